@@ -1,0 +1,19 @@
+"""Planar segmentation of range images by multi-label graph cuts."""
+
+from rangeseg_ros.core.camera import Camera, CameraError
+from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.core.range_image import RangeImage, RangeImageError
+from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+
+__all__ = [
+    'Camera',
+    'CameraError',
+    'Config',
+    'ConfigError',
+    'Plane',
+    'RangeImage',
+    'RangeImageError',
+    'Segmentation',
+    'Segmenter',
+]

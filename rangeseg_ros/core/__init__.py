@@ -1,0 +1,1 @@
+"""The segmenter: arrays in, arrays out."""

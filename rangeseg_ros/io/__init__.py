@@ -1,0 +1,1 @@
+"""Files: images, cameras, clouds, bags."""
