@@ -1,0 +1,126 @@
+"""Depth images in the bytes of ROS messages: sensor_msgs/Image and compressedDepth.
+
+Plain fields in, arrays out, so that bags and the node share one decoder and neither needs ROS.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# REP 118: millimetres as unsigned integers, or metres as floats.
+PIXEL_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
+
+# compressed_depth_image_transport: ConfigHeader {int32 format; float32 a, b}, then the PNG.
+_HEADER = struct.Struct('<iff')
+
+
+class EncodingError(ValueError):
+    """A message that holds no depth image, or a damaged one."""
+
+
+def decode_image(
+    height: int, width: int, encoding: str, is_bigendian: bool, step: int, data: Any
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Depth image of the fields of a sensor_msgs/Image.
+
+    Parameters
+    ----------
+    height, width : int
+        Size of the image, pixels.
+    encoding : str
+        One of `PIXEL_TYPES`.
+    is_bigendian : bool
+        Byte order of `data`.
+    step : int
+        Length of a row, bytes; rows may be padded.
+    data : bytes-like
+        The rows; the padding of the last one may be missing.
+
+    Returns
+    -------
+    (H, W) uint16 in millimetres or float32 in metres, native byte order; a view of `data` where
+    that is possible, so not to be written to.
+
+    Raises
+    ------
+    EncodingError
+        Another encoding, an empty image, rows or data too short for the size.
+    """
+    if encoding not in PIXEL_TYPES:
+        raise EncodingError(
+            f'encoding {encoding!r} is no depth image; known: {", ".join(PIXEL_TYPES)}'
+        )
+    dtype = np.dtype(PIXEL_TYPES[encoding])
+    if height < 1 or width < 1:
+        raise EncodingError(f'depth image is empty ({width}x{height})')
+    row = width * dtype.itemsize
+    if step < row:
+        raise EncodingError(f'step of {step} bytes is too short for {width} pixels of {encoding}')
+    raw = np.frombuffer(data, np.uint8)
+    needed = step * (height - 1) + row
+    if raw.size < needed:
+        raise EncodingError(
+            f'{raw.size} bytes of data are too few for {width}x{height} {encoding} in rows of '
+            f'{step} bytes'
+        )
+    rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1), writeable=False)
+    stored = dtype.newbyteorder('>' if is_bigendian else '<')
+    return np.ascontiguousarray(rows).view(stored).astype(dtype, copy=False)
+
+
+def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Depth image of a sensor_msgs/CompressedImage written by compressed_depth_image_transport.
+
+    Parameters
+    ----------
+    format : str
+        E.g. '16UC1; compressedDepth png'.
+    data : bytes-like
+        A 12-byte header and a 16-bit PNG. 32FC1 is quantised in inverse depth:
+        depth = a / (value - b), 0 invalid, with a and b in the header.
+
+    Returns
+    -------
+    (H, W) uint16 in millimetres or float32 in metres with NaN where invalid.
+
+    Raises
+    ------
+    EncodingError
+        Another format or compression, or damaged data.
+    """
+    encoding, _, compression = (part.strip() for part in format.partition(';'))
+    # Older publishers do not name the codec; it was always PNG.
+    if encoding not in PIXEL_TYPES or compression not in (
+        'compressedDepth',
+        'compressedDepth png',
+    ):
+        raise EncodingError(
+            f'format {format!r} is no known depth image; known: '
+            f'{", ".join(f"{name}; compressedDepth png" for name in PIXEL_TYPES)}'
+        )
+    raw = np.frombuffer(data, np.uint8)
+    if raw.size <= _HEADER.size:
+        raise EncodingError(f'compressed depth image of {raw.size} bytes has no PNG')
+    _, a, b = _HEADER.unpack(raw[: _HEADER.size].tobytes())
+    try:
+        image = cv2.imdecode(raw[_HEADER.size :], cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise EncodingError('compressed depth image holds no readable PNG')
+    if image.ndim != 2 or image.dtype != np.uint16:
+        raise EncodingError(
+            f'compressed depth image must be a 16-bit PNG of one channel, not {image.dtype} of '
+            f'shape {image.shape}'
+        )
+    if encoding != '32FC1':
+        return image.view(np.uint16)
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        depth = np.float32(a) / (image.astype(np.float32) - np.float32(b))
+    depth[(image == 0) | ~(depth > 0)] = np.nan
+    return depth
