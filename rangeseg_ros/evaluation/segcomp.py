@@ -1,0 +1,279 @@
+"""The file kinds of the segmentation comparison of Hoover et al.
+
+References
+----------
+A. Hoover et al., "An experimental comparison of range image segmentation algorithms", IEEE TPAMI
+18(7), 1996.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FIRST_REGION = 10
+MAX_REGIONS = 246
+NOISE, SHADOW, EDGE = 1, 2, 3
+SIZE = 512
+
+_MAGIC = 0x59A66A95
+_PERCEPTRON_WORDS = (2, 2, 3, 3, 3, 3, 4, 4, 3, 5)
+_RANGE_MASK = 4095
+
+
+class SegcompError(ValueError):
+    """A file, or an array to be written, that breaks the segcomp conventions."""
+
+
+def read_raster(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+    """Read an 8-bit Sun raster, such as an ABW range image.
+
+    Returns
+    -------
+    (H, W) uint8
+        The pixels; in a range image 0 is shadow.
+
+    Raises
+    ------
+    SegcompError
+        Wrong magic number, not 8 bits per pixel, a compressed or truncated file.
+    """
+    data = Path(path).read_bytes()
+    if len(data) < 4 or struct.unpack_from('>I', data)[0] != _MAGIC:
+        raise SegcompError(f'{path}: not a Sun raster (wrong magic number)')
+    if len(data) < 32:
+        raise SegcompError(f'{path}: truncated Sun raster: the header has {len(data)} of 32 bytes')
+    width, height, depth, _, kind, _, colormap = struct.unpack_from('>7i', data, 4)
+    if width < 1 or height < 1 or colormap < 0:
+        raise SegcompError(f'{path}: malformed Sun raster header: size {width}x{height}')
+    if depth != 8:
+        raise SegcompError(f'{path}: Sun raster has {depth} bits per pixel, not 8')
+    if kind not in (0, 1):
+        raise SegcompError(f'{path}: Sun raster of type {kind}; only uncompressed ones (0, 1)')
+    pixels = data[32 + colormap : 32 + colormap + width * height]
+    if len(pixels) < width * height:
+        raise SegcompError(
+            f'{path}: truncated Sun raster: {len(pixels)} of {width * height} pixels'
+        )
+    return np.frombuffer(pixels, np.uint8).reshape(height, width).copy()
+
+
+def write_raster(path: str | os.PathLike[str], image: ArrayLike) -> None:
+    """Write an (H, W) uint8 image as an 8-bit Sun raster.
+
+    Raises
+    ------
+    SegcompError
+        An array of another shape or type.
+    """
+    pixels = np.asarray(image)
+    if pixels.ndim != 2 or pixels.dtype != np.uint8:
+        raise SegcompError(f'{path}: a raster is (H, W) uint8, not {pixels.shape} {pixels.dtype}')
+    height, width = pixels.shape
+    header = struct.pack('>I7i', _MAGIC, width, height, 8, width * height, 1, 0, 0)
+    _replace(path, header + pixels.tobytes())
+
+
+def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
+    """Read a `.gt-seg` or `.ms-seg` raster: 0 none, 1 noise, 2 shadow, 3 edge, regions from 10.
+
+    Raises
+    ------
+    SegcompError
+        As `read_raster`, and labels 4..9.
+    """
+    image = read_raster(path)
+    _check_labels(path, image)
+    return image
+
+
+def write_segmentation(path: str | os.PathLike[str], image: ArrayLike) -> None:
+    """Write a `.gt-seg` or `.ms-seg` raster from (H, W) uint8 labels in segcomp's convention.
+
+    Raises
+    ------
+    SegcompError
+        As `write_raster`, and labels 4..9.
+    """
+    _check_labels(path, np.asarray(image))
+    write_raster(path, image)
+
+
+def to_segcomp(labels: ArrayLike, shadow: ArrayLike | None = None) -> NDArray[np.uint8]:
+    """Convert a label image (0 = none) to segcomp's convention.
+
+    Parameters
+    ----------
+    labels : (H, W) integer
+        0 = no region.
+    shadow : (H, W) bool, optional
+        Pixels without measurement, to become label 2.
+
+    Returns
+    -------
+    (H, W) uint8
+        Regions numbered from 10 in the order of their labels.
+
+    Raises
+    ------
+    SegcompError
+        More than 246 regions.
+    """
+    array = np.asarray(labels)
+    present, index = np.unique(array, return_inverse=True)
+    regions = np.cumsum(present != 0)
+    if regions[-1] > MAX_REGIONS:
+        raise SegcompError(f'{regions[-1]} regions; the segcomp format holds {MAX_REGIONS}')
+    codes = np.where(present != 0, regions + FIRST_REGION - 1, 0).astype(np.uint8)
+    image = codes[index.reshape(array.shape)]
+    if shadow is not None:
+        image[np.asarray(shadow) & (image == 0)] = SHADOW
+    return image
+
+
+def from_segcomp(image: ArrayLike) -> NDArray[np.uint16]:
+    """Convert labels in segcomp's convention to ours: 0 = none, region k to k - 9."""
+    array = np.asarray(image)
+    return np.maximum(array.astype(np.int32) - FIRST_REGION + 1, 0).astype(np.uint16)
+
+
+def read_perceptron(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
+    """Read a Perceptron range image.
+
+    Returns
+    -------
+    (512, 512) uint16
+        12-bit range values; the reflectance and control bits of the file are dropped.
+
+    Raises
+    ------
+    SegcompError
+        A header that does not have the ten expected lines, or missing pixels.
+    """
+    data = Path(path).read_bytes()
+    start = 0
+    for number, words in enumerate(_PERCEPTRON_WORDS, start=1):
+        end = data.find(b'\n', start, start + 1000)
+        if end < 0 or len(data[start:end].split()) != words:
+            raise SegcompError(
+                f'{path}: not a Perceptron image: header line {number} must have {words} words'
+            )
+        start = end + 1
+    pixels = data[start + 2 :]
+    if len(pixels) != 4 * SIZE * SIZE:
+        problem = 'truncated' if len(pixels) < 4 * SIZE * SIZE else 'oversized'
+        raise SegcompError(
+            f'{path}: {problem} Perceptron image: {len(pixels)} bytes of pixels, '
+            f'not {4 * SIZE * SIZE}'
+        )
+    values = np.frombuffer(pixels, '>i4').reshape(SIZE, SIZE)
+    return (values & _RANGE_MASK).astype(np.uint16)
+
+
+def write_perceptron(path: str | os.PathLike[str], values: ArrayLike) -> None:
+    """Write 12-bit range values as a Perceptron image (512 x 512, integer, 0..4095).
+
+    Raises
+    ------
+    SegcompError
+        Another size or type, or values beyond 12 bits.
+    """
+    array = np.asarray(values)
+    if array.shape != (SIZE, SIZE) or array.dtype.kind not in 'iu':
+        raise SegcompError(
+            f'{path}: a Perceptron image is {SIZE}x{SIZE} integers, '
+            f'not {array.shape} {array.dtype}'
+        )
+    if array.min() < 0 or array.max() > _RANGE_MASK:
+        raise SegcompError(f'{path}: Perceptron range values must be in 0..{_RANGE_MASK}')
+    lines = (' '.join(['perceptron', *'x' * (words - 1)]) for words in _PERCEPTRON_WORDS)
+    header = ''.join(f'{line}\n' for line in lines).encode() + b'\x00\x00'
+    _replace(path, header + array.astype('>i4').tobytes())
+
+
+class RegionAngle(NamedTuple):
+    """Angle between the normals of two adjacent regions of a ground truth, degrees."""
+
+    first: int
+    second: int
+    degrees: float
+
+
+def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
+    """Read a `.gt-ang` file: a count, then lines `regionA regionB degrees`.
+
+    Raises
+    ------
+    SegcompError
+        A wrong count or a malformed line.
+    """
+    return [RegionAngle(int(a), int(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
+
+
+def write_angles(path: str | os.PathLike[str], angles: Sequence[RegionAngle]) -> None:
+    """Write a `.gt-ang` file."""
+    lines = [str(len(angles)), *(f'{a} {b} {degrees:.6f}' for a, b, degrees in angles)]
+    _replace(path, ('\n'.join(lines) + '\n').encode())
+
+
+def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
+    """Read a `.ms-nor` file: a count, then lines `label nx ny nz`.
+
+    Raises
+    ------
+    SegcompError
+        A wrong count or a malformed line.
+    """
+    return {int(row[0]): np.array(row[1:]) for row in _read_rows(path, 4, integers=1)}
+
+
+def write_normals(path: str | os.PathLike[str], normals: Mapping[int, ArrayLike]) -> None:
+    """Write a `.ms-nor` file from the normal (3,) of each label."""
+    rows = (f'{label} {x:.9f} {y:.9f} {z:.9f}' for label, (x, y, z) in _items(normals))
+    _replace(path, ('\n'.join([str(len(normals)), *rows]) + '\n').encode())
+
+
+def _items(normals: Mapping[int, ArrayLike]) -> list[tuple[int, NDArray]]:
+    return [(label, np.asarray(normal, dtype=float)) for label, normal in normals.items()]
+
+
+def _read_rows(path: str | os.PathLike[str], columns: int, integers: int) -> list[list[float]]:
+    """Rows of a counted table whose first `integers` columns are whole numbers."""
+    lines = [line.split() for line in Path(path).read_text(errors='replace').splitlines()]
+    lines = [words for words in lines if words]
+    try:
+        (count,) = (int(word) for word in lines[0])
+    except (IndexError, ValueError):
+        raise SegcompError(f'{path}: the first line must be a count') from None
+    if len(lines) - 1 != count:
+        raise SegcompError(f'{path}: {len(lines) - 1} lines where the first announces {count}')
+    rows = []
+    for number, words in enumerate(lines[1:], start=1):
+        try:
+            row = [float(int(word)) for word in words[:integers]]
+            row += [float(word) for word in words[integers:]]
+        except (ValueError, OverflowError):
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise SegcompError(f'{path}: malformed entry {number}: {" ".join(words)[:60]!r}')
+        rows.append(row)
+    return rows
+
+
+def _check_labels(path: str | os.PathLike[str], image: NDArray) -> None:
+    bad = image[(image > EDGE) & (image < FIRST_REGION)]
+    if bad.size:
+        raise SegcompError(f'{path}: label {bad.min()}; 4..9 are not allowed, regions begin at 10')
+
+
+def _replace(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write under another name first, so that nobody ever sees half a file."""
+    part = Path(f'{os.fspath(path)}.part')
+    part.write_bytes(data)
+    part.replace(path)

@@ -1,0 +1,294 @@
+"""Files and geometry of the segcomp sets: round trips, malformed files, the published formulas."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from rangeseg_ros.evaluation import segcomp
+from rangeseg_ros.evaluation import segcomp_geometry as geometry
+from rangeseg_ros.evaluation.segcomp import SegcompError
+
+READERS = (
+    segcomp.read_raster,
+    segcomp.read_segmentation,
+    segcomp.read_perceptron,
+    segcomp.read_angles,
+    segcomp.read_normals,
+)
+
+
+@given(arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9))))
+def test_raster_round_trip(tmp_path_factory, image):
+    path = tmp_path_factory.mktemp('raster') / 'image.range'
+    segcomp.write_raster(path, image)
+    assert np.array_equal(segcomp.read_raster(path), image)
+
+
+def test_raster_bytes(tmp_path):
+    path = tmp_path / 'image.range'
+    segcomp.write_raster(path, np.array([[1, 2, 3], [4, 5, 6]], np.uint8))
+    words = [0x59A66A95, 3, 2, 8, 6, 1, 0, 0]
+    assert path.read_bytes() == struct.pack('>8I', *words) + bytes([1, 2, 3, 4, 5, 6])
+
+
+def raster(magic=0x59A66A95, width=2, height=2, depth=8, kind=1, maplength=0, pixels=4):
+    header = struct.pack('>8I', magic, width, height, depth, width * height, kind, 0, maplength)
+    return header + bytes(pixels)
+
+
+@pytest.mark.parametrize(
+    ('data', 'fault'),
+    [
+        (b'', 'magic'),
+        (raster(magic=0x956AA659), 'magic'),
+        (raster()[:20], 'header has 20 of 32'),
+        (raster(depth=1), '1 bits'),
+        (raster(kind=2), 'type 2'),
+        (raster(width=0), 'size 0x2'),
+        (raster(pixels=3), '3 of 4 pixels'),
+        (raster(maplength=3), '1 of 4 pixels'),
+    ],
+)
+def test_malformed_raster(tmp_path, data, fault):
+    path = tmp_path / 'bad.range'
+    path.write_bytes(data)
+    with pytest.raises(SegcompError, match=fault) as error:
+        segcomp.read_raster(path)
+    assert str(path) in str(error.value) and '\n' not in str(error.value)
+
+
+def test_raster_takes_only_bytes(tmp_path):
+    with pytest.raises(SegcompError, match='uint8'):
+        segcomp.write_raster(tmp_path / 'image', np.zeros((2, 2)))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize('label', range(4, 10))
+def test_reserved_labels(tmp_path, label):
+    image = np.full((2, 2), 10, np.uint8)
+    image[0, 0] = label
+    with pytest.raises(SegcompError, match=f'label {label}'):
+        segcomp.write_segmentation(tmp_path / 'a.ms-seg', image)
+    segcomp.write_raster(tmp_path / 'a.ms-seg', image)
+    with pytest.raises(SegcompError, match=f'a.ms-seg: label {label}'):
+        segcomp.read_segmentation(tmp_path / 'a.ms-seg')
+
+
+def test_label_conventions():
+    labels = np.array([[0, 3, 3], [700, 0, 5]], np.uint16)
+    shadow = np.array([[True, True, False], [False, False, False]])
+    image = segcomp.to_segcomp(labels, shadow)
+    assert image.tolist() == [[2, 10, 10], [12, 0, 11]]
+    assert segcomp.from_segcomp(image).tolist() == [[0, 1, 1], [3, 0, 2]]
+    assert segcomp.to_segcomp(np.zeros((1, 2), np.uint16)).tolist() == [[0, 0]]
+
+
+def test_at_most_246_regions():
+    assert segcomp.to_segcomp(np.arange(247)).max() == 255
+    with pytest.raises(SegcompError, match='247 regions'):
+        segcomp.to_segcomp(np.arange(248))
+
+
+def test_perceptron_round_trip(tmp_path):
+    values = np.random.default_rng(1).integers(0, 4096, (512, 512))
+    path = tmp_path / 'perc.test.0'
+    segcomp.write_perceptron(path, values)
+    assert np.array_equal(segcomp.read_perceptron(path), values)
+    data = path.read_bytes()
+    words = [len(line.split()) for line in data[: -4 * 512 * 512 - 2].splitlines()]
+    assert words == [2, 2, 3, 3, 3, 3, 4, 4, 3, 5]
+
+
+def test_perceptron_drops_the_upper_bits(tmp_path):
+    path = tmp_path / 'perc.test.0'
+    segcomp.write_perceptron(path, np.full((512, 512), 7))
+    data = path.read_bytes()
+    start = len(data) - 4 * 512 * 512
+    path.write_bytes(data[:start] + struct.pack('>I', 0xABCDE123) + data[start + 4 :])
+    assert segcomp.read_perceptron(path)[0, :2].tolist() == [0x123, 7]
+
+
+@pytest.mark.parametrize(
+    ('change', 'fault'),
+    [
+        (lambda data: data[:-1], 'truncated'),
+        (lambda data: data[:100], 'header line 7 must have 4 words'),
+        (lambda data: data + b'x', 'oversized'),
+        (lambda data: b'extra ' + data, 'header line 1 must have 2 words'),
+        (lambda data: data[data.index(b'\n') + 1 :], 'header line 2'),
+        (lambda data: b'', 'header line 1'),
+    ],
+)
+def test_malformed_perceptron(tmp_path, change, fault):
+    path = tmp_path / 'perc.test.0'
+    segcomp.write_perceptron(path, np.zeros((512, 512), int))
+    path.write_bytes(change(path.read_bytes()))
+    with pytest.raises(SegcompError, match=fault):
+        segcomp.read_perceptron(path)
+
+
+@pytest.mark.parametrize(
+    'values',
+    [
+        np.zeros((2, 2), int),
+        np.zeros((512, 512)),
+        np.full((512, 512), 4096),
+        -np.eye(512).astype(int),
+    ],
+)
+def test_perceptron_takes_only_12_bits(tmp_path, values):
+    with pytest.raises(SegcompError):
+        segcomp.write_perceptron(tmp_path / 'perc.test.0', values)
+    assert not list(tmp_path.iterdir())
+
+
+def test_angles_round_trip(tmp_path):
+    angles = [segcomp.RegionAngle(10, 11, 90.0), segcomp.RegionAngle(10, 14, 37.25)]
+    segcomp.write_angles(tmp_path / 'a.gt-ang', angles)
+    assert (tmp_path / 'a.gt-ang').read_text().splitlines()[0] == '2'
+    assert segcomp.read_angles(tmp_path / 'a.gt-ang') == angles
+
+
+def test_normals_round_trip(tmp_path):
+    normals = {10: np.array([0, 0.6, -0.8]), 12: np.array([1.0, 0, 0])}
+    segcomp.write_normals(tmp_path / 'a.ms-nor', normals)
+    read = segcomp.read_normals(tmp_path / 'a.ms-nor')
+    assert list(read) == [10, 12]
+    assert np.allclose(read[10], normals[10]) and np.allclose(read[12], normals[12])
+
+
+@pytest.mark.parametrize(
+    ('text', 'fault'),
+    [
+        ('', 'count'),
+        ('two\n', 'count'),
+        ('2 3\n', 'count'),
+        ('2\n10 11 90\n', '1 lines where the first announces 2'),
+        ('1\n10 11\n', 'malformed entry 1'),
+        ('1\n10 11.5 90\n', 'malformed entry 1'),
+        ('1\n10 11 ninety\n', 'malformed entry 1'),
+        ('1\n10 11 nan\n', 'malformed entry 1'),
+        ('1\n10 11 90 4\n', 'malformed entry 1'),
+        ('1\n' + '9' * 400 + ' 11 90\n', 'malformed entry 1'),
+    ],
+)
+def test_malformed_angles(tmp_path, text, fault):
+    path = tmp_path / 'a.gt-ang'
+    path.write_text(text)
+    with pytest.raises(SegcompError, match=fault):
+        segcomp.read_angles(path)
+
+
+@given(st.binary(max_size=200), st.sampled_from(READERS))
+def test_arbitrary_bytes_are_refused_in_one_line(tmp_path_factory, data, reader):
+    path = tmp_path_factory.mktemp('bytes') / 'file'
+    path.write_bytes(data)
+    try:
+        reader(path)
+    except SegcompError as error:
+        assert '\n' not in str(error)
+
+
+def published_abw(v, r, c, offset, scale, f):
+    aspect = 1.4508
+    x = (c - 255) * (v / scale + offset) / abs(f)
+    y = (255 - r) / aspect * (v / scale + offset) / abs(f)
+    return x, y, (255 - v) / scale
+
+
+@pytest.mark.parametrize(
+    ('number', 'split', 'constants'),
+    [
+        (0, 'test', (785.410786, 0.773545, -1610.981722)),
+        (29, 'test', (785.410786, 0.773545, -1610.981722)),
+        (1, 'test', (771.016866, 0.791686, -1586.072821)),
+        (0, 'train', (771.016866, 0.791686, -1586.072821)),
+    ],
+)
+def test_abw_points_are_the_published_ones(number, split, constants):
+    values = np.random.default_rng(2).integers(0, 256, (512, 512))
+    values[0, 0] = 0
+    points = geometry.abw_points(values, geometry.abw_calibration(number, split))
+    assert np.isnan(points[values == 0]).all()
+    # The published z counts from range value 255 towards the sensor, whose centre is where
+    # x = y = 0 for all pixels, so where v / scale + offset = 0.
+    centre = 255 / constants[1] + constants[0]
+    for r, c in ((0, 1), (511, 511), (100, 400), (255, 255)):
+        x, y, z = published_abw(max(values[r, c], 1), r, c, *constants)
+        values[r, c] = max(values[r, c], 1)
+        point = geometry.abw_points(values, geometry.abw_calibration(number, split))[r, c]
+        assert point * 1000 == pytest.approx((x, -y, centre - z), rel=1e-6)
+
+
+def test_abw_values_return():
+    for calibration in (geometry.ABW_FIRST, geometry.ABW_SECOND):
+        values = np.arange(1, 256)
+        assert np.allclose(calibration.values(calibration.depth(values)), values)
+
+
+def test_abw_range_image():
+    values = np.full((512, 512), 128)
+    values[:3] = 0
+    image = geometry.abw_range_image(values, geometry.ABW_FIRST)
+    assert not image.valid[:3].any() and image.valid[3:].all()
+    expected = geometry.abw_points(values, geometry.ABW_FIRST)
+    assert np.allclose(image.points, expected, rtol=1e-5, equal_nan=True)
+
+
+def published_perceptron(v, r, c):
+    h1, h2, delta, r0 = 3.0, 5.5, 0.20236, 830.3
+    alpha = math.radians(51.65 * (255.5 - c) / 512)
+    beta = math.radians(36.73 * (255.5 - r) / 512)
+    dz = -h1 * (1 - math.cos(alpha)) / math.tan(math.radians(45))
+    dy = dz * math.tan(math.radians(45) + beta / 2)
+    dx = (h2 + dy) * math.tan(alpha)
+    r1 = (dz - h2) / delta
+    r2 = math.sqrt(dx**2 + (h2 + dy) ** 2) / delta
+    r3 = (v + r0 - (r1 + r2)) * delta
+    x = dx + r3 * math.sin(alpha)
+    y = dy + r3 * math.cos(alpha) * math.sin(beta)
+    z = dz + r3 * math.cos(alpha) * math.cos(beta)
+    return x, y, z
+
+
+def test_perceptron_points_are_the_published_ones():
+    values = np.random.default_rng(3).integers(0, 4096, (512, 512))
+    points = geometry.perceptron_points(values)
+    for r, c in ((0, 0), (511, 511), (0, 511), (37, 402), (256, 255)):
+        x, y, z = published_perceptron(values[r, c], r, c)
+        assert points[r, c] * 100 == pytest.approx((-x, -y, z))
+
+
+def test_perceptron_frame_is_the_optical_one():
+    points = geometry.perceptron_points(np.full((512, 512), 500))
+    assert (np.diff(points[256, :, 0]) > 0).all()
+    assert (np.diff(points[:, 256, 1]) > 0).all()
+    assert (points[..., 2] > 0).all()
+
+
+def test_perceptron_values_return():
+    values = np.random.default_rng(4).integers(0, 4096, (512, 512))
+    rays = geometry.perceptron_rays()
+    assert np.allclose(np.linalg.norm(rays.directions, axis=2), 1)
+    distance = ((geometry.perceptron_points(values) - rays.origins) * rays.directions).sum(axis=2)
+    assert np.allclose(geometry.perceptron_values(distance), values)
+
+
+def test_perceptron_range_image():
+    values = np.full((512, 512), 700)
+    image = geometry.perceptron_range_image(values)
+    assert np.allclose(image.points, geometry.perceptron_points(values), atol=1e-5)
+
+
+def test_range_images_have_one_size():
+    for convert in (
+        geometry.perceptron_range_image,
+        lambda values: geometry.abw_range_image(values, geometry.ABW_FIRST),
+    ):
+        with pytest.raises(SegcompError, match='512x512'):
+            convert(np.zeros((4, 4), int))
