@@ -1,0 +1,207 @@
+"""Random scenes of solids, and where the camera stands in them.
+
+World frame: x and y along the floor, z up, metres; the floor is z = 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.simulation.solids import Solid, box, cylinder, half_space, sphere
+
+OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rotation of the optical frame (z forward, REP 103) in a body frame with x forward, z up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """Where a sensor stands.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+        World-from-sensor rotation.
+    position : (3,) float64
+        Sensor's origin in the world, metres.
+    """
+
+    rotation: NDArray[np.float64]
+    position: NDArray[np.float64]
+
+    @classmethod
+    def looking(cls, position: ArrayLike, yaw: float, pitch: float, roll: float) -> Pose:
+        """Camera at `position` looking along `yaw`, down by `pitch`, turned by `roll` (degrees).
+
+        Yaw is measured from the world's x axis; roll about the optical axis.
+        """
+        body = Rotation.from_euler('ZYX', [yaw, pitch, roll], degrees=True).as_matrix()
+        return cls(body @ OPTICAL_IN_BODY, np.asarray(position, np.float64))
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Solids and the poses of the camera that looks at them, one per frame.
+
+    Attributes
+    ----------
+    solids : tuple of Solid
+        In the world frame.
+    poses : tuple of Pose
+        At least one.
+    """
+
+    solids: tuple[Solid, ...]
+    poses: tuple[Pose, ...]
+
+    def planes(self, pose: Pose) -> NDArray[np.float64]:
+        """(F, 4) equations (normal, distance) of all faces in the frame of a sensor at `pose`.
+
+        Normals point out of the solids, so towards the sensor on every visible face; NaN for
+        curved faces.
+        """
+        world = np.vstack([solid.planes for solid in self.solids])
+        distance = world[:, :3] @ pose.position + world[:, 3]
+        return np.column_stack([world[:, :3] @ pose.rotation, distance])
+
+
+def kinect_room(seed: int, frames: int = 1) -> Scene:
+    """Floor, two walls and three to five boxes at any orientation, as a hand-held Kinect sees it.
+
+    The boxes rest on the floor, stand on one another, lie tilted or float; the camera is 0.8 to
+    1.8 m above the floor and tilted down; depth is about 0.8 to 5 m.
+
+    Parameters
+    ----------
+    seed : int
+        The same seed gives the same room and, for its first frames, the same motion.
+    frames : int
+        Number of camera poses at 30 Hz; see `camera_motion`.
+    """
+    random = np.random.default_rng([seed, 1])
+    room = _Room(random)
+    for _ in range(random.integers(3, 6)):
+        room.add_box()
+    return Scene(tuple(room.solids), camera_motion(room.pose, seed, frames))
+
+
+def curved_scene(seed: int, frames: int = 1) -> Scene:
+    """Room with a ball and a standing cylinder on the floor, and one or two boxes.
+
+    Parameters
+    ----------
+    seed, frames : int
+        As for `kinect_room`.
+    """
+    random = np.random.default_rng([seed, 2])
+    room = _Room(random)
+    room.add_ball()
+    room.add_cylinder()
+    for _ in range(random.integers(1, 3)):
+        room.add_box()
+    return Scene(tuple(room.solids), camera_motion(room.pose, seed, frames))
+
+
+def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
+    """Hand-held motion about a pose, smooth and seeded, at 30 frames per second.
+
+    Each of the six coordinates swings sinusoidally with its own period of 5 to 11 s, by up to
+    0.15 m and 8 degrees: at most about 0.2 m/s and 10 degrees/s per axis. The first pose is
+    `start`.
+    """
+    random = np.random.default_rng([seed, 3])
+    period, phase = random.uniform(5, 11, 6), random.uniform(0, 2 * np.pi, 6)
+    amplitude = np.array([0.15, 0.15, 0.08, 4.0, 8.0, 2.0]) * random.uniform(0.6, 1, 6)
+    time = np.arange(frames)[:, None] / 30
+    swing = np.sin(2 * np.pi * time / period + phase) - np.sin(phase)
+    shift, turn = np.split(amplitude * swing / 2, 2, axis=1)
+    turned = Rotation.from_euler('xyz', turn, degrees=True).as_matrix()
+    return tuple(
+        Pose(start.rotation @ rotation, start.position + offset)
+        for rotation, offset in zip(turned, shift, strict=True)
+    )
+
+
+class _Room:
+    """A room under construction: the camera above the origin looks along x into a corner."""
+
+    def __init__(self, random: np.random.Generator) -> None:
+        self.random = random
+        self.height = random.uniform(0.8, 1.8)
+        # The higher the camera, the more it looks down.
+        pitch = random.uniform(8, 20) + 12 * (self.height - 0.8)
+        self.pose = Pose.looking((0, 0, self.height), 0, pitch, random.uniform(-4, 4))
+        self.depth = random.uniform(3.0, 4.4)
+        side = random.choice([-1, 1])
+        turn = np.radians(random.uniform(-25, 25))
+        corner = np.radians(random.uniform(80, 105))
+        back = np.array([-np.cos(turn), -np.sin(turn), 0])
+        beside = np.array([-np.cos(turn + side * corner), -np.sin(turn + side * corner), 0])
+        # Through a point on the viewing axis, and through one beside it.
+        self.walls = [
+            half_space(back, (self.depth, 0, 0)),
+            half_space(beside, (2.2, side * random.uniform(0.9, 1.5), 0)),
+        ]
+        self.solids = [half_space((0, 0, 1), (0, 0, 0)), *self.walls]
+        self.occupied: list[tuple[NDArray[np.float64], float]] = []
+        self.tops: list[tuple[NDArray[np.float64], float, float, float]] = []
+
+    def add_box(self) -> None:
+        """Add a box: resting on the floor, stacked, or tilted and perhaps floating."""
+        kind = self.random.choice(['resting', 'stacked', 'tilted'], p=[0.45, 0.2, 0.35])
+        size = self.random.uniform(0.2, 0.8, 3)
+        if kind == 'stacked' and self.tops:
+            place, top, width, yaw = self.tops.pop(self.random.integers(len(self.tops)))
+            size[:2] = self.random.uniform(0.4, 0.9, 2) * width
+            size[2] = self.random.uniform(0.1, 0.4)
+            angle = yaw + self.random.uniform(-20, 20)
+            self.solids.append(box(size, _about_z(angle), (*place, top + size[2] / 2)))
+        elif kind == 'tilted':
+            rotation = Rotation.random(random_state=self.random).as_matrix()
+            reach = np.abs(rotation) @ size / 2
+            lift = max(self.random.uniform(-0.4, 0.5), 0)
+            place = self._free_place(float(np.hypot(*reach[:2])))
+            self.solids.append(box(size, rotation, (*place, reach[2] + lift)))
+        else:
+            yaw = self.random.uniform(0, 90)
+            place = self._free_place(float(np.hypot(*size[:2]) / 2))
+            self.solids.append(box(size, _about_z(yaw), (*place, size[2] / 2)))
+            self.tops.append((place, size[2], min(size[:2]), yaw))
+
+    def add_ball(self) -> None:
+        """Add a ball that lies on the floor."""
+        radius = self.random.uniform(0.15, 0.3)
+        place = self._free_place(radius)
+        self.solids.append(sphere(radius, (*place, radius)))
+
+    def add_cylinder(self) -> None:
+        """Add a cylinder that stands on the floor."""
+        radius, height = self.random.uniform(0.1, 0.25), self.random.uniform(0.4, 0.9)
+        place = self._free_place(radius)
+        self.solids.append(cylinder(radius, height, np.eye(3), (*place, height / 2)))
+
+    def _free_place(self, radius: float) -> NDArray[np.float64]:
+        """(x, y) of an upright cylinder of that radius that is in view and touches nothing.
+
+        After many failures the objects may overlap; they are then cast as one body.
+        """
+        for _ in range(1000):
+            place = self.random.uniform((1.3, -1.4), (self.depth, 1.4))
+            free = np.hypot(*place) - radius > 1.0 and abs(place[1]) < 0.45 * place[0]
+            for wall in self.walls:
+                free &= wall.normals[0, :2] @ place + wall.offsets[0] > radius
+            for other, reach in self.occupied:
+                free &= np.hypot(*(place - other)) > radius + reach
+            if free:
+                break
+        self.occupied.append((place, radius))
+        return place
+
+
+def _about_z(degrees: float) -> NDArray[np.float64]:
+    """Rotation about the vertical."""
+    rotation: NDArray[np.float64] = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return rotation

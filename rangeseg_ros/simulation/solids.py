@@ -1,0 +1,194 @@
+"""Convex solids and exact ray casting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """Points p with normals @ p + offsets <= 0 and, when there is a quadric, p'Qp <= 0.
+
+    Attributes
+    ----------
+    normals : (K, 3) float64
+        Outward unit normals of the planar faces.
+    offsets : (K,) float64
+        Offsets of the faces, metres.
+    quadric : (4, 4) float64 or None
+        Symmetric matrix of a convex quadric in homogeneous coordinates; the solid's last face.
+    """
+
+    normals: NDArray[np.float64]
+    offsets: NDArray[np.float64]
+    quadric: NDArray[np.float64] | None = None
+
+    @property
+    def face_count(self) -> int:
+        """Number of faces, the curved one included."""
+        return len(self.offsets) + (self.quadric is not None)
+
+    @property
+    def planes(self) -> NDArray[np.float64]:
+        """(face_count, 4) plane equations (normal, offset); NaN for the curved face."""
+        planes = np.full((self.face_count, 4), np.nan)
+        planes[: len(self.offsets)] = np.column_stack([self.normals, self.offsets])
+        return planes
+
+    def intersect(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Where rays enter the solid.
+
+        Parameters
+        ----------
+        origins : (3,) or (N, 3) float64
+            One origin for all rays, or one for each.
+        directions : (N, 3) float64
+            Directions, of any length.
+
+        Returns
+        -------
+        distance : (N,) float64
+            Ray parameter of the entry, in lengths of the direction; inf where the ray misses
+            the solid or starts inside it.
+        face : (N,) intp
+            Face entered.
+        """
+        height = self.normals @ np.atleast_2d(origins).T + self.offsets[:, None]
+        rate = self.normals @ directions.T
+        with np.errstate(divide='ignore', invalid='ignore'):
+            crossing = -height / rate
+        entries = np.where(rate < 0, crossing, -np.inf)
+        exits = np.where(rate > 0, crossing, np.inf)
+        exits[(rate == 0) & (height > 0)] = -np.inf
+        if self.quadric is not None:
+            entry, exit_ = _quadric_interval(self.quadric, np.atleast_2d(origins), directions)
+            entries, exits = np.vstack([entries, entry]), np.vstack([exits, exit_])
+        face = entries.argmax(axis=0)
+        entry = entries.max(axis=0)
+        hit = (entry > 0) & (entry < exits.min(axis=0))
+        return np.where(hit, entry, np.inf), face
+
+
+def _quadric_interval(
+    quadric: NDArray[np.float64], origins: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Ray parameters between which p'Qp <= 0; (inf, -inf) where that is nowhere."""
+    matrix, vector, scalar = quadric[:3, :3], quadric[:3, 3], quadric[3, 3]
+    gradient = origins @ matrix + vector
+    a = np.einsum('ni,ij,nj->n', directions, matrix, directions)
+    b = np.einsum('ni,ni->n', directions, np.broadcast_to(gradient, directions.shape))
+    c = np.einsum('ni,ni->n', gradient + vector, origins) + scalar
+    with np.errstate(divide='ignore', invalid='ignore'):
+        root = np.sqrt(b * b - a * c)
+        entry, exit_ = (-b - root) / a, (-b + root) / a
+    # A ray along a cylinder's axis never crosses the surface: it is inside or it is not.
+    along, inside = a < 1e-15, np.broadcast_to(c <= 0, a.shape)
+    entry = np.where(along, np.where(inside, -np.inf, np.inf), entry)
+    exit_ = np.where(along, np.where(inside, np.inf, -np.inf), exit_)
+    miss = np.isnan(entry)
+    return np.where(miss, np.inf, entry), np.where(miss, -np.inf, exit_)
+
+
+def cast(
+    solids: Sequence[Solid], origins: ArrayLike, directions: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """First hit of every ray.
+
+    Parameters
+    ----------
+    solids : sequence of Solid
+        Faces are numbered through all solids, in their order.
+    origins : (3,) or (..., 3) array_like
+        One origin for all rays, or one for each.
+    directions : (..., 3) array_like
+        Directions, of any length.
+
+    Returns
+    -------
+    distance : (...) float64
+        Ray parameter of the hit, in lengths of the direction; inf where nothing is hit.
+    face : (...) int32
+        Number of the face hit, -1 where nothing is.
+    """
+    directions = np.asarray(directions, np.float64)
+    shape = directions.shape[:-1]
+    directions = directions.reshape(-1, 3)
+    origins = np.asarray(origins, np.float64).reshape(-1, 3)
+    distance = np.full(len(directions), np.inf)
+    face = np.full(len(directions), -1, np.int32)
+    first = 0
+    for solid in solids:
+        entry, local = solid.intersect(origins, directions)
+        closer = entry < distance
+        distance[closer] = entry[closer]
+        face[closer] = first + local[closer]
+        first += solid.face_count
+    return distance.reshape(shape), face.reshape(shape)
+
+
+def half_space(normal: ArrayLike, point: ArrayLike) -> Solid:
+    """Everything behind the plane through `point` whose outward normal is `normal`."""
+    unit = np.asarray(normal, np.float64)
+    unit = unit / np.linalg.norm(unit)
+    return Solid(unit[None], -np.array([unit @ np.asarray(point, np.float64)]))
+
+
+def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
+    """Right prism over a convex polygon.
+
+    Parameters
+    ----------
+    outline : (M, 2) array_like
+        Corners of the base, counter-clockwise, metres.
+    height : float
+        Height of the prism along its own z axis; z runs from -height / 2 to height / 2.
+    rotation : (3, 3) array_like
+        World-from-solid rotation.
+    centre : (3,) array_like
+        World position of the solid's origin.
+    """
+    corners = np.asarray(outline, np.float64)
+    edges = np.roll(corners, -1, axis=0) - corners
+    sides = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    normals = np.vstack([sides, [[0, 0, 1], [0, 0, -1]]])
+    offsets = -np.append((sides[:, :2] * corners).sum(axis=1), [height / 2, height / 2])
+    return _placed(Solid(normals, offsets), rotation, centre)
+
+
+def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
+    """Box of a size (3,) in metres, rotated (world-from-box) and centred at `centre`."""
+    x, y, z = np.asarray(size, np.float64) / 2
+    return prism([(-x, -y), (x, -y), (x, y), (-x, y)], 2 * z, rotation, centre)
+
+
+def sphere(radius: float, centre: ArrayLike) -> Solid:
+    """Ball of a radius in metres."""
+    quadric = np.diag([1.0, 1.0, 1.0, -(radius**2)])
+    return _placed(Solid(np.zeros((0, 3)), np.zeros(0), quadric), np.eye(3), centre)
+
+
+def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
+    """Cylinder along its own z axis, with flat ends."""
+    normals, offsets = np.array([[0.0, 0, 1], [0, 0, -1]]), np.full(2, -height / 2)
+    quadric = np.diag([1.0, 1.0, 0.0, -(radius**2)])
+    return _placed(Solid(normals, offsets, quadric), rotation, centre)
+
+
+def _placed(solid: Solid, rotation: ArrayLike, centre: ArrayLike) -> Solid:
+    """Return the solid after p -> rotation @ p + centre."""
+    rotation, centre = np.asarray(rotation, np.float64), np.asarray(centre, np.float64)
+    normals = solid.normals @ rotation.T
+    offsets = solid.offsets - normals @ centre
+    quadric = solid.quadric
+    if quadric is not None:
+        back = np.eye(4)
+        back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ centre
+        quadric = back.T @ quadric @ back
+    return Solid(normals, offsets, quadric)
