@@ -1,0 +1,345 @@
+"""Depth frames in recordings: rosbag2 (mcap, sqlite3) and ROS 1 bags, read and written."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rosbags import rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+from rangeseg_ros.core.camera import Camera, CameraError
+from rangeseg_ros.io.depth_encodings import (
+    PIXEL_TYPES,
+    EncodingError,
+    decode_compressed,
+    decode_image,
+)
+from rangeseg_ros.io.recordings import RecordingError, open_recording
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+
+
+class BagError(ValueError):
+    """A recording that cannot be read or written, or that lacks depth images or their camera."""
+
+
+class DamagedBagError(BagError):
+    """A recording that cannot be read further than here."""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthFrame:
+    """A depth image of a recording.
+
+    Attributes
+    ----------
+    stamp : int
+        Time of the measurement (header stamp), nanoseconds.
+    frame_id : str
+        Optical frame of the camera.
+    depth : (H, W) uint16 or float32
+        Millimetres with 0 invalid, or metres with non-finite or <= 0 invalid.
+    camera : Camera
+        The latest camera_info before the image, or else the first one.
+    """
+
+    stamp: int
+    frame_id: str
+    depth: NDArray[np.uint16] | NDArray[np.float32]
+    camera: Camera
+
+
+class DepthBag:
+    """Iterates over the depth frames of one recording, in the order of the recording.
+
+    Parameters
+    ----------
+    path : Path
+        Directory or .mcap or .db3 file of a rosbag2, or .bag file of ROS 1.
+    depth_topic, camera_topic : str, optional
+        Where to find images and intrinsics. By default the depth image is found by type and
+        name, or encoding; its camera_info is the sibling topic, or the only one there is.
+
+    Attributes
+    ----------
+    depth_topic, camera_topic : str
+        The topics in use.
+
+    Raises
+    ------
+    BagError
+        Not a recording, or one without depth images or camera_info: the message lists its
+        topics. Also an image of unknown encoding, and intrinsics that do not fit it.
+    DamagedBagError
+        While iterating, after the last frame before the damage.
+    """
+
+    def __init__(
+        self, path: Path, depth_topic: str | None = None, camera_topic: str | None = None
+    ) -> None:
+        self.path = path
+        try:
+            self._recording = open_recording(path)
+        except OSError as error:
+            raise BagError(f'{path}: {error.strerror}') from None
+        except RecordingError as error:
+            raise BagError(f'{path}: {error}') from None
+        try:
+            self.depth_topic = depth_topic or self._find_depth_topic()
+            self._require(self.depth_topic, 'depth image', (IMAGE, COMPRESSED_IMAGE))
+            self.camera_topic = camera_topic or self._find_camera_topic()
+            self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
+            self._first_camera = self._read_camera(self._first_message(self.camera_topic))
+            self._frame(self._first_message(self.depth_topic), self._first_camera)
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> DepthBag:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
+        self._recording.close()
+
+    def __len__(self) -> int:
+        """Count the depth images, of a damaged recording those before the damage."""
+        return self._recording.counts[self.depth_topic]
+
+    def __iter__(self) -> Iterator[DepthFrame]:
+        camera = self._first_camera
+        count = 0
+        try:
+            for topic, message in self._recording.messages((self.depth_topic, self.camera_topic)):
+                if topic == self.camera_topic:
+                    latest = self._read_camera(message)
+                    camera = camera if latest == camera else latest  # keeps its cached rays
+                else:
+                    yield self._frame(message, camera)
+                    count += 1
+        # Readers meet damaged bytes with exceptions of every kind.
+        except Exception as error:
+            raise DamagedBagError(f'{self.path}: damaged after {count} frames: {error}') from error
+
+    def _frame(self, message: Any, camera: Camera) -> DepthFrame:
+        where = f'{self.path}: {self.depth_topic}'
+        try:
+            if hasattr(message, 'format'):
+                depth = decode_compressed(message.format, message.data)
+            else:
+                depth = decode_image(
+                    message.height,
+                    message.width,
+                    message.encoding,
+                    bool(message.is_bigendian),
+                    message.step,
+                    message.data,
+                )
+        except EncodingError as error:
+            raise BagError(f'{where}: {error}') from None
+        if depth.shape != camera.shape:
+            raise BagError(
+                f'{where} is {depth.shape[1]}x{depth.shape[0]}, but {self.camera_topic} '
+                f'{camera.width}x{camera.height}'
+            )
+        stamp = message.header.stamp
+        return DepthFrame(
+            stamp.sec * 10**9 + stamp.nanosec, message.header.frame_id, depth, camera
+        )
+
+    def _read_camera(self, message: Any) -> Camera:
+        ros1 = hasattr(message, 'K')
+        roi = message.roi
+        try:
+            return Camera.from_matrices(
+                message.width,
+                message.height,
+                message.K if ros1 else message.k,
+                message.P if ros1 else message.p,
+                (message.binning_x, message.binning_y),
+                (roi.x_offset, roi.y_offset, roi.width, roi.height),
+            )
+        except CameraError as error:
+            raise BagError(f'{self.path}: {self.camera_topic}: {error}') from None
+
+    def _first_message(self, topic: str) -> Any:
+        try:
+            for _, message in self._recording.messages((topic,)):
+                return message
+            reason = 'no message'
+        except Exception as error:
+            reason = f'no readable message: {error}'
+        raise BagError(f'{self.path}: {reason} on {topic}')
+
+    def _find_depth_topic(self) -> str:
+        types = self._recording.types
+        images = [name for name, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+        found = [name for name in images if 'depth' in name.lower() and self._may_be_depth(name)]
+        found = found or [name for name in images if self._may_be_depth(name)]
+        if not found:
+            raise BagError(f'{self.path}: no depth image; {self._topics_there_are()}')
+        return min(
+            found,
+            key=lambda name: (
+                _sibling_camera_info(name) not in types,
+                types[name] == COMPRESSED_IMAGE,
+                len(name),
+                name,
+            ),
+        )
+
+    def _may_be_depth(self, topic: str) -> bool:
+        if self._recording.counts[topic] == 0:
+            return False
+        message = self._first_message(topic)
+        if hasattr(message, 'format'):
+            return 'compressedDepth' in message.format
+        return message.encoding in PIXEL_TYPES
+
+    def _find_camera_topic(self) -> str:
+        there = [name for name, kind in self._recording.types.items() if kind == CAMERA_INFO]
+        sibling = _sibling_camera_info(self.depth_topic)
+        if sibling in there:
+            return sibling
+        if len(there) == 1:
+            return there[0]
+        raise BagError(
+            f'{self.path}: no camera_info for {self.depth_topic}; {self._topics_there_are()}'
+        )
+
+    def _require(self, topic: str, what: str, kinds: tuple[str, ...]) -> None:
+        if self._recording.types.get(topic) not in kinds:
+            raise BagError(f'{self.path}: no {what} on {topic}; {self._topics_there_are()}')
+
+    def _topics_there_are(self) -> str:
+        topics = sorted(self._recording.types.items())
+        listed = ', '.join(f'{name} [{kind}]' for name, kind in topics) or 'none'
+        damage = self._recording.damage
+        return f'topics: {listed}' + (f' (damaged: {damage})' if damage else '')
+
+
+def _sibling_camera_info(image_topic: str) -> str:
+    """Topic of the intrinsics, by the convention of image_transport."""
+    base = re.sub(r'/compressed(Depth)?$', '', image_topic)
+    return base.rpartition('/')[0] + '/camera_info'
+
+
+class DepthBagWriter:
+    """Writes depth frames of one camera to a new rosbag2 (mcap).
+
+    The topics are those to which the node listens by default. The recording appears under its
+    name once it is complete.
+
+    Parameters
+    ----------
+    path : Path
+        Directory to make.
+    camera : Camera
+        Intrinsics, written with every image.
+    frame_id : str
+        Optical frame of the camera.
+
+    Raises
+    ------
+    BagError
+        `path` exists, or an image does not have the camera's size or a depth image's type.
+
+    Examples
+    --------
+    >>> with DepthBagWriter(path, camera) as bag:
+    ...     bag.write(depth, stamp)
+    """
+
+    depth_topic = '/depth/image_rect'
+    camera_topic = '/depth/camera_info'
+
+    def __init__(
+        self, path: Path, camera: Camera, frame_id: str = 'camera_depth_optical_frame'
+    ) -> None:
+        self.path = Path(path)
+        self.camera = camera
+        self.frame_id = frame_id
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+
+    def __enter__(self) -> DepthBagWriter:
+        if self.path.exists():
+            raise BagError(f'{self.path}: exists already, not overwritten')
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._partial = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self.path.parent))
+        self._writer = rosbag2.Writer(
+            self._partial / self.path.name, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
+        )
+        self._writer.open()
+        self._image = self._writer.add_connection(self.depth_topic, IMAGE, typestore=self._store)
+        self._info = self._writer.add_connection(
+            self.camera_topic, CAMERA_INFO, typestore=self._store
+        )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        try:
+            self._writer.__exit__(kind, error, trace)
+            if kind is None:
+                (self._partial / self.path.name).rename(self.path)
+        finally:
+            shutil.rmtree(self._partial)
+
+    def write(self, depth: NDArray[np.uint16] | NDArray[np.float32], stamp: int) -> None:
+        """Append an image, (H, W) uint16 millimetres or float32 metres, at `stamp` nanoseconds."""
+        encodings = {np.dtype(np.uint16): '16UC1', np.dtype(np.float32): '32FC1'}
+        if depth.shape != self.camera.shape or depth.dtype not in encodings:
+            raise BagError(
+                f'depth image must be {self.camera.shape} uint16 or float32, '
+                f'not {depth.shape} {depth.dtype}'
+            )
+        types = self._store.types
+        time = types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
+        header = types['std_msgs/msg/Header'](time, self.frame_id)
+        height, width = depth.shape
+        little_endian = np.ascontiguousarray(depth, depth.dtype.newbyteorder('<'))
+        image = types[IMAGE](
+            header=header,
+            height=height,
+            width=width,
+            encoding=encodings[depth.dtype],
+            is_bigendian=0,
+            step=width * depth.itemsize,
+            data=little_endian.view(np.uint8).ravel(),
+        )
+        camera = self.camera
+        k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        info = types[CAMERA_INFO](
+            header=header,
+            height=height,
+            width=width,
+            distortion_model='plumb_bob',
+            d=np.zeros(5),
+            k=k.ravel(),
+            r=np.eye(3).ravel(),
+            p=np.column_stack([k, np.zeros(3)]).ravel(),
+            binning_x=0,
+            binning_y=0,
+            roi=types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
+        )
+        for connection, message in ((self._info, info), (self._image, image)):
+            data = self._store.serialize_cdr(message, connection.msgtype)
+            self._writer.write(connection, stamp, data)
