@@ -1,0 +1,322 @@
+"""Hoover's metrics: cases counted by hand, every tie rule, and a literal oracle."""
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from rangeseg_ros.evaluation.hoover import (
+    ComparisonError,
+    Overlap,
+    RegionClass,
+    angle_errors,
+    classify,
+    overlap_figures,
+    plane_errors,
+)
+
+
+def overlap(*runs):
+    """Overlap of two one-row images given as runs (truth label, found label, pixels)."""
+    truth = np.concatenate([np.full(n, g, np.uint16) for g, _, n in runs])
+    labels = np.concatenate([np.full(n, m, np.uint16) for _, m, n in runs])
+    return Overlap.between(truth[None], labels[None])
+
+
+def counts(runs, tolerance):
+    result = classify(overlap(*runs), tolerance).counts()
+    return tuple(result[k] for k in ('regions', 'correct', 'over', 'under', 'missed', 'noise'))
+
+
+# --- correct -------------------------------------------------------------------------------------
+
+
+def test_identical_images_are_correct_at_any_tolerance():
+    runs = [(1, 7, 10), (2, 5, 20), (0, 0, 5)]
+    for tolerance in (0.51, 0.8, 1.0):
+        assert counts(runs, tolerance) == (2, 2, 0, 0, 0, 0)
+
+
+def test_exactly_the_tolerance_is_enough():
+    # 8 of the 10 pixels on both sides: m1 = m2 = 0.8.
+    runs = [(1, 1, 8), (1, 0, 2), (0, 1, 2)]
+    assert counts(runs, 0.8) == (1, 1, 0, 0, 0, 0)
+    assert counts(runs, 0.81) == (1, 0, 0, 0, 1, 1)
+
+
+def test_both_sides_must_reach_the_tolerance():
+    # m1 = 8/8, m2 = 8/16.
+    assert counts([(1, 1, 8), (0, 1, 8)], 0.51) == (1, 0, 0, 0, 1, 1)
+    # m1 = 8/16, m2 = 8/8; a single part is no over-segmentation.
+    assert counts([(1, 1, 8), (1, 0, 8)], 0.51) == (1, 0, 0, 0, 1, 1)
+
+
+def test_unlabelled_pixels_count_as_part_of_the_region():
+    # Region 1 has 10 pixels, 4 of them without a label in the segmentation: m1 = 0.6.
+    runs = [(1, 1, 6), (1, 0, 4)]
+    assert counts(runs, 0.6) == (1, 1, 0, 0, 0, 0)
+    assert counts(runs, 0.7) == (1, 0, 0, 0, 1, 1)
+
+
+# --- over-segmentation ---------------------------------------------------------------------------
+
+
+def test_two_halves_are_an_over_segmentation():
+    # Neither half reaches m1 = 0.51; together m1 = 10/10, m2 = 10/10.
+    assert counts([(1, 1, 5), (1, 2, 5)], 0.51) == (1, 0, 1, 0, 0, 0)
+
+
+def test_parts_must_cover_the_region_together():
+    # m1 = 7/10 of the whole: over at 0.7, nothing at 0.8.
+    runs = [(1, 1, 4), (1, 2, 3), (1, 0, 3)]
+    assert counts(runs, 0.7) == (1, 0, 1, 0, 0, 0)
+    assert counts(runs, 0.8) == (1, 0, 0, 0, 1, 2)
+
+
+def test_a_part_that_lies_mostly_outside_does_not_count():
+    # Part 2 has 3 of 6 pixels inside: only part 1 is left, and one part is no over-segmentation;
+    # it has m1 = 6/9 = 0.67, so it is correct at 0.6.
+    runs = [(1, 1, 6), (1, 2, 3), (0, 2, 3)]
+    assert counts(runs, 0.6) == (1, 1, 0, 0, 0, 1)
+
+
+def test_a_speck_inside_turns_correct_into_over_segmentation():
+    # Thesis 6.1.3: correct has (90/100, 90/90), mean 0.95; over (91/100, 91/91), mean 0.955.
+    assert counts([(1, 1, 90), (1, 2, 1), (1, 0, 9)], 0.8) == (1, 0, 1, 0, 0, 0)
+
+
+def test_correct_stays_when_over_segmentation_measures_lower():
+    # Part 2 has 3 of its 5 pixels inside, 0.6 >= T = 0.58, and costs m2 what it gains m1.
+    # Correct: (44/75, 44/44), mean 0.79333; over: (47/75, 47/49), mean 0.79293.
+    assert counts([(1, 1, 44), (1, 2, 3), (0, 2, 2), (1, 0, 28)], 0.58) == (1, 1, 0, 0, 0, 1)
+    # Correct: (46/75, 46/46), mean 0.80667; over: (49/75, 49/51), mean 0.80706.
+    assert counts([(1, 1, 46), (1, 2, 3), (0, 2, 2), (1, 0, 26)], 0.58) == (1, 0, 1, 0, 0, 0)
+
+
+def test_correct_wins_a_tie_with_over_segmentation():
+    # Correct (45/75, 45/45) = (0.6, 1), over (48/75, 48/50) = (0.64, 0.96): both means 0.8.
+    # Part 2, 3/5 = 0.6 inside, is left without a class: noise.
+    assert counts([(1, 1, 45), (1, 2, 3), (0, 2, 2), (1, 0, 27)], 0.6) == (1, 1, 0, 0, 0, 1)
+
+
+# --- under-segmentation --------------------------------------------------------------------------
+
+
+def test_two_regions_in_one_are_an_under_segmentation_of_the_found_one():
+    # `under` counts the one region of the segmentation; both regions of the truth have a class.
+    assert counts([(1, 1, 5), (2, 1, 5)], 0.51) == (2, 0, 0, 1, 0, 0)
+
+
+def test_under_segmentation_must_fill_the_found_region():
+    # m2 = 7/10.
+    runs = [(1, 1, 4), (2, 1, 3), (0, 1, 3)]
+    assert counts(runs, 0.7) == (2, 0, 0, 1, 0, 0)
+    assert counts(runs, 0.8) == (2, 0, 0, 0, 2, 1)
+
+
+def test_swallowing_a_small_region_turns_correct_into_under_segmentation():
+    # Correct (90/90, 90/100), mean 0.95; under (100/100, 100/100).
+    assert counts([(1, 1, 90), (2, 1, 10)], 0.8) == (2, 0, 0, 1, 0, 0)
+
+
+def test_correct_wins_a_tie_with_under_segmentation():
+    # The mirror of the tie above: means 0.8 and 0.8, under-segmentation must be strictly higher.
+    assert counts([(1, 1, 45), (2, 1, 3), (2, 0, 2), (0, 1, 27)], 0.6) == (2, 1, 0, 0, 1, 0)
+
+
+def test_under_segmentation_takes_over_a_part_of_an_over_segmentation():
+    # Truth 1 (102): 80 in found 1, 2 in found 2, 20 unlabelled; truth 2 (10) wholly in found 1.
+    # T = 0.75. Correct 1-1: (80/102, 80/90), mean 0.837. Over: (82/102, 82/92), mean 0.848,
+    # higher. Under, found 1 with truths 1 and 2: (90/112, 90/90), mean 0.902, strictly higher.
+    # Truths 1 and 2 and found 1 become under; found 2 keeps its class over, although no region
+    # of the truth is over-segmented any more.
+    runs = [(1, 1, 80), (1, 2, 2), (1, 0, 20), (2, 1, 10)]
+    assert counts(runs, 0.75) == (2, 0, 0, 1, 0, 0)
+    result = classify(overlap(*runs), 0.75)
+    assert result.labels.tolist() == [RegionClass.UNDER, RegionClass.OVER]
+    assert result.truth.tolist() == [RegionClass.UNDER, RegionClass.UNDER]
+    assert result.matches == {}
+
+
+def test_over_segmentation_that_measures_higher_keeps_its_part():
+    # As above but 15 pixels in found 2, truth 1 (100): over (95/100, 95/105), mean 0.927; under
+    # (90/110, 90/90), mean 0.909. Truth 2 is missed.
+    runs = [(1, 1, 80), (1, 2, 15), (1, 0, 5), (2, 1, 10)]
+    assert counts(runs, 0.8) == (2, 0, 1, 0, 1, 0)
+
+
+# --- the rest ------------------------------------------------------------------------------------
+
+
+def test_what_has_no_class_is_missed_or_noise():
+    assert counts([(1, 0, 10), (0, 3, 10), (0, 0, 4)], 0.8) == (1, 0, 0, 0, 1, 1)
+
+
+def test_empty_images():
+    assert counts([(0, 0, 4)], 0.8) == (0, 0, 0, 0, 0, 0)
+    assert counts([(1, 0, 4)], 0.8) == (1, 0, 0, 0, 1, 0)
+    assert counts([(0, 1, 4)], 0.8) == (0, 0, 0, 0, 0, 1)
+
+
+def test_tens_of_thousands_of_regions():
+    labels = np.arange(1, 40001, dtype=np.uint16).reshape(200, 200)
+    assert classify(Overlap.between(labels, labels), 1.0).counts()['correct'] == 40000
+
+
+@pytest.mark.parametrize('tolerance', [0.5, 1.01, -1.0, float('nan')])
+def test_tolerance_out_of_range(tolerance):
+    with pytest.raises(ComparisonError, match='tolerance'):
+        classify(overlap((1, 1, 4)), tolerance)
+
+
+def test_images_that_cannot_be_compared():
+    with pytest.raises(ComparisonError, match='size'):
+        Overlap.between(np.zeros((2, 2), int), np.zeros((2, 3), int))
+    with pytest.raises(ComparisonError, match='integers'):
+        Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
+
+
+def test_judged_pixels_only():
+    truth = np.array([[1, 1, 1, 0, 0, 2]])
+    labels = np.array([[4, 4, 4, 4, 9, 0]])
+    result = Overlap.between(truth, labels, judged=truth > 0)
+    # Found region 9 lies only where nothing is judged: it does not exist. Region 4 has 3 pixels.
+    assert result.labels.tolist() == [4] and result.label_sizes.tolist() == [3]
+    assert classify(result, 1.0).counts()['correct'] == 1
+
+
+def literal(truth, labels, tolerance):
+    """The five metrics as the reference tool is described, pixel by pixel and in its order."""
+    gts = sorted({int(v) for v in truth.flat} - {0})
+    mss = sorted({int(v) for v in labels.flat} - {0})
+
+    def size(image, k):
+        return sum(int(v) == k for v in image.flat)
+
+    def both(n, m):
+        return sum(
+            int(a) == n and int(b) == m for a, b in zip(truth.flat, labels.flat, strict=True)
+        )
+
+    gt_class = dict.fromkeys(gts)
+    ms_class = dict.fromkeys(mss)
+    for n in gts:
+        for m in mss:
+            m1, m2 = both(n, m) / size(truth, n), both(n, m) / size(labels, m)
+            if m1 >= tolerance and m2 >= tolerance:
+                gt_class[n] = ms_class[m] = ('correct', m1, m2)
+    for n in gts:
+        parts = [m for m in mss if both(n, m) / size(labels, m) >= tolerance]
+        if len(parts) < 2:
+            continue
+        covered = sum(both(n, m) for m in parts)
+        m1, m2 = covered / size(truth, n), covered / sum(size(labels, m) for m in parts)
+        if m1 >= tolerance and m2 >= tolerance:
+            if gt_class[n] and (gt_class[n][1] + gt_class[n][2]) / 2 >= (m1 + m2) / 2:
+                continue
+            gt_class[n] = ('over', m1, m2)
+            ms_class.update(dict.fromkeys(parts, ('over', m1, m2)))
+    for m in mss:
+        parts = [n for n in gts if both(n, m) / size(truth, n) >= tolerance]
+        if len(parts) < 2:
+            continue
+        covered = sum(both(n, m) for n in parts)
+        m1, m2 = covered / sum(size(truth, n) for n in parts), covered / size(labels, m)
+        if m1 >= tolerance and m2 >= tolerance:
+            if ms_class[m] and not (m1 + m2) / 2 > (ms_class[m][1] + ms_class[m][2]) / 2:
+                continue
+            ms_class[m] = ('under', m1, m2)
+            gt_class.update(dict.fromkeys(parts, ('under', m1, m2)))
+    return (
+        [c[0] if c else None for c in gt_class.values()],
+        [c[0] if c else None for c in ms_class.values()],
+    )
+
+
+NAMES = {
+    RegionClass.UNMATCHED: None,
+    RegionClass.CORRECT: 'correct',
+    RegionClass.OVER: 'over',
+    RegionClass.UNDER: 'under',
+}
+RUNS = st.lists(
+    st.tuples(st.integers(0, 3), st.integers(0, 3), st.integers(1, 30)), min_size=1, max_size=9
+)
+
+
+@given(RUNS, st.sampled_from([0.51, 0.6, 0.75, 0.8, 0.9, 1.0]))
+@example([(1, 1, 45), (1, 2, 3), (0, 2, 2), (1, 0, 27)], 0.6)
+@example([(1, 1, 80), (1, 2, 2), (1, 0, 20), (2, 1, 10)], 0.75)
+def test_classes_are_those_of_the_literal_counting(runs, tolerance):
+    truth = np.concatenate([np.full(n, g) for g, _, n in runs])
+    labels = np.concatenate([np.full(n, m) for _, m, n in runs])
+    result = classify(Overlap.between(truth, labels), tolerance)
+    found = ([NAMES[c] for c in result.truth], [NAMES[c] for c in result.labels])
+    assert found == literal(truth, labels, tolerance)
+
+
+# --- figures by overlap --------------------------------------------------------------------------
+
+
+def test_overlap_figures_by_hand():
+    # Truth 1 (10): 8 in found 1 (10 pixels): IoU 8/12; 2 in found 2 (4 pixels): IoU 2/12.
+    # Truth 2 (6): 2 in found 2: IoU 2/8; 4 in found 3 (4): IoU 4/6.
+    # Truth 3 (5): untouched, IoU 0. Mean of the best: (2/3 + 2/3 + 0) / 3.
+    # One to one: 1-1 (8) and 2-3 (4): 12 of 21 pixels. No IoU reaches 0.8.
+    item = overlap((1, 1, 8), (0, 1, 2), (1, 2, 2), (2, 2, 2), (2, 3, 4), (3, 0, 5))
+    figures = overlap_figures([item])
+    assert figures['mean_iou'] == pytest.approx(4 / 9)
+    assert figures['pixel_accuracy'] == pytest.approx(12 / 21)
+    assert figures['precision'] == figures['recall'] == 0
+    figures = overlap_figures([item], threshold=0.6)
+    assert figures['precision'] == pytest.approx(2 / 3)
+    assert figures['recall'] == pytest.approx(2 / 3)
+
+
+def test_assignment_is_the_best_not_the_greedy_one():
+    # Greedy takes 1-1 (5) and is left with 2-2 (0): 5. Best: 1-2 (4) and 2-1 (4): 8 of 13.
+    item = overlap((1, 1, 5), (1, 2, 4), (2, 1, 4))
+    assert overlap_figures([item])['pixel_accuracy'] == pytest.approx(8 / 13)
+
+
+def test_figures_are_pooled_over_images():
+    perfect, lost = overlap((1, 1, 30)), overlap((1, 0, 10), (0, 1, 10))
+    figures = overlap_figures([perfect, lost])
+    assert figures == {
+        'mean_iou': 0.5,
+        'pixel_accuracy': 0.75,
+        'precision': 0.5,
+        'recall': 0.5,
+    }
+
+
+def test_figures_without_regions_are_undefined():
+    assert all(np.isnan(v) for v in overlap_figures([overlap((0, 0, 4))]).values())
+
+
+# --- angles and planes ---------------------------------------------------------------------------
+
+
+def test_angle_errors_of_correct_pairs():
+    normals = {5: (0, 0, -1), 6: (0, -1, 0), 7: (0, np.sin(0.1), -np.cos(0.1))}
+    matches = {10: 5, 11: 6, 12: 7}
+    # 5-6 is 90 degrees; 5-7 is 0.1 rad; 13 has no match.
+    angles = [(10, 11, 88.0), (10, 12, 0.0), (11, 13, 45.0)]
+    assert angle_errors(angles, normals, matches) == pytest.approx([2.0, np.degrees(0.1)])
+    # 174 degrees and 6 degrees are one angle between planes.
+    assert angle_errors([(10, 12, 174.0)], normals, matches) == pytest.approx(
+        [6 - np.degrees(0.1)]
+    )
+    assert angle_errors([], normals, matches).shape == (0,)
+
+
+def test_plane_errors():
+    tilt = np.radians(3)
+    truth = {1: (0, 0, -1, 2.0), 2: (0, -1, 0, 1.0), 3: (1, 0, 0, 1)}
+    found = {
+        7: (0, -np.sin(tilt), -np.cos(tilt), 2.01),
+        8: (0, 1, 0, -1.5),  # the same plane with the other sign
+    }
+    errors = plane_errors(truth, found, {1: 7, 2: 8, 3: 9, 4: 7})
+    assert errors == pytest.approx(np.array([[3.0, 0.01], [0.0, 0.5]]))
+    assert plane_errors(truth, found, {}).shape == (0, 2)
