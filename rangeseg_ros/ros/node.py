@@ -1,0 +1,174 @@
+"""The node: depth messages in; labels, planes, markers and overlay out while somebody listens."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+import traceback
+from threading import Thread
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.time import Time
+
+from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
+from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
+from rangeseg_ros.ros.latest import Latest
+from rangeseg_ros.ros.messages import OUTPUTS, make_rclpy, message_class
+from rangeseg_ros.ros.parameters import NodeConfig, bind
+
+
+class SegmentPlanes(Node):
+    """Segments the newest depth message whenever it is free, while any output is subscribed.
+
+    The executor's thread receives, answers parameter requests and reports; one worker thread
+    computes and publishes.
+    """
+
+    def __init__(self) -> None:
+        super().__init__('segment_planes')
+        self._config = bind(self, self._configure)
+        self._segmenter = Segmenter(self._config)
+        self._input: DepthInput | None = None
+        self._frames: Latest[DepthFrame] = Latest()
+        self._statistics = FrameStatistics()
+        events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
+        overriding = QoSOverridingOptions.with_default_policies()
+        self._outputs = {
+            name: self.create_publisher(
+                message_class(output.kind),
+                f'~/{name}',
+                QoSProfile(depth=5),
+                event_callbacks=events,
+                qos_overriding_options=overriding,
+            )
+            for name, output in OUTPUTS.items()
+        }
+        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._timer = self.create_timer(1.0, self._report)
+        self._worker = Thread(target=self._work, name='segmentation', daemon=True)
+        self._worker.start()
+
+    def stop(self, patience: float) -> bool:
+        """Let the worker finish the frame in hand; False when it takes more seconds than that."""
+        self._frames.close()
+        self._worker.join(patience)
+        return not self._worker.is_alive()
+
+    def _configure(self, config: NodeConfig) -> None:
+        restart = config.input != self._config.input
+        self._config = config
+        self._segmenter = Segmenter(config)
+        if restart and self._input:
+            self._input.destroy()
+            self._input = None
+            self._follow_demand()
+
+    def _follow_demand(self) -> None:
+        """Subscribe to the input when the first listener comes, unsubscribe with the last."""
+        listeners = sum(output.get_subscription_count() for output in self._outputs.values())
+        if listeners and self._input is None:
+            lost = self._statistics.lost.add
+            self._input = DepthInput(self, self._config.input, self._accept, lost)
+        elif not listeners and self._input:
+            self._input.destroy()
+            self._input = None
+
+    def _accept(self, frame: DepthFrame) -> None:
+        self._statistics.received.add()
+        if self._frames.put(frame):
+            self._statistics.dropped.add()
+
+    def _work(self) -> None:
+        while frame := self._frames.take():
+            try:
+                self._segment(frame)
+                self._statistics.problem = ''
+            except ValueError as error:
+                self._refuse(str(error))
+            # Whatever one frame does to the segmenter, the next one gets its chance.
+            except Exception as error:
+                if not self.context.ok():
+                    return
+                self._refuse(f'{type(error).__name__}: {error}')
+                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
+
+    def _segment(self, frame: DepthFrame) -> None:
+        ticks = [time.perf_counter()]
+        start = self.get_clock().now().nanoseconds
+        image = frame.range_image()
+        ticks.append(time.perf_counter())
+        result = self._segmenter.segment(image)
+        ticks.append(time.perf_counter())
+        header = frame.message.header
+        for name, output in OUTPUTS.items():
+            publisher = self._outputs[name]
+            if publisher.get_subscription_count():
+                publisher.publish(output.message(make_rclpy, header, image, result))
+        ticks.append(time.perf_counter())
+        conversion, compute, publication = (
+            1000 * (end - begin) for begin, end in zip(ticks, ticks[1:], strict=False)
+        )
+        self._statistics.times = FrameTimes(
+            transport=(frame.arrival - Time.from_msg(header.stamp).nanoseconds) / 1e6,
+            waiting=(start - frame.arrival) / 1e6,
+            conversion=conversion,
+            compute=compute,
+            publication=publication,
+            stages=result.timings,
+        )
+        self._statistics.planes = len(result.planes)
+        self._statistics.reason = result.reason
+        self._statistics.published.add()
+
+    def _refuse(self, problem: str) -> None:
+        self._statistics.problem = problem
+        self._statistics.refused.add()
+        self.get_logger().warning(f'frame refused: {problem}', throttle_duration_sec=5.0)
+
+    def _report(self) -> None:
+        name = self.get_fully_qualified_name().lstrip('/')
+        status = self._statistics.status(name, self._input, self._config.stall_timeout)
+        report = DiagnosticArray(status=[status])
+        report.header.stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(report)
+
+
+def main() -> None:
+    """Run the node until it is told to stop; bad parameters end it with exit code 2."""
+    # rclpy's own handler ends the spinning. Without this, Python's would raise KeyboardInterrupt
+    # on top, wherever the code is, and again on every further Ctrl-C.
+    signal.signal(signal.SIGINT, lambda number, stack: None)
+    rclpy.init()
+    finished = True
+    try:
+        node = SegmentPlanes()
+    except (ConfigError, ParameterException) as error:
+        print(f'segment_planes: {error}', file=sys.stderr)
+        rclpy.try_shutdown()
+        sys.exit(2)
+    try:
+        rclpy.spin(node)
+    except ExternalShutdownException:
+        pass
+    finally:
+        finished = node.stop(patience=2.0)
+    if not finished:
+        # No thread may outlive the interpreter inside a solver that takes minutes.
+        os._exit(0)
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+if __name__ == '__main__':
+    main()

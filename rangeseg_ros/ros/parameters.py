@@ -1,0 +1,97 @@
+"""ROS parameters of the node, declared from the fields of its configuration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import Field, dataclass, fields, replace
+from typing import Any
+
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from rangeseg_ros.core.config import Config, ConfigError, option
+
+
+@dataclass(frozen=True)
+class NodeConfig(Config):
+    """The parameters of the segmenter and those that only the node has."""
+
+    input: str = option(
+        'image',
+        'depth images (image), images of compressed_depth_image_transport (compressed_depth) or '
+        'organised clouds (points)',
+        choices=('image', 'compressed_depth', 'points'),
+    )
+    stall_timeout: float = option(
+        2.0,
+        'seconds without a depth image, while somebody listens, that /diagnostics calls an error',
+        low=0.1,
+        high=3600.0,
+    )
+
+
+def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
+    """Declare the parameters of `node` and keep a configuration in step with them.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    apply : callable
+        Gets the new configuration after every successful change.
+
+    Returns
+    -------
+    NodeConfig
+        The configuration to start with.
+
+    Raises
+    ------
+    ConfigError, rclpy.exceptions.ParameterException
+        A bad value among the parameters that the node was started with.
+    """
+    for declared in fields(NodeConfig):
+        node.declare_parameter(declared.name, declared.default, _descriptor(declared))
+    names = [declared.name for declared in fields(NodeConfig)]
+    config = NodeConfig(**{name: node.get_parameter(name).value for name in names})
+
+    def changed(parameters: list[Parameter]) -> NodeConfig:
+        return replace(config, **{p.name: p.value for p in parameters if p.name in names})
+
+    def check(parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            changed(parameters)
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def keep(parameters: list[Parameter]) -> None:
+        nonlocal config
+        config = changed(parameters)
+        apply(config)
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(keep)
+    return config
+
+
+def _descriptor(declared: Field[Any]) -> ParameterDescriptor:
+    """Description and range of a `Config` field."""
+    metadata = declared.metadata
+    descriptor = ParameterDescriptor(description=metadata['description'])
+    if metadata['choices']:
+        descriptor.additional_constraints = f'one of {", ".join(metadata["choices"])}'
+    if metadata['low'] is not None and isinstance(declared.default, float):
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=metadata['low'], to_value=metadata['high'])
+        ]
+    elif metadata['low'] is not None:
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(metadata['low']), to_value=int(metadata['high']), step=1)
+        ]
+    return descriptor

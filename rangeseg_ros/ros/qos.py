@@ -1,0 +1,107 @@
+"""Quality of service that follows what the publishers of a topic offer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+
+class MatchedSubscription:
+    """A subscription that is reliable where every publisher offers it, else best effort.
+
+    The middleware's own `best_available` policy looks once, when the subscription is made, and
+    takes a topic without publishers for a reliable one. Here the choice is made anew whenever
+    publishers come or go. The parameter `qos_overrides.<topic>.subscription.reliability` ends it.
+
+    Parameters
+    ----------
+    node : rclpy.node.Node
+    kind : type
+        Class of the messages.
+    topic : str
+    callback : callable
+        Gets every message.
+    lost : callable, optional
+        Gets the number of messages that the middleware lost, each time it notices a loss.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        lost: Callable[[int], None] = lambda count: None,
+    ) -> None:
+        self._node = node
+        self._arguments = kind, topic, callback
+        self._events = SubscriptionEventCallbacks(
+            matched=self._follow_publishers,
+            incompatible_qos=self._follow_publishers,
+            message_lost=lambda event: lost(_newly_lost(event)),
+        )
+        self._subscription = self._create()
+
+    @property
+    def topic(self) -> str:
+        """Name of the topic, remapped."""
+        name: str = self._subscription.topic_name
+        return name
+
+    @property
+    def publishers(self) -> int:
+        """Number of publishers, whether their quality of service fits or not."""
+        count: int = self._node.count_publishers(self.topic)
+        return count
+
+    def destroy(self) -> None:
+        """Unsubscribe."""
+        self._node.destroy_subscription(self._subscription)
+
+    def _create(self) -> Subscription:
+        kind, topic, callback = self._arguments
+        resolved = self._node.resolve_topic_name(topic)
+        self._offered = self._best_offered(resolved)
+        self._overridden = True
+
+        def choose(qos: QoSProfile) -> SetParametersResult:
+            if qos.reliability == ReliabilityPolicy.BEST_AVAILABLE:
+                self._overridden = False
+                qos.reliability, qos.durability = self._offered
+            return SetParametersResult(successful=True)
+
+        return self._node.create_subscription(
+            kind,
+            topic,
+            callback,
+            QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_AVAILABLE),
+            event_callbacks=self._events,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(callback=choose),
+        )
+
+    def _best_offered(self, topic: str) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
+        """The strictest policies that fit every publisher; those that fit any when there is none."""
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
+        reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+        latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
+        return (
+            ReliabilityPolicy.RELIABLE if offers and reliable else ReliabilityPolicy.BEST_EFFORT,
+            DurabilityPolicy.TRANSIENT_LOCAL if offers and latched else DurabilityPolicy.VOLATILE,
+        )
+
+    def _follow_publishers(self, event: Any) -> None:
+        if not self._overridden and self._best_offered(self.topic) != self._offered:
+            self.destroy()
+            self._subscription = self._create()
+
+
+def _newly_lost(event: QoSMessageLostInfo) -> int:
+    count: int = event.total_count_change
+    return count
