@@ -1,0 +1,121 @@
+"""Pictures of segmentations: labels over the depth image, contact sheets."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from functools import cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.planes import Plane
+
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+def colours(ids: Sequence[int] | NDArray) -> NDArray[np.uint8]:
+    """Colours of plane ids, (N, 3) RGB: always the same, and far apart for near ids.
+
+    Hues are a golden angle apart, which keeps any run of them spread around the circle; three
+    brightnesses tell later ids of a similar hue apart.
+    """
+    return np.array([_colour(int(number)) for number in ids], np.uint8).reshape(-1, 3)
+
+
+@cache
+def _colour(number: int) -> tuple[int, int, int]:
+    hue = number * _GOLDEN % 1
+    saturation, value = ((0.85, 1.0), (0.6, 1.0), (0.95, 0.75))[number // 13 % 3]
+    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
+    return round(255 * red), round(255 * green), round(255 * blue)
+
+
+def grey(inverse: NDArray) -> NDArray[np.uint8]:
+    """Grey picture of inverse range, near = bright, nothing measured = black; (H, W)."""
+    measured = inverse > 0
+    if not measured.any():
+        return np.zeros(inverse.shape, np.uint8)
+    low, high = np.percentile(inverse[measured], (2, 98))
+    picture = np.clip((inverse - low) / max(high - low, 1e-9), 0, 1) * 175 + 60
+    return np.where(measured, picture, 0).astype(np.uint8)
+
+
+def overlay(
+    inverse: NDArray, labels: NDArray[np.uint16], planes: Sequence[Plane] = ()
+) -> NDArray[np.uint8]:
+    """Colour the labels over a grey picture of the range image.
+
+    Parameters
+    ----------
+    inverse : (H, W) float
+        Inverse range, 0 where nothing was measured (`RangeImage.inverse`).
+    labels : (H, W) uint16
+        0 = no plane, shown grey.
+    planes : sequence of Plane
+        When given, colours follow the planes' ids, which are also written on them.
+
+    Returns
+    -------
+    (H, W, 3) uint8 RGB
+    """
+    numbers = np.arange(int(labels.max(initial=0)) + 1)
+    for plane in planes:
+        numbers[plane.label] = plane.id
+    palette = colours(numbers)
+    base = cv2.cvtColor(grey(inverse), cv2.COLOR_GRAY2RGB)
+    picture: NDArray = cv2.addWeighted(base, 0.45, palette[labels], 0.55, 0)
+    np.copyto(picture, base, where=(labels == 0)[..., None])
+    picture[_borders(labels)] = 0
+    for plane in planes:
+        _write_id(picture, labels == plane.label, str(plane.id))
+    return picture
+
+
+def contact_sheet(
+    pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), columns: int = 3
+) -> NDArray[np.uint8]:
+    """Tile pictures (H, W, 3), left to right and top to bottom, with titles in their corners.
+
+    Raises
+    ------
+    ValueError
+        No picture, or pictures of different shapes.
+    """
+    if len({picture.shape for picture in pictures}) != 1:
+        raise ValueError('a contact sheet needs pictures of one shape')
+    tiles = [picture.copy() for picture in pictures]
+    for tile, title in zip(tiles, titles, strict=False):
+        _write(tile, title, (6, tile.shape[0] - 8), 0.5)
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
+    rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
+    return np.vstack(rows)
+
+
+def _borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Pixels of a region whose right or lower neighbour has another label."""
+    borders = np.zeros(labels.shape, bool)
+    borders[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    borders[:-1] |= labels[:-1] != labels[1:]
+    return borders & (labels > 0)
+
+
+def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) -> None:
+    """Write `text` where the region is widest, if it is wide enough."""
+    x, y, width, height = cv2.boundingRect(region.astype(np.uint8))
+    part = region[y : y + height, x : x + width].astype(np.uint8)
+    inside = cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3)
+    _, radius, _, (column, row) = cv2.minMaxLoc(inside)
+    if radius < 8:
+        return
+    scale = min(0.8, radius / 30 + 0.2)
+    (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    _write(picture, text, (x + column - 1 - wide // 2, y + row - 1 + high // 2), scale)
+
+
+def _write(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
+    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        cv2.putText(
+            picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA
+        )
