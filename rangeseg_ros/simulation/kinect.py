@@ -9,6 +9,7 @@ effect is constant: 1/z = 0.00290 * disparity, z in metres, so that one quantum 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -110,7 +111,8 @@ def simulate_kinect(
         random = np.random.default_rng([seed, frame, 4])
         if noise == 'measured':
             slope = _slope(rays, face, planes)
-            face[_blind(depth, slope, random)] = -1
+            points = depth[..., None] * (rays @ pose.rotation.T) + pose.position
+            face[_blind(depth, slope, points, scene.dark, random)] = -1
             disparity = measured_disparity(depth, slope, sensor_seed, random)
         else:
             field = smooth_field(
@@ -156,6 +158,7 @@ def measured_disparity(
     return 1 / (QUANTUM * depth) + sensor_pattern(depth.shape, sensor_seed) + fresh + noise
 
 
+@lru_cache(maxsize=4)
 def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float64]:
     """Fixed error of one sensor, (H, W) quanta of disparity.
 
@@ -178,7 +181,9 @@ def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float
         first = random.uniform(0, period)
     step *= random.choice([-1, 1])
     bands = step * (((column - first) / period) % 1 - 0.5)
-    return distortion + bands
+    pattern: NDArray[np.float64] = distortion + bands
+    pattern.setflags(write=False)
+    return pattern
 
 
 def _distortion_scale(width: int) -> tuple[float, float]:
@@ -244,17 +249,21 @@ def _slope(
 
 
 def _blind(
-    depth: NDArray[np.float64], slope: NDArray[np.float64], random: np.random.Generator
+    depth: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    points: NDArray[np.float64],
+    dark: NDArray[np.float64],
+    random: np.random.Generator,
 ) -> NDArray[np.bool_]:
     """(H, W) True where real sensors measure nothing, shadows apart.
 
-    Nearer than 0.8 m, in the last eight columns, and where too little light returns: in patches
-    that cover 3 % of well-lit surfaces (dark, shiny) and nearly all of those seen at more than
-    about 80 degrees.
+    Nearer than 0.8 m, in the last eight columns, on dark places and, with ragged borders, on
+    surfaces seen at more than about 80 degrees.
     """
-    patches = smooth_field(depth.shape, (6.0, 6.0), random)
-    grazing = np.degrees(np.arctan(slope))
-    blind = patches > 1.9 - 0.4 * np.maximum(grazing - 75, 0)
+    ragged = smooth_field(depth.shape, (2.5, 2.5), random)
+    blind = np.degrees(np.arctan(slope)) + 2 * ragged > 80
+    for *centre, radius in dark:
+        blind |= np.linalg.norm(points - centre, axis=-1) < radius * (1 + 0.06 * ragged)
     blind |= depth < 0.8
     blind[:, -8:] = True
     return blind

@@ -5,13 +5,13 @@ World frame: x and y along the floor, z up, metres; the floor is z = 0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.simulation.solids import Solid, box, cylinder, half_space, sphere
+from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, sphere
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of the optical frame (z forward, REP 103) in a body frame with x forward, z up."""
@@ -52,10 +52,13 @@ class Scene:
         In the world frame.
     poses : tuple of Pose
         At least one.
+    dark : (N, 4) float64
+        Centres and radii of balls in which surfaces return too little light to be measured.
     """
 
     solids: tuple[Solid, ...]
     poses: tuple[Pose, ...]
+    dark: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
 
     def planes(self, pose: Pose) -> NDArray[np.float64]:
         """(F, 4) equations (normal, distance) of all faces in the frame of a sensor at `pose`.
@@ -85,7 +88,7 @@ def kinect_room(seed: int, frames: int = 1) -> Scene:
     room = _Room(random)
     for _ in range(random.integers(3, 6)):
         room.add_box()
-    return Scene(tuple(room.solids), camera_motion(room.pose, seed, frames))
+    return room.scene(camera_motion(room.pose, seed, frames))
 
 
 def curved_scene(seed: int, frames: int = 1) -> Scene:
@@ -97,12 +100,13 @@ def curved_scene(seed: int, frames: int = 1) -> Scene:
         As for `kinect_room`.
     """
     random = np.random.default_rng([seed, 2])
-    room = _Room(random)
+    # The curved objects stand in front, so that no box hides them.
+    room = _Room(random, nearest=2.5)
     room.add_ball()
     room.add_cylinder()
     for _ in range(random.integers(1, 3)):
         room.add_box()
-    return Scene(tuple(room.solids), camera_motion(room.pose, seed, frames))
+    return room.scene(camera_motion(room.pose, seed, frames))
 
 
 def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
@@ -128,8 +132,9 @@ def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
 class _Room:
     """A room under construction: the camera above the origin looks along x into a corner."""
 
-    def __init__(self, random: np.random.Generator) -> None:
+    def __init__(self, random: np.random.Generator, nearest: float = 1.0) -> None:
         self.random = random
+        self.nearest = nearest
         self.height = random.uniform(0.8, 1.8)
         # The higher the camera, the more it looks down.
         pitch = random.uniform(8, 20) + 12 * (self.height - 0.8)
@@ -163,34 +168,44 @@ class _Room:
             rotation = Rotation.random(random_state=self.random).as_matrix()
             reach = np.abs(rotation) @ size / 2
             lift = max(self.random.uniform(-0.4, 0.5), 0)
-            place = self._free_place(float(np.hypot(*reach[:2])))
+            place = self._free_place(np.hypot(*reach[:2]), self.nearest, self.depth)
             self.solids.append(box(size, rotation, (*place, reach[2] + lift)))
         else:
             yaw = self.random.uniform(0, 90)
-            place = self._free_place(float(np.hypot(*size[:2]) / 2))
+            place = self._free_place(np.hypot(*size[:2]) / 2, self.nearest, self.depth)
             self.solids.append(box(size, _about_z(yaw), (*place, size[2] / 2)))
             self.tops.append((place, size[2], min(size[:2]), yaw))
 
     def add_ball(self) -> None:
         """Add a ball that lies on the floor."""
         radius = self.random.uniform(0.15, 0.3)
-        place = self._free_place(radius)
+        place = self._free_place(radius, 1.3, 2.3)
         self.solids.append(sphere(radius, (*place, radius)))
 
     def add_cylinder(self) -> None:
         """Add a cylinder that stands on the floor."""
         radius, height = self.random.uniform(0.1, 0.25), self.random.uniform(0.4, 0.9)
-        place = self._free_place(radius)
+        place = self._free_place(radius, 1.3, 2.3)
         self.solids.append(cylinder(radius, height, np.eye(3), (*place, height / 2)))
 
-    def _free_place(self, radius: float) -> NDArray[np.float64]:
+    def scene(self, poses: tuple[Pose, ...]) -> Scene:
+        """The finished room, with up to three dark places of 3 to 6 degrees radius in view."""
+        count = self.random.integers(4)
+        view = self.random.uniform((-0.45, -0.3, 1), (0.45, 0.3, 1), (count, 3))
+        rays = view @ self.pose.rotation.T
+        distance, _ = cast(self.solids, self.pose.position, rays)
+        centres = self.pose.position + distance[:, None] * rays
+        radii = distance * np.radians(self.random.uniform(3, 6, len(rays)))
+        return Scene(tuple(self.solids), poses, np.column_stack([centres, radii]))
+
+    def _free_place(self, radius: float, near: float, far: float) -> NDArray[np.float64]:
         """(x, y) of an upright cylinder of that radius that is in view and touches nothing.
 
         After many failures the objects may overlap; they are then cast as one body.
         """
         for _ in range(1000):
-            place = self.random.uniform((1.3, -1.4), (self.depth, 1.4))
-            free = np.hypot(*place) - radius > 1.0 and abs(place[1]) < 0.45 * place[0]
+            place = self.random.uniform((near, -1.4), (far, 1.4))
+            free = np.hypot(*place) - radius > 0.8 and abs(place[1]) < 0.45 * place[0]
             for wall in self.walls:
                 free &= wall.normals[0, :2] @ place + wall.offsets[0] > radius
             for other, reach in self.occupied:

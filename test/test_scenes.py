@@ -1,0 +1,173 @@
+"""Ray casting against exact cases and brute force; truth regions; the random scenes."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.simulation import scenes
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import Pose, Scene
+from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, prism, sphere
+from rangeseg_ros.simulation.truth import NOT_PLANAR, visible_regions
+
+ORIGIN = np.zeros(3)
+UPRIGHT = np.eye(3)
+TRIANGLE = [(-0.5, -0.3), (0.6, -0.3), (0.1, 0.7)]
+
+
+@pytest.mark.parametrize(
+    ('solid', 'direction', 'distance', 'face'),
+    [
+        (half_space((0, 0, -1), (0, 0, 3)), (0, 0, 1), 3, 0),
+        (half_space((0, 0, -1), (0, 0, 3)), (0, 0, 2), 1.5, 0),
+        (half_space((0, 0, -1), (0, 0, 3)), (1, 0, 0), np.inf, -1),
+        (half_space((0, 0, -1), (0, 0, 3)), (0, 0, -1), np.inf, -1),
+        # Faces of a prism: its sides in the order of the outline, then top (+z) and bottom.
+        (box((1, 1, 1), UPRIGHT, (0, 0, 3)), (0, 0, 1), 2.5, 5),
+        (box((1, 1, 1), UPRIGHT, (3, 0, 0)), (1, 0, 0), 2.5, 3),
+        # Exactly along the plane of a side face, beyond it, and just within.
+        (box((1, 1, 1), UPRIGHT, (0.6, 0, 3)), (0, 0, 1), np.inf, -1),
+        (box((1, 1, 1), UPRIGHT, (0.4, 0, 3)), (0, 0, 1), 2.5, 5),
+        # From inside nothing is entered.
+        (box((1, 1, 1), UPRIGHT, (0, 0, 0)), (0, 0, 1), np.inf, -1),
+        (sphere(0.5, (0, 0, 2)), (0, 0, 1), 1.5, 0),
+        (sphere(0.5, (0.5 + 1e-9, 0, 2)), (0, 0, 1), np.inf, -1),
+        (cylinder(0.5, 1, UPRIGHT, (2, 0, 0)), (1, 0, 0), 1.5, 2),
+        # Along the axis of a cylinder its end is hit, or nothing.
+        (cylinder(0.5, 1, UPRIGHT, (0, 0, 2)), (0, 0, 1), 1.5, 1),
+        (cylinder(0.5, 1, UPRIGHT, (0.6, 0, 2)), (0, 0, 1), np.inf, -1),
+    ],
+)
+def test_exact_hits(solid, direction, distance, face):
+    reached, hit = cast([solid], ORIGIN, direction)
+    assert reached == pytest.approx(distance, abs=1e-12)
+    assert hit == face
+
+
+def inside(solid: Solid, points, margin=1e-6):
+    """Whether points lie in a solid, by a margin."""
+    deep = (points @ solid.normals.T + solid.offsets < -margin).all(axis=-1)
+    if solid.quadric is not None:
+        homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+        deep &= np.einsum('...i,ij,...j', homogeneous, solid.quadric, homogeneous) < -margin
+    return deep
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_first_hit_is_on_the_face_and_nothing_lies_before_it(seed):
+    random = np.random.default_rng(seed)
+
+    def turn():
+        return Rotation.random(random_state=random).as_matrix()
+
+    solids = [
+        half_space(random.standard_normal(3), 4 * random.standard_normal(3)),
+        box(random.uniform(0.2, 2, 3), turn(), random.uniform(-2, 2, 3)),
+        prism(TRIANGLE, random.uniform(0.2, 2), turn(), random.uniform(-2, 2, 3)),
+        sphere(random.uniform(0.1, 1), random.uniform(-2, 2, 3)),
+        cylinder(random.uniform(0.1, 1), random.uniform(0.2, 2), turn(), random.uniform(-2, 2, 3)),
+    ]
+    origins, directions = random.uniform(-3, 3, (2, 40, 3))
+    distance, face = cast(solids, origins, directions)
+    owner = np.repeat(np.arange(5), [solid.face_count for solid in solids])
+    planes = np.vstack([solid.planes for solid in solids])
+    steps = np.linspace(0, 1, 400)
+    for origin, direction, reach, hit in zip(origins, directions, distance, face, strict=True):
+        # March up to the hit (or far) outside of every solid that the ray does not start in.
+        path = origin + steps[:, None] * direction * min(reach, 5.0)
+        for number, solid in enumerate(solids):
+            if not inside(solid, origin):
+                assert not inside(solid, path).any()
+            elif np.isfinite(reach):
+                assert owner[hit] != number
+        if hit >= 0:
+            point = origin + reach * direction
+            assert inside(solids[owner[hit]], point, margin=-1e-9)
+            if not np.isnan(planes[hit]).any():
+                assert planes[hit, :3] @ point + planes[hit, 3] == pytest.approx(0, abs=1e-9)
+                assert planes[hit, :3] @ direction < 0
+
+
+def test_face_cut_in_two_gives_two_regions_of_one_face():
+    face = np.array([[0, 1, 0, 0], [0, 1, 0, -1], [0, 1, 2, 0]], np.int32)
+    planes = np.array([[0, 0, -1, 3.0], [0, 0, -1, 2.0], [np.nan] * 4])
+    labels, regions = visible_regions(face, planes)
+    # The pixel at the lower right touches the middle region only through a corner.
+    expected = [[1, 4, 2, 2], [1, 4, 2, 0], [1, 4, NOT_PLANAR, 3]]
+    assert labels.tolist() == expected
+    assert [(r.label, r.face, r.count, r.distance) for r in regions] == [
+        (1, 0, 3, 3.0),
+        (2, 0, 3, 3.0),
+        (3, 0, 1, 3.0),
+        (4, 1, 3, 2.0),
+    ]
+
+
+@pytest.mark.parametrize('build', [scenes.kinect_room, scenes.curved_scene])
+@pytest.mark.parametrize('seed', range(3))
+def test_points_of_a_region_lie_on_its_plane(build, seed):
+    camera = kinect_camera(320, 240)
+    frame = simulate_kinect(build(seed), camera, noise='none')
+    points = frame.depth[..., None].astype(float) * camera.rays
+    for plane in frame.planes:
+        assert plane.distance > 0
+        assert np.linalg.norm(plane.normal) == pytest.approx(1)
+        mask = frame.labels == plane.label
+        assert mask.sum() == plane.count
+        assert np.abs(points[mask] @ plane.normal + plane.distance).max() < 2e-6
+    curved = frame.labels == NOT_PLANAR
+    assert curved.mean() > 0.01 if build is scenes.curved_scene else not curved.any()
+
+
+def test_rooms_are_varied_and_in_range():
+    rooms = [scenes.kinect_room(seed) for seed in range(20)]
+    assert {len(room.solids) - 3 for room in rooms} == {3, 4, 5}
+    heights = [room.poses[0].position[2] for room in rooms]
+    assert 0.8 <= min(heights) < 1.0 and 1.6 < max(heights) <= 1.8
+    large = []
+    for room in rooms:
+        frame = simulate_kinect(room, kinect_camera(160, 120), noise='none')
+        depth = frame.depth[frame.depth > 0]
+        assert depth.min() > 0.7 and depth.max() < 6
+        # 1000 pixels at 640x480.
+        large.append(sum(plane.count * 16 >= 1000 for plane in frame.planes))
+    assert min(large) >= 5 and 9 <= np.mean(large) <= 15
+
+
+def test_same_seed_same_scene_and_motion_continues():
+    short, long = scenes.kinect_room(5, frames=3), scenes.kinect_room(5, frames=60)
+    for one, other in zip(short.poses, long.poses[:3], strict=True):
+        assert np.array_equal(one.rotation, other.rotation)
+        assert np.array_equal(one.position, other.position)
+    for one, other in zip(short.solids, long.solids, strict=True):
+        assert np.array_equal(one.planes, other.planes)
+    steps = np.diff([pose.position for pose in long.poses], axis=0)
+    speed = 30 * np.linalg.norm(steps, axis=1)
+    assert 0.01 < speed.max() < 0.4
+
+
+def test_truth_ids_persist_while_the_camera_moves():
+    room = scenes.kinect_room(5, frames=30)
+    camera = kinect_camera(160, 120)
+    first, last = (simulate_kinect(room, camera, frame=k, noise='none') for k in (0, 29))
+    before, after = room.poses[0], room.poses[29]
+    turn = after.rotation.T @ before.rotation
+    shift = after.rotation.T @ (before.position - after.position)
+    faces = {plane.face: plane for plane in last.planes}
+    common = [plane for plane in first.planes if plane.face in faces]
+    assert len(common) >= 5
+    for plane in common:
+        moved = faces[plane.face]
+        assert moved.normal == pytest.approx(turn @ plane.normal)
+        assert moved.distance == pytest.approx(plane.distance - turn @ plane.normal @ shift)
+
+
+def test_pose_looks_where_it_says():
+    pose = Pose.looking((0, 0, 1), yaw=90, pitch=30, roll=0)
+    # Optical z: along the world's y, downwards; optical x: to the right of it.
+    assert pose.rotation[:, 2] == pytest.approx([0, np.cos(np.pi / 6), -0.5])
+    assert pose.rotation[:, 0] == pytest.approx([1, 0, 0])
+    floor = Scene((half_space((0, 0, 1), ORIGIN),), (pose,))
+    assert floor.planes(pose)[0] == pytest.approx([0, -np.cos(np.pi / 6), -0.5, 1.0])
