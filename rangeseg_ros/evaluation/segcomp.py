@@ -17,6 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.io.files import replacing
+
 FIRST_REGION = 10
 MAX_REGIONS = 246
 NOISE, SHADOW, EDGE = 1, 2, 3
@@ -77,7 +79,7 @@ def write_raster(path: str | os.PathLike[str], image: ArrayLike) -> None:
         raise SegcompError(f'{path}: a raster is (H, W) uint8, not {pixels.shape} {pixels.dtype}')
     height, width = pixels.shape
     header = struct.pack('>I7i', _MAGIC, width, height, 8, width * height, 1, 0, 0)
-    _replace(path, header + pixels.tobytes())
+    _write(path, header + pixels.tobytes())
 
 
 def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
@@ -194,7 +196,7 @@ def write_perceptron(path: str | os.PathLike[str], values: ArrayLike) -> None:
         raise SegcompError(f'{path}: Perceptron range values must be in 0..{_RANGE_MASK}')
     lines = (' '.join(['perceptron', *'x' * (words - 1)]) for words in _PERCEPTRON_WORDS)
     header = ''.join(f'{line}\n' for line in lines).encode() + b'\x00\x00'
-    _replace(path, header + array.astype('>i4').tobytes())
+    _write(path, header + array.astype('>i4').tobytes())
 
 
 class RegionAngle(NamedTuple):
@@ -219,7 +221,7 @@ def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
 def write_angles(path: str | os.PathLike[str], angles: Sequence[RegionAngle]) -> None:
     """Write a `.gt-ang` file."""
     lines = [str(len(angles)), *(f'{a} {b} {degrees:.6f}' for a, b, degrees in angles)]
-    _replace(path, ('\n'.join(lines) + '\n').encode())
+    _write(path, ('\n'.join(lines) + '\n').encode())
 
 
 def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
@@ -236,7 +238,7 @@ def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]
 def write_normals(path: str | os.PathLike[str], normals: Mapping[int, ArrayLike]) -> None:
     """Write a `.ms-nor` file from the normal (3,) of each label."""
     rows = (f'{label} {x:.9f} {y:.9f} {z:.9f}' for label, (x, y, z) in _items(normals))
-    _replace(path, ('\n'.join([str(len(normals)), *rows]) + '\n').encode())
+    _write(path, ('\n'.join([str(len(normals)), *rows]) + '\n').encode())
 
 
 def _items(normals: Mapping[int, ArrayLike]) -> list[tuple[int, NDArray]]:
@@ -272,8 +274,6 @@ def _check_labels(path: str | os.PathLike[str], image: NDArray) -> None:
         raise SegcompError(f'{path}: label {bad.min()}; 4..9 are not allowed, regions begin at 10')
 
 
-def _replace(path: str | os.PathLike[str], data: bytes) -> None:
-    """Write under another name first, so that nobody ever sees half a file."""
-    part = Path(f'{os.fspath(path)}.part')
-    part.write_bytes(data)
-    part.replace(path)
+def _write(path: str | os.PathLike[str], data: bytes) -> None:
+    with replacing(Path(path)) as partial:
+        partial.write_bytes(data)

@@ -1,0 +1,153 @@
+"""PCD files: the three encodings, LZF by hand, malformed files, and real ones where they are."""
+
+import contextlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rangeseg_ros.io.pcd import PcdError, lzf_decompress, read_pcd
+
+SHARED = Path(__file__).resolve().parents[2] / 'shared' / 'data'
+
+HEADER = """# .PCD v0.7
+VERSION 0.7
+FIELDS x label normal
+SIZE 4 2 8
+TYPE F U F
+COUNT 1 1 3
+WIDTH 3
+HEIGHT 2
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 6
+DATA {}
+"""
+X = np.array([[0.5, np.nan, 2], [3, 4, 5]], np.float32)
+LABEL = np.array([[0, 1, 65535], [3, 4, 5]], np.uint16)
+NORMAL = np.arange(18, dtype=float).reshape(2, 3, 3)
+
+
+def records():
+    dtype = np.dtype([('x', '<f4'), ('label', '<u2'), ('normal', '<f8', (3,))])
+    array = np.zeros((2, 3), dtype)
+    array['x'], array['label'], array['normal'] = X, LABEL, NORMAL
+    return array
+
+
+def literal_lzf(data):
+    """LZF of incompressible data: runs of at most 32 literal bytes."""
+    runs = (data[i : i + 32] for i in range(0, len(data), 32))
+    return b''.join(bytes([len(run) - 1]) + run for run in runs)
+
+
+def encoded(kind):
+    head = HEADER.format(kind).encode()
+    array = records()
+    if kind == 'ascii':
+        rows = (f'{r["x"]} {r["label"]} {" ".join(map(str, r["normal"]))}' for r in array.ravel())
+        return head + '\n'.join(rows).encode()
+    if kind == 'binary':
+        return head + array.tobytes()
+    raw = b''.join(array[name].tobytes() for name in array.dtype.names)
+    packed = literal_lzf(raw)
+    return head + struct.pack('<II', len(packed), len(raw)) + packed
+
+
+@pytest.mark.parametrize('kind', ['ascii', 'binary', 'binary_compressed'])
+def test_encodings(tmp_path, kind):
+    path = tmp_path / 'a.pcd'
+    path.write_bytes(encoded(kind))
+    fields = read_pcd(path)
+    assert list(fields) == ['x', 'label', 'normal']
+    assert np.array_equal(fields['x'], X, equal_nan=True) and fields['x'].dtype == np.float32
+    assert np.array_equal(fields['label'], LABEL) and fields['label'].dtype == np.uint16
+    assert np.array_equal(fields['normal'], NORMAL)
+
+
+def test_lzf_by_hand():
+    # Literal 'abc'; then 4 bytes from 3 back: 'abca'.
+    assert lzf_decompress(b'\x02abc' + bytes([2 << 5, 2]), 7) == b'abcabca'
+    # Literal 'x'; then 7 + 3 + 2 = 12 bytes from 1 back: a run.
+    assert lzf_decompress(b'\x00x' + bytes([7 << 5, 3, 0]), 13) == b'x' * 13
+
+
+def test_lzf_far_copy():
+    # 300 back: distance 299 = 1 * 256 + 43 in the low bits of the control byte and the next.
+    data = bytes(range(256)) + bytes(44)
+    packed = literal_lzf(data) + bytes([(1 << 5) | 1, 43])
+    assert lzf_decompress(packed, 303) == data + b'\x00\x01\x02'
+
+
+@given(st.binary(max_size=60))
+def test_damaged_lzf_is_refused(data):
+    with contextlib.suppress(PcdError):
+        assert len(lzf_decompress(data, 40)) == 40
+
+
+@pytest.mark.parametrize(
+    ('change', 'fault'),
+    [
+        (lambda d: b'', 'no DATA'),
+        (lambda d: d.replace(b'FIELDS', b'FEELDS'), 'lacks FIELDS'),
+        (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 3'), 'do not agree'),
+        (lambda d: d.replace(b'x label normal', b'x x normal'), 'do not agree'),
+        (lambda d: d.replace(b'SIZE 4 2 8', b'SIZE 4 3 8'), 'malformed'),
+        (lambda d: d.replace(b'TYPE F U F', b'TYPE F Q F'), 'malformed'),
+        (lambda d: d.replace(b'WIDTH 3', b'WIDTH three'), 'malformed'),
+        (lambda d: d.replace(b'WIDTH 3', b'WIDTH 0'), 'empty'),
+        (lambda d: d.replace(b'DATA binary', b'DATA zipped'), 'unknown DATA'),
+        (lambda d: d[:-1], 'truncated'),
+    ],
+)
+def test_malformed(tmp_path, change, fault):
+    path = tmp_path / 'bad.pcd'
+    path.write_bytes(change(encoded('binary')))
+    with pytest.raises(PcdError, match=fault) as error:
+        read_pcd(path)
+    assert str(path) in str(error.value) and '\n' not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'cut', 'fault'),
+    [
+        ('ascii', 4, 'malformed or truncated'),
+        ('binary_compressed', 5, 'truncated'),
+        ('binary_compressed', 200, 'truncated'),
+    ],
+)
+def test_truncated(tmp_path, kind, cut, fault):
+    path = tmp_path / 'bad.pcd'
+    path.write_bytes(encoded(kind)[:-cut])
+    with pytest.raises(PcdError, match=fault):
+        read_pcd(path)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(PcdError, match='none'):
+        read_pcd(tmp_path / 'none.pcd')
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason='needs the data beside the repository')
+def test_real_scan():
+    fields = read_pcd(SHARED / 'synpeb' / 'scan_500.pcd')
+    assert fields['x'].shape == (500, 500)
+    labels = np.unique(fields['intensity'][fields['intensity'] >= 10])
+    assert len(labels) == 38
+    # Azimuth grows along a row, elevation falls from row to row.
+    x, y, z = (fields[name].astype(float) for name in 'xyz')
+    azimuth = np.degrees(np.arctan2(y, x))
+    elevation = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    assert azimuth[0] == pytest.approx(-35 + 0.14 * np.arange(500), abs=0.01)
+    assert elevation[:, 0] == pytest.approx(np.linspace(30, -30, 500), abs=0.01)
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason='needs the data beside the repository')
+def test_real_cloud():
+    fields = read_pcd(SHARED / 'mosd' / 'learn0.pcd')
+    assert fields['z'].shape == (480, 640) and fields['label'].dtype == np.uint32
+    u = (fields['x'] / fields['z'])[240] * 525 + 319.5
+    measured = np.isfinite(u)
+    assert np.allclose(u[measured], np.arange(640)[measured], atol=0.1)
