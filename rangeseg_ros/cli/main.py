@@ -43,9 +43,8 @@ def rangeseg() -> None:
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     try:
-        rangeseg.main(standalone_mode=False)
-    except click.exceptions.Exit as done:
-        sys.exit(done.exit_code)
+        # Without its standalone mode click returns the code that a command exits with.
+        sys.exit(rangeseg.main(standalone_mode=False))
     except click.ClickException as error:
         print(f'rangeseg: {error.format_message()}', file=sys.stderr)
         sys.exit(2)

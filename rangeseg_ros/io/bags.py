@@ -133,7 +133,10 @@ class DepthBag:
                     count += 1
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
-            raise DamagedBagError(f'{self.path}: damaged after {count} frames: {error}') from error
+            reason = str(error) or type(error).__name__
+            raise DamagedBagError(
+                f'{self.path}: damaged after {count} frames: {reason}'
+            ) from error
 
     def _frame(self, message: Any, camera: Camera) -> DepthFrame:
         where = f'{self.path}: {self.depth_topic}'

@@ -1,8 +1,9 @@
-"""Files that are whole or not there."""
+"""Files that are whole or not there, and the order of their names."""
 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,3 +18,8 @@ def replacing(path: Path) -> Iterator[Path]:
         partial = Path(folder) / path.name
         yield partial
         os.replace(partial, path)
+
+
+def natural_order(path: Path) -> list[str | int]:
+    """Sort key that puts frame_2 before frame_10."""
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', path.name)]

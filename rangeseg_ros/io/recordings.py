@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import bz2
 import io
-import re
 import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
@@ -18,10 +17,13 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
 import lz4.frame
+from mcap.exceptions import EndOfFile
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
+
+from rangeseg_ros.io.files import natural_order
 
 
 class RecordingError(ValueError):
@@ -142,7 +144,7 @@ class _Record(NamedTuple):
 
 def _records(path: Path) -> Iterator[_Record]:
     if path.is_dir():
-        for part in sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=_natural_order):
+        for part in sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=natural_order):
             yield from _records(part)
     elif path.suffix == '.mcap':
         yield from _mcap_records(path)
@@ -155,23 +157,21 @@ def _records(path: Path) -> Iterator[_Record]:
         raise EOFError('file ends without an index')
 
 
-def _natural_order(path: Path) -> list[str | int]:
-    """Sort bag_2 before bag_10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', path.name)]
-
-
 def _mcap_records(path: Path) -> Iterator[_Record]:
     schemas: dict[int, str] = {}
     channels: dict[int, Channel] = {}
     with path.open('rb') as file:
-        for record in StreamReader(file, record_size_limit=path.stat().st_size).records:
-            if isinstance(record, Schema):
-                schemas[record.id] = record.name
-            elif isinstance(record, Channel):
-                channels[record.id] = record
-            elif isinstance(record, Message):
-                channel = channels[record.channel_id]
-                yield _Record(channel.topic, schemas[channel.schema_id], record.data)
+        try:
+            for record in StreamReader(file, record_size_limit=path.stat().st_size).records:
+                if isinstance(record, Schema):
+                    schemas[record.id] = record.name
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    yield _Record(channel.topic, schemas[channel.schema_id], record.data)
+        except EndOfFile:
+            raise EOFError('file ends within a record') from None
 
 
 def _sqlite_records(path: Path) -> Iterator[_Record]:

@@ -1,0 +1,45 @@
+"""Options and habits that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from tqdm import tqdm
+
+T = TypeVar('T')
+
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
+
+camera: Callable[..., Any] = click.option(
+    '--camera',
+    'camera_file',
+    type=FILE,
+    required=True,
+    help='Intrinsics: a ROS camera-calibration YAML file.',
+)
+params: Callable[..., Any] = click.option(
+    '--params',
+    'params_file',
+    type=FILE,
+    help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
+)
+exact: Callable[..., Any] = click.option(
+    '--exact',
+    is_flag=True,
+    help='Minimise with every label at full resolution instead of coarse to fine: slow.',
+)
+depth_scale: Callable[..., Any] = click.option(
+    '--depth-scale',
+    type=click.FloatRange(min=0, min_open=True),
+    help='Metres per unit of the images.  [default: 0.001 for integers, 1 for floats]',
+)
+
+
+def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
+    """Show the progress through `items` on a terminal, and nothing elsewhere."""
+    bar: Iterable[T] = tqdm(items, total=total, unit=unit, disable=None)
+    return bar

@@ -1,0 +1,62 @@
+"""`rangeseg segment`: depth images to labels and planes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import click
+
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli.results import make_segmenter, write_pictures
+from rangeseg_ros.core.range_image import RangeImage, RangeImageError
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.io.planes import PlaneTable
+
+
+@click.command()
+@click.argument('depth', nargs=-1, required=True, type=options.FILE)
+@options.camera
+@click.option(
+    '--output',
+    type=click.Path(file_okay=False, path_type=Path),
+    required=True,
+    help='Folder for the results; made when missing.',
+)
+@options.depth_scale
+@options.params
+@options.exact
+def command(
+    depth: tuple[Path, ...],
+    camera_file: Path,
+    output: Path,
+    depth_scale: float | None,
+    params_file: Path | None,
+    exact: bool,
+) -> None:
+    """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
+
+    Writes for each image <stem>_labels.png (16 bits, 0 = no plane), <stem>_planes.csv (a row for
+    each plane, metres, x right, y down, z forward) and <stem>_overlay.png.
+    """
+    name, count = Counter(path.stem for path in depth).most_common(1)[0]
+    if count > 1:
+        raise click.UsageError(f'{count} images named {name} would write the same results')
+    camera = read_camera(camera_file)
+    segmenter = make_segmenter(params_file, exact)
+    for path in options.progress(depth, len(depth), 'image'):
+        try:
+            image = RangeImage.from_depth(read_depth(path), camera, depth_scale)
+        except RangeImageError as error:
+            raise click.ClickException(f'{path}: {error}') from None
+        result = segmenter.segment(image)
+        write_pictures(output, path.stem, image, result)
+        with (
+            replacing(output / f'{path.stem}_planes.csv') as partial,
+            PlaneTable(partial) as table,
+        ):
+            table.write(result.planes)
+        found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
+        click.echo(f'{path}: {found}')
