@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from rangeseg_ros.core.directions import DirectionsError, check_count
+
 
 class ConfigError(ValueError):
     """A parameter that does not exist, or a value outside its range."""
@@ -40,17 +42,98 @@ class Config:
         'labels are planes, refined (planes), or discretised normals as in the thesis (normals)',
         choices=('planes', 'normals'),
     )
+    normals: str = option(
+        'cross_product',
+        'observed normals by cross product of the tangents (cross_product) or least-squares '
+        'plane through a window (plane_fit)',
+        choices=('cross_product', 'plane_fit'),
+    )
+    normal_baseline: int = option(
+        3,
+        'pixels from a pixel to the neighbours of its cross product; the thesis uses 1, where '
+        'one step of the quantised depth of a Kinect turns the normal by tens of degrees',
+        low=1,
+        high=50,
+    )
+    normal_radius: int = option(
+        2, 'the window of plane_fit has 2 r + 1 rows and columns', low=1, high=50
+    )
+    directions: str = option(
+        'platonic',
+        'method normals: distribution of the label directions: subdivided icosahedron, regular '
+        'angles, spiral, or hypercube rejection (random)',
+        choices=('platonic', 'regular', 'spiral', 'random'),
+    )
+    direction_count: int = option(
+        305,
+        'method normals: number of directions; platonic has 4, 17, 73, 305, 1249, regular the '
+        'odd squares (25, 225, 1225), spiral and random any',
+        low=1,
+        high=5000,
+    )
+    jump_edges: str = option(
+        'plane',
+        'edges that separate regions: deviation from the local plane (plane), thresholded depth '
+        'gradient as in the thesis (sobel), or none',
+        choices=('plane', 'sobel', 'none'),
+    )
+    edge_step: float = option(
+        0.0044,
+        'jump_edges plane: smallest jump of the inverse range, 1/m; the default is 1.5 steps of '
+        'the disparity of a Kinect, 18 mm at 2 m',
+        low=0.0,
+        high=10.0,
+    )
+    weighting: str = option(
+        'uniform',
+        'neighbourhood weights: all alike (uniform) or more for closer points (distance)',
+        choices=('uniform', 'distance'),
+    )
     smoothness: float = option(
         55.0,
         'method normals: lambda of eq. 5.3, weight of the Potts prior against degrees of angle',
         low=0.0,
         high=10000.0,
     )
+    moves: str = option(
+        'expansion',
+        'method normals: alpha-expansion or alpha-beta-swap',
+        choices=('expansion', 'swap'),
+    )
+    cycles: int = option(
+        5, 'method normals: rounds of moves at most; fewer when none helps', low=1, high=1000
+    )
+    exact: bool = option(
+        False,
+        'method normals: expand all directions at full resolution, which takes minutes, instead '
+        'of coarse to fine',
+    )
+    noise_regions: str = option(
+        'identify',
+        'regions of less than two pixels per pixel of their perimeter: leave them, mark them as '
+        'no plane (identify), or merge them with their neighbours',
+        choices=('leave', 'identify', 'merge'),
+    )
+    min_pixels: int = option(
+        250, 'smallest region that makes a plane, pixels', low=1, high=100000000
+    )
+    dithering: float = option(
+        0.0,
+        'standard deviation of Gaussian noise added to the range, metres; breaks up the steps '
+        'of coarsely quantised depth',
+        low=0.0,
+        high=10.0,
+    )
+    seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
     def __post_init__(self) -> None:
         for option_field in fields(self):
             value = _checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
+        try:
+            check_count(self.directions, self.direction_count)
+        except DirectionsError as error:
+            raise ConfigError(f'parameter direction_count: {error}') from None
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:

@@ -101,6 +101,20 @@ class RangeImage:
         rays = (cloud * inverse[..., None]).astype(np.float32)
         return cls(rays, inverse)
 
+    def dithered(self, sigma: float, seed: int) -> RangeImage:
+        """Copy with Gaussian noise on the ranges (thesis 6.7.1).
+
+        Parameters
+        ----------
+        sigma : float
+            Standard deviation, metres.
+        seed : int
+            Of the noise.
+        """
+        noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
+        with np.errstate(divide='ignore'):
+            return RangeImage(self.rays, _reciprocal(1 / self.inverse + noise, 1.0), self.camera)
+
     @property
     def shape(self) -> tuple[int, int]:
         """(height, width)."""

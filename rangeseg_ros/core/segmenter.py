@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core import coarse_to_fine, moves
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.core.directions import directions
+from rangeseg_ros.core.energy import angle, energy
+from rangeseg_ros.core.jump_edges import jump_edges
+from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.normals import observed_normals
+from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.regions import plane_regions
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +55,65 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
+        self._directions = directions(
+            self.config.directions, self.config.direction_count, self.config.seed
+        )
 
     def segment(self, image: RangeImage) -> Segmentation:
         """Label every pixel of `image` with the plane it belongs to."""
-        labels = np.zeros(image.shape, np.uint16)
-        return Segmentation(labels, [], 0.0, {}, 'no valid depth')
+        config, watch = self.config, Stopwatch()
+        if config.dithering > 0:
+            image = image.dithered(config.dithering, config.seed)
+        normals = observed_normals(image, config)
+        watch.lap('normals')
+        horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
+        watch.lap('edges')
+        minimise = moves.minimise if config.exact else coarse_to_fine.minimise
+        labels = minimise(
+            normals,
+            self._directions,
+            horizontal,
+            vertical,
+            config.smoothness,
+            config.cycles,
+            config.moves,
+        )
+        data = angle(normals, self._directions.astype(np.float32)[labels])
+        value = energy(data, labels, horizontal, vertical, config.smoothness)
+        watch.lap('labels')
+        regions = plane_regions(labels, image.valid, horizontal, vertical, config)
+        watch.lap('regions')
+        planes = fit_planes(regions, image)
+        watch.lap('planes')
+        return Segmentation(regions, planes, value, watch.laps, _reason(image, normals, planes))
+
+
+def _reason(image: RangeImage, normals: NDArray[np.float32], planes: list[Plane]) -> str:
+    """Why there is no plane; empty when there is one."""
+    if planes:
+        return ''
+    if not image.valid.any():
+        return 'no valid depth'
+    if np.isnan(normals).all():
+        return 'no surface normal: no pixel has valid neighbours far enough in all directions'
+    return 'no region large enough'
+
+
+class Stopwatch:
+    """Times the stages of a run.
+
+    Attributes
+    ----------
+    laps : dict
+        Milliseconds per stage.
+    """
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """End the stage that has been running."""
+        now = time.perf_counter()
+        self.laps[stage] = 1000 * (now - self._last)
+        self._last = now

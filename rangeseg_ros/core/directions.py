@@ -1,0 +1,134 @@
+"""The discretised hemisphere of surface normals: what the labels of method `normals` stand for.
+
+Every set faces the sensor: unit vectors with z < 0 in the optical frame (x right, y down,
+z forward). The equator is left out, as a surface seen edge-on does not appear in an image.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
+_EQUATOR = 1e-9
+
+
+class DirectionsError(ValueError):
+    """A number of directions that the distribution cannot give."""
+
+
+def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Discretise the hemisphere of normals that face the sensor.
+
+    Parameters
+    ----------
+    distribution : {'platonic', 'regular', 'spiral', 'random'}
+        Subdivided icosahedron (section 5.2.2), regular angles (5.2.1), generalised spiral, or
+        hypercube rejection (5.2.1).
+    count : int
+        Number of directions: 4, 17, 73, 305 or 1249 (table A.3) for `platonic`, an odd square
+        (table A.1) for `regular`, any positive number for the others.
+    seed : int
+        Of the random numbers of `random`.
+
+    Returns
+    -------
+    (count, 3) float64
+        Unit vectors with z < 0.
+
+    Raises
+    ------
+    DirectionsError
+        Unknown distribution, or a count that it cannot give.
+    """
+    check_count(distribution, count)
+    if distribution == 'platonic':
+        return platonic(PLATONIC_COUNTS.index(count))
+    if distribution == 'regular':
+        return regular((math.isqrt(count) + 1) // 2)
+    if distribution == 'spiral':
+        return spiral(count)
+    return hypercube_rejection(count, seed)
+
+
+def check_count(distribution: str, count: int) -> None:
+    """Raise DirectionsError if `distribution` cannot give `count` directions."""
+    if distribution not in ('platonic', 'regular', 'spiral', 'random'):
+        raise DirectionsError(f'unknown distribution of directions {distribution!r}')
+    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
+        counts = ', '.join(map(str, PLATONIC_COUNTS))
+        raise DirectionsError(f'platonic subdivision gives {counts} directions, not {count}')
+    if count < 1:
+        raise DirectionsError(f'the number of directions must be positive, not {count}')
+    root = math.isqrt(count)
+    if distribution == 'regular' and (root * root != count or root % 2 == 0):
+        raise DirectionsError(
+            f'regular angles give an odd square (1, 9, 25 ... 1225) of directions, not {count}'
+        )
+
+
+def platonic(subdivisions: int) -> NDArray[np.float64]:
+    """Vertices of an icosahedron after Loop subdivision (thesis 5.2.2, appendix A.2).
+
+    The solid is cut by a plane through an edge and the edge opposite to it; the vertices
+    strictly on one side are returned.
+    """
+    golden = (1 + 5**0.5) / 2
+    # The edges between the vertices (+-1, +-golden, 0) lie in the plane z = 0.
+    corners = [(0.0, s, t * golden) for s in (-1, 1) for t in (-1, 1)]
+    vertices = np.array([np.roll(corner, k) for k in (0, 1, 2) for corner in corners])
+    near = np.linalg.norm(vertices[:, None] - vertices[None], axis=2) < 2.1
+    faces = np.array([f for f in combinations(range(12), 3) if near[np.ix_(f, f)].all()])
+    vertices /= np.linalg.norm(vertices[0])
+    for _ in range(subdivisions):
+        vertices, faces = _subdivide(vertices, faces)
+    return vertices[vertices[:, 2] < -_EQUATOR]
+
+
+def regular(n: int) -> NDArray[np.float64]:
+    """Elevation and azimuth in steps of 90/n degrees (thesis 5.2.1, appendix A.1): (2n-1)^2."""
+    elevation = np.pi / 2 * np.arange(1, n) / n
+    azimuth = np.pi / 2 * np.arange(4 * n) / n
+    phi, theta = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing='ij'))
+    ring = np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), -np.sin(phi)], 1)
+    return np.vstack([[[0.0, 0.0, -1.0]], ring[::-1]])
+
+
+def spiral(count: int) -> NDArray[np.float64]:
+    """Points on a spiral from the pole to the equator, each for an equal area (thesis 5.2.1)."""
+    k = np.arange(count) + 0.5
+    z = 1 - k / count
+    turn = np.pi * (3 - 5**0.5) * k
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), -z], 1)
+
+
+def hypercube_rejection(count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Uniform points of a cube, those outside its sphere rejected (thesis 5.2.1)."""
+    random = np.random.default_rng(seed)
+    found = np.empty((0, 3))
+    while len(found) < count:
+        cube = random.uniform(-1, 1, (2 * count, 3))
+        radius = np.linalg.norm(cube, axis=1)
+        cube /= np.maximum(radius, _EQUATOR)[:, None]
+        inside = (radius > _EQUATOR) & (radius <= 1) & (np.abs(cube[:, 2]) > _EQUATOR)
+        found = np.vstack([found, cube[inside]])
+    found[:, 2] = -np.abs(found[:, 2])
+    return found[:count]
+
+
+def _subdivide(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Split every triangle in four by new vertices at the middles of its edges."""
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]], axis=2)
+    unique, inverse = np.unique(edges.reshape(-1, 2), axis=0, return_inverse=True)
+    middle = vertices[unique].sum(axis=1)
+    middle /= np.linalg.norm(middle, axis=1, keepdims=True)
+    ab, bc, ca = (len(vertices) + inverse.reshape(-1, 3)).T
+    a, b, c = faces.T
+    split = np.stack([a, ab, ca, ab, b, bc, ca, bc, c, ab, bc, ca], 1).reshape(-1, 3)
+    return np.vstack([vertices, middle]), split

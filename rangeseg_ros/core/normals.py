@@ -1,0 +1,109 @@
+"""Observed surface normals (thesis 5.7): unit vectors towards the sensor."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.range_image import RangeImage
+
+
+def observed_normals(image: RangeImage, config: Config) -> NDArray[np.float32]:
+    """Normals by the method that `config` names, (H, W, 3); NaN where undefined."""
+    if config.normals == 'plane_fit':
+        return plane_fit(image, config.normal_radius)
+    return cross_product(image, config.normal_baseline)
+
+
+def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
+    """Cross product of the tangents between the neighbours of a pixel (thesis 5.7.1).
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    baseline : int
+        Distance from the pixel to its left, right, upper and lower neighbour, pixels; 1 in the
+        thesis. The noise of the direction falls in proportion.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        NaN where the pixel or one of its neighbours was not measured or lies outside the image.
+    """
+    height, width = image.shape
+    normals = np.full((height, width, 3), np.nan, np.float32)
+    if min(height, width) <= 2 * baseline:
+        return normals
+    x, y, z = cv2.split(image.points)
+    inner = (slice(baseline, -baseline), slice(baseline, -baseline))
+    # NaN, where nothing was measured, spreads by itself.
+    ux, uy, uz = (
+        c[baseline:-baseline, 2 * baseline :] - c[baseline:-baseline, : -2 * baseline]
+        for c in (x, y, z)
+    )
+    vx, vy, vz = (
+        c[2 * baseline :, baseline:-baseline] - c[: -2 * baseline, baseline:-baseline]
+        for c in (x, y, z)
+    )
+    cross = cv2.merge((uz * vy - uy * vz, ux * vz - uz * vx, uy * vx - ux * vy))
+    normals[inner] = cross
+    normals[~image.valid] = np.nan
+    return _towards_sensor(normals, image)
+
+
+def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
+    """Least-squares plane through a window of pixels (thesis 5.7.2).
+
+    The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse, so that the sums
+    of the normal equations are box filters over the image.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    radius : int
+        The window has 2 radius + 1 rows and columns.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        NaN where the window holds a pixel that was not measured or lies outside the image.
+    """
+    window = 2 * radius + 1
+
+    def mean(product: NDArray[np.float64]) -> NDArray[np.float64]:
+        return cv2.boxFilter(product, cv2.CV_64F, (window, window), borderType=cv2.BORDER_CONSTANT)
+
+    valid = image.valid
+    a, b, c = (np.where(valid, ray, 0) for ray in cv2.split(image.rays.astype(np.float64)))
+    w = image.inverse.astype(np.float64)
+    aa, ab, ac, bb, bc, cc = (mean(p) for p in (a * a, a * b, a * c, b * b, b * c, c * c))
+    aw, bw, cw = (mean(p) for p in (a * w, b * w, c * w))
+    # Cramer's rule, without the determinant: the result is normalised anyhow.
+    normal = np.stack(
+        [
+            (bb * cc - bc * bc) * aw + (ac * bc - ab * cc) * bw + (ab * bc - ac * bb) * cw,
+            (ac * bc - ab * cc) * aw + (aa * cc - ac * ac) * bw + (ab * ac - aa * bc) * cw,
+            (ab * bc - ac * bb) * aw + (ab * ac - aa * bc) * bw + (aa * bb - ab * ab) * cw,
+        ],
+        axis=-1,
+    )
+    kernel = np.ones((window, window), np.uint8)
+    complete = cv2.erode(
+        valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    normal[complete == 0] = np.nan
+    return _towards_sensor(normal, image)
+
+
+def _towards_sensor(normals: NDArray, image: RangeImage) -> NDArray[np.float32]:
+    """Unit vectors against the rays; NaN for vectors without a direction."""
+    length = np.sqrt(np.einsum('ijk,ijk->ij', normals, normals))
+    facing = np.einsum('ijk,ijk->ij', normals, image.rays)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        scale = np.where(length > 0, -np.sign(facing) / length, np.nan)
+    scale[scale == 0] = np.nan
+    return (normals * scale[..., None]).astype(np.float32)
