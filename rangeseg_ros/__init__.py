@@ -5,6 +5,7 @@ from rangeseg_ros.core.config import Config, ConfigError
 from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.core.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.ros.clouds import planes_from_message
 
 __all__ = [
     'Camera',
@@ -16,4 +17,5 @@ __all__ = [
     'RangeImageError',
     'Segmentation',
     'Segmenter',
+    'planes_from_message',
 ]

@@ -12,11 +12,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from rangeseg_ros.core.camera import Camera, CameraError
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.ros.messages import (
-    camera_from_message,
-    depth_from_message,
-    points_from_message,
-)
+from rangeseg_ros.ros.clouds import points_from_message
+from rangeseg_ros.ros.messages import camera_from_message, depth_from_message
 from rangeseg_ros.ros.qos import MatchedSubscription
 
 IMAGE_TOPIC = 'depth/image_rect'
@@ -155,9 +152,10 @@ class DepthInput:
             return
         self.problem = ''
         if message.header.frame_id != self._camera_frame:
-            self._warn(
+            self._node.get_logger().warning(
                 f'image is in frame {message.header.frame_id!r}, '
-                f'its camera_info in {self._camera_frame!r}'
+                f'its camera_info in {self._camera_frame!r}',
+                throttle_duration_sec=5.0,
             )
         self._waiting = None
         self._accept(DepthFrame(message, camera, arrival))

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 import traceback
+from itertools import pairwise
 from threading import Thread
 
 import rclpy
@@ -24,7 +25,8 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.latest import Latest
-from rangeseg_ros.ros.messages import OUTPUTS, make_rclpy, message_class
+from rangeseg_ros.ros.messages import make_rclpy, message_class
+from rangeseg_ros.ros.outputs import OUTPUTS
 from rangeseg_ros.ros.parameters import NodeConfig, bind
 
 
@@ -116,9 +118,7 @@ class SegmentPlanes(Node):
             if publisher.get_subscription_count():
                 publisher.publish(output.message(make_rclpy, header, image, result))
         ticks.append(time.perf_counter())
-        conversion, compute, publication = (
-            1000 * (end - begin) for begin, end in zip(ticks, ticks[1:], strict=False)
-        )
+        conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(ticks))
         self._statistics.times = FrameTimes(
             transport=(frame.arrival - Time.from_msg(header.stamp).nanoseconds) / 1e6,
             waiting=(start - frame.arrival) / 1e6,

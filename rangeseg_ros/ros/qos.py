@@ -87,7 +87,7 @@ class MatchedSubscription:
         )
 
     def _best_offered(self, topic: str) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
-        """The strictest policies that fit every publisher; those that fit any when there is none."""
+        """The strictest policies that fit every publisher, of none those that fit any."""
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)

@@ -1,0 +1,159 @@
+"""Point clouds of messages: organised clouds in, `~/planes` out and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.ros.messages import Make
+
+# One row of `~/planes`: the fields of a Plane.
+PLANE_TYPE = np.dtype(
+    [
+        ('x', '<f4'),
+        ('y', '<f4'),
+        ('z', '<f4'),
+        ('normal_x', '<f4'),
+        ('normal_y', '<f4'),
+        ('normal_z', '<f4'),
+        ('distance', '<f4'),
+        ('label', '<u4'),
+        ('id', '<u4'),
+        ('count', '<u4'),
+        ('rms', '<f4'),
+        ('area', '<f4'),
+        ('covariance', '<f4', 16),
+    ]
+)
+
+# sensor_msgs/PointField: datatype -> numpy.
+_POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+
+class CloudError(ValueError):
+    """A PointCloud2 that is damaged, or not what is asked for."""
+
+
+def points_from_message(cloud: Any) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2.
+
+    Raises
+    ------
+    CloudError
+        No fields x, y, z of one floating-point type, one row only, or damaged.
+    """
+    records = _records(cloud)
+    columns: Any = records.dtype.fields or {}
+    kinds = {str(columns[name][0]) if name in columns else 'missing' for name in 'xyz'}
+    if kinds not in ({'float32'}, {'float64'}):
+        raise CloudError('cloud must have the fields x, y, z of one floating-point type')
+    if cloud.height < 2 and cloud.width > 1:
+        raise CloudError(f'cloud is not organised ({cloud.width}x{cloud.height})')
+    return np.stack([records[name] for name in 'xyz'], axis=-1)
+
+
+def planes_from_message(cloud: Any) -> NDArray[np.void]:
+    """Planes of a message of `~/planes`.
+
+    Parameters
+    ----------
+    cloud : sensor_msgs/PointCloud2
+        Of rclpy or rosbags.
+
+    Returns
+    -------
+    (N,) structured array, one row per plane, with the columns of `PLANE_TYPE`: `x`, `y`, `z`
+    (centroid, metres), `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance`
+    (metres: normal . p + distance = 0), `label`, `id`, `count` (pixels), `rms` (metres), `area`
+    (square metres), `covariance` ((N, 16): of normal and distance, 4x4 row by row).
+
+    Raises
+    ------
+    CloudError
+        The message is damaged.
+    """
+    return _records(cloud).ravel()
+
+
+def _records(cloud: Any) -> NDArray[np.void]:
+    """Structured array (H, W) of the fields of a PointCloud2, native byte order."""
+    order = '>' if cloud.is_bigendian else '<'
+    try:
+        dtype = np.dtype(
+            {
+                'names': [field.name for field in cloud.fields],
+                'formats': [
+                    (order + _POINT_FIELD_TYPES[field.datatype], field.count)
+                    if field.count > 1
+                    else order + _POINT_FIELD_TYPES[field.datatype]
+                    for field in cloud.fields
+                ],
+                'offsets': [field.offset for field in cloud.fields],
+                'itemsize': cloud.point_step,
+            }
+        )
+    except (ValueError, KeyError) as error:
+        raise CloudError(f'cloud has contradictory fields: {error}') from None
+    data = np.frombuffer(cloud.data, np.uint8)
+    if cloud.height * cloud.width == 0:
+        return np.empty((cloud.height, cloud.width), dtype).astype(dtype.newbyteorder('='))
+    row = cloud.width * cloud.point_step
+    needed = cloud.row_step * (cloud.height - 1) + row
+    if cloud.row_step < row or data.size < needed:
+        raise CloudError(
+            f'{data.size} bytes of data are too few for {cloud.width}x{cloud.height} points of '
+            f'{cloud.point_step} bytes in rows of {cloud.row_step} bytes'
+        )
+    strides = (cloud.row_step, cloud.point_step)
+    records: NDArray[np.void] = np.ndarray((cloud.height, cloud.width), dtype, data, 0, strides)
+    return records.astype(dtype.newbyteorder('='))
+
+
+def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
+    """sensor_msgs/PointCloud2 with one point per plane; see `planes_from_message`."""
+    rows = np.array(
+        [
+            (
+                *plane.centroid,
+                *plane.normal,
+                plane.distance,
+                plane.label,
+                plane.id,
+                plane.count,
+                plane.rms,
+                plane.area,
+                plane.covariance.ravel(),
+            )
+            for plane in planes
+        ],
+        PLANE_TYPE,
+    )
+    datatypes = {kind: number for number, kind in _POINT_FIELD_TYPES.items()}
+    fields = []
+    for name in PLANE_TYPE.names or ():
+        column, offset = PLANE_TYPE.fields[name][:2]  # type: ignore[index]
+        fields.append(
+            make(
+                'sensor_msgs/msg/PointField',
+                name=name,
+                offset=offset,
+                datatype=datatypes[column.base.str[1:]],
+                count=int(np.prod(column.shape)),
+            )
+        )
+    return make(
+        'sensor_msgs/msg/PointCloud2',
+        header=header,
+        height=1,
+        width=rows.size,
+        fields=fields,
+        is_bigendian=False,
+        point_step=PLANE_TYPE.itemsize,
+        row_step=rows.nbytes,
+        data=rows.view(np.uint8),
+        is_dense=True,
+    )

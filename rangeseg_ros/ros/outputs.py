@@ -1,0 +1,55 @@
+"""What is published of a segmentation: one message per topic of the node."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.drawing import overlay
+from rangeseg_ros.ros.clouds import planes_message
+from rangeseg_ros.ros.markers import markers_message
+from rangeseg_ros.ros.messages import Make, image_message
+
+
+@dataclass(frozen=True)
+class Output:
+    """A topic of the node.
+
+    Attributes
+    ----------
+    kind : str
+        Type of the message.
+    message : callable
+        (make, header, image, result) -> message.
+    """
+
+    kind: str
+    message: Callable[[Make, Any, RangeImage, Segmentation], Any]
+
+
+def _labels(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return image_message(make, header, result.labels, 'mono16')
+
+
+def _planes(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return planes_message(make, header, result.planes)
+
+
+def _markers(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return markers_message(make, header, result.planes)
+
+
+def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    picture = overlay(image.inverse, result.labels, result.planes)
+    return image_message(make, header, picture, 'rgb8')
+
+
+OUTPUTS = {
+    'labels': Output('sensor_msgs/msg/Image', _labels),
+    'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
+    'markers': Output('visualization_msgs/msg/MarkerArray', _markers),
+    'overlay': Output('sensor_msgs/msg/Image', _overlay),
+}
