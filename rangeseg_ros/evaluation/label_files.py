@@ -1,0 +1,124 @@
+"""Label images in files, and which of two folders belong together."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.evaluation.segcomp import from_segcomp, read_segmentation
+from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.images import read_labels
+
+NOT_PLANAR = 65535
+SEGCOMP_SUFFIXES = ('.gt-seg', '.ms-seg')
+
+
+class EvaluationError(ValueError):
+    """Files that cannot be evaluated: missing, unpaired, or of an unknown layout."""
+
+
+class Truth(NamedTuple):
+    """Ground truth of one image.
+
+    Attributes
+    ----------
+    labels : (H, W) uint16
+        0 = no region.
+    judged : (H, W) bool or None
+        Pixels that count; None for all.
+    """
+
+    labels: NDArray[np.uint16]
+    judged: NDArray[np.bool_] | None
+
+    def compare(self, labels: NDArray) -> Overlap:
+        """Overlap of a segmentation with this truth; the label 65535 is no region there either."""
+        if self.judged is not None:
+            labels = np.where(labels == NOT_PLANAR, 0, labels)
+        return Overlap.between(self.labels, labels, self.judged)
+
+
+def read_label_image(path: Path) -> NDArray[np.uint16]:
+    """Read labels, 0 = none: a segcomp raster (regions from 10), or a PNG of 8 or 16 bits.
+
+    Raises
+    ------
+    SegcompError, ImageFileError
+        A missing or malformed file.
+    """
+    if path.suffix in SEGCOMP_SUFFIXES:
+        return from_segcomp(read_segmentation(path))
+    return read_labels(path)
+
+
+def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:
+    """Ground truth from a label image.
+
+    Where the image has the label 65535, judged not to be planar, its 0 means not judged, and
+    regions are compared over the judged pixels only: a found region that covers something curved
+    pays for it, one that runs into what nobody judged does not. Otherwise all pixels count, as in
+    the reference tool.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+        0 = no region (or not judged), 65535 = judged not to be planar.
+    min_pixels : int
+        Smaller regions are no regions; their pixels stay judged.
+    """
+    curved = labels == NOT_PLANAR
+    judged = labels > 0 if curved.any() else None
+    sizes = np.bincount(labels.ravel(), minlength=1)
+    keep = sizes >= min_pixels
+    return Truth(np.where(keep[labels] & ~curved, labels, 0).astype(np.uint16), judged)
+
+
+def pair_files(truth: Path, labels: Path) -> dict[str, tuple[Path, Path]]:
+    """Pair the label images of two folders (or two files) by name.
+
+    In a folder the images are its `.gt-seg` or `.ms-seg` files; else its `*_truth.png` or
+    `*_labels.png`; else all its PNGs. Names are equal when they agree without suffix and without
+    `_truth`, `_labels`, `_depth` at the end.
+
+    Returns
+    -------
+    dict
+        Name -> (truth, labels), in natural order.
+
+    Raises
+    ------
+    EvaluationError
+        No label images, or one without its counterpart.
+    """
+    if truth.is_file() and labels.is_file():
+        return {_key(truth): (truth, labels)}
+    if not (truth.is_dir() and labels.is_dir()):
+        raise EvaluationError(f'{truth} and {labels} must be two files or two folders')
+    truths, found = _label_files(truth), _label_files(labels)
+    for name, path in found.items():
+        if name not in truths:
+            raise EvaluationError(f'{path}: no ground truth of that name in {truth}')
+    for name, path in truths.items():
+        if name not in found:
+            raise EvaluationError(f'{path}: no segmentation of that name in {labels}')
+    return {name: (path, found[name]) for name, path in truths.items()}
+
+
+def _label_files(folder: Path) -> dict[str, Path]:
+    for patterns in (('*.gt-seg', '*.ms-seg'), ('*_truth.png', '*_labels.png'), ('*.png',)):
+        paths = [path for pattern in patterns for path in folder.glob(pattern)]
+        files = {_key(path): path for path in sorted(paths, key=natural_order)}
+        if len(files) < len(paths):
+            raise EvaluationError(f'{folder}: several label images of the same name')
+        if files:
+            return files
+    raise EvaluationError(f'{folder}: no label images (.gt-seg, .ms-seg, .png)')
+
+
+def _key(path: Path) -> str:
+    return re.sub(r'(_(truth|labels|depth))+$', '', path.stem)

@@ -1,0 +1,195 @@
+"""`rangeseg compare`: figures of known label images, pairing of folders, and refusals."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.evaluation import segcomp
+
+
+@pytest.fixture
+def compare(tmp_path, monkeypatch, capsys):
+    """Run `rangeseg compare`; returns exit code, figures (or None), and what went to stderr."""
+
+    def run(*args):
+        output = tmp_path / 'figures.json'
+        words = ['rangeseg', 'compare', *map(str, args), '--json', str(output)]
+        monkeypatch.setattr('sys.argv', words)
+        with pytest.raises(SystemExit) as end:
+            main()
+        figures = json.loads(output.read_text()) if output.exists() else None
+        return end.value.code or 0, figures, capsys.readouterr().err
+
+    return run
+
+
+def write(path, labels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.array(labels, np.uint16)
+    if path.suffix == '.png':
+        assert cv2.imwrite(str(path), image)
+    else:
+        segcomp.write_segmentation(path, image.astype(np.uint8))
+    return path
+
+
+def test_two_png_files(tmp_path, compare):
+    # Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
+    truth = write(tmp_path / 'truth.png', [[1, 1, 1, 1, 2, 2, 2, 0]])
+    labels = write(tmp_path / 'labels.png', [[5, 5, 5, 5, 5, 6, 6, 0]])
+    code, figures, _ = compare(truth, labels, '--tolerance', '0.8', '0.9')
+    assert code == 0
+    assert figures['tolerances'] == {
+        '0.8': {
+            'regions': 2,
+            'correct': 1,
+            'over': 0,
+            'under': 0,
+            'missed': 1,
+            'noise': 1,
+            'mean_iou': pytest.approx((4 / 5 + 2 / 3) / 2),
+            'pixel_accuracy': pytest.approx(6 / 7),
+        },
+        '0.9': {
+            'regions': 2,
+            'correct': 0,
+            'over': 0,
+            'under': 0,
+            'missed': 2,
+            'noise': 2,
+            'mean_iou': pytest.approx((4 / 5 + 2 / 3) / 2),
+            'pixel_accuracy': pytest.approx(6 / 7),
+        },
+    }
+
+
+def test_rasters_count_regions_from_ten(tmp_path, compare):
+    # 0-3 are no regions on either side, so nothing is noise.
+    truth = write(tmp_path / 'abw.test.1.gt-seg', [[10, 10, 2, 3], [11, 11, 0, 1]])
+    labels = write(tmp_path / 'abw.test.1.ms-seg', [[12, 12, 3, 2], [10, 10, 1, 0]])
+    code, figures, _ = compare(truth, labels)
+    assert code == 0
+    assert list(figures['tolerances']) == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
+    row = figures['tolerances']['0.95']
+    assert (row['regions'], row['correct'], row['noise']) == (2, 2, 0)
+
+
+def test_a_png_may_be_compared_with_a_raster(tmp_path, compare):
+    truth = write(tmp_path / 'a.gt-seg', [[10, 10, 2, 11]])
+    labels = write(tmp_path / 'a.png', [[7, 7, 0, 4]])
+    assert compare(truth, labels)[1]['tolerances']['0.8']['correct'] == 2
+
+
+def test_folders_are_paired_by_name_and_summed(tmp_path, compare):
+    write(tmp_path / 'gt/2_truth.png', [[1, 1, 0]])
+    write(tmp_path / 'gt/10_truth.png', [[1, 2, 0]])
+    write(tmp_path / 'ms/2_depth_labels.png', [[1, 1, 0]])
+    write(tmp_path / 'ms/10_depth_labels.png', [[0, 2, 3]])
+    write(tmp_path / 'ms/10_depth_overlay.png', [[9, 9, 9]])
+    code, figures, _ = compare(tmp_path / 'gt', tmp_path / 'ms', '--tolerance', '0.8')
+    assert code == 0
+    assert figures['images'] == 2
+    row = figures['tolerances']['0.8']
+    assert (row['regions'], row['correct'], row['missed'], row['noise']) == (3, 2, 1, 1)
+    # Over all three regions and four pixels, not the mean of two images.
+    assert row['mean_iou'] == pytest.approx(2 / 3)
+    assert row['pixel_accuracy'] == pytest.approx(3 / 4)
+    assert list(figures['per_image']) == ['2', '10']
+    assert figures['per_image']['10']['tolerances']['0.8']['missed'] == 1
+
+
+def test_not_judged_pixels_do_not_count(tmp_path, compare):
+    # Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3.
+    truth = write(tmp_path / 'truth.png', [[1, 1, 0, 65535, 65535]])
+    labels = write(tmp_path / 'labels.png', [[7, 7, 7, 7, 0]])
+    row = compare(truth, labels, '--tolerance', '0.6')[1]['tolerances']['0.6']
+    assert (row['regions'], row['correct'], row['noise']) == (1, 1, 0)
+    assert row['mean_iou'] == pytest.approx(2 / 3)
+    # Without 65535 in the truth every pixel counts: 2 / 4.
+    truth = write(tmp_path / 'truth.png', [[1, 1, 0, 0, 0]])
+    assert compare(truth, labels)[1]['tolerances']['0.6']['mean_iou'] == pytest.approx(1 / 2)
+
+
+def test_a_truth_agrees_with_itself(tmp_path, compare):
+    truth = write(tmp_path / 'truth.png', [[1, 2, 0, 65535]])
+    row = compare(truth, truth)[1]['tolerances']['0.95']
+    assert (row['correct'], row['noise'], row['pixel_accuracy']) == (2, 0, 1.0)
+
+
+def test_small_regions_can_be_left_out(tmp_path, compare):
+    truth = write(tmp_path / 'truth.png', [[1, 1, 1, 2]])
+    labels = write(tmp_path / 'labels.png', [[1, 1, 1, 0]])
+    assert compare(truth, labels)[1]['tolerances']['0.8']['missed'] == 1
+    row = compare(truth, labels, '--min-pixels', 2)[1]['tolerances']['0.8']
+    assert (row['regions'], row['missed']) == (1, 0)
+
+
+def test_undefined_figures_are_null(tmp_path, compare):
+    empty = write(tmp_path / 'empty.png', [[0, 0]])
+    assert compare(empty, empty)[1]['tolerances']['0.8']['mean_iou'] is None
+
+
+def refuse(result, *parts):
+    code, figures, err = result
+    assert code == 2 and figures is None
+    assert err.count('\n') == 1
+    for part in parts:
+        assert str(part) in err
+
+
+@pytest.mark.parametrize('tolerance', ['0.5', '1.2', '80', 'nan'])
+def test_tolerance_out_of_range(tmp_path, compare, tolerance):
+    truth = write(tmp_path / 'truth.png', [[1]])
+    refuse(compare(truth, truth, '--tolerance', tolerance), 'tolerance', 'above 0.5')
+
+
+def test_files_of_different_size(tmp_path, compare):
+    a, b = write(tmp_path / 'a.png', [[1, 1]]), write(tmp_path / 'b.png', [[1]])
+    refuse(compare(a, b), b, 'differ in size')
+
+
+def test_missing_counterpart(tmp_path, compare):
+    write(tmp_path / 'gt/1.png', [[1]])
+    write(tmp_path / 'ms/1.png', [[1]])
+    extra = write(tmp_path / 'ms/2.png', [[1]])
+    refuse(compare(tmp_path / 'gt', tmp_path / 'ms'), extra, 'no ground truth')
+    refuse(compare(tmp_path / 'ms', tmp_path / 'gt'), extra, 'no segmentation')
+
+
+def test_file_against_folder(tmp_path, compare):
+    truth = write(tmp_path / 'gt/1.png', [[1]])
+    refuse(compare(truth, tmp_path / 'gt'), 'two files or two folders')
+
+
+def test_folder_without_label_images(tmp_path, compare):
+    refuse(compare(tmp_path, tmp_path), tmp_path, 'no label images')
+
+
+@pytest.mark.parametrize(
+    ('change', 'fault'),
+    [
+        (lambda data: b'\0' + data[1:], 'magic'),
+        (lambda data: data[:-1], 'truncated'),
+        (lambda data: data[:-1] + b'\x05', 'label 5'),
+    ],
+)
+def test_malformed_rasters(tmp_path, compare, change, fault):
+    truth = write(tmp_path / 'a.gt-seg', [[10, 10]])
+    labels = write(tmp_path / 'a.ms-seg', [[10, 10]])
+    labels.write_bytes(change(labels.read_bytes()))
+    refuse(compare(truth, labels), labels, fault)
+
+
+def test_colour_image(tmp_path, compare):
+    truth = write(tmp_path / 'truth.png', [[1, 1]])
+    picture = tmp_path / 'picture.png'
+    assert cv2.imwrite(str(picture), np.zeros((1, 2, 3), np.uint8))
+    refuse(compare(truth, picture), picture, 'one channel')
+
+
+def test_missing_file(tmp_path, compare):
+    truth = write(tmp_path / 'truth.png', [[1, 1]])
+    refuse(compare(truth, tmp_path / 'none.png'), 'none.png')
