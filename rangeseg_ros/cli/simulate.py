@@ -1,0 +1,175 @@
+"""`rangeseg simulate`: scenes with known truth, as the three sensors see them."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import click
+import numpy as np
+
+from rangeseg_ros.cli import options
+from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.simulation.kinect import NOISES, Frame, kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
+from rangeseg_ros.simulation.truth import TruePlane
+
+SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
+
+seed_option = click.option(
+    '--seed',
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help='Seed of the first scene; the next ones have the next numbers.',
+)
+output_option = click.option(
+    '--output',
+    type=click.Path(path_type=Path),
+    required=True,
+    help='Folder to make; it must not exist, or be empty.',
+)
+
+
+@click.group()
+def command() -> None:
+    """Simulate range images with ground truth."""
+
+
+@command.command()
+@click.option(
+    '--scenes', type=click.IntRange(min=1), default=12, show_default=True, help='How many.'
+)
+@click.option(
+    '--frames',
+    type=click.IntRange(min=1),
+    default=1,
+    show_default=True,
+    help='Frames of each scene, at 30 Hz from a camera that moves as if held by hand.',
+)
+@seed_option
+@click.option(
+    '--sensor-seed',
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help='Which sensor: its fixed distortion and bands (noise "measured").',
+)
+@click.option(
+    '--noise',
+    type=click.Choice(NOISES),
+    default='measured',
+    show_default=True,
+    help='As measured on real sensors; the textbook formula, correlated over 1.5 pixels or '
+    'independent; or none.',
+)
+@click.option(
+    '--scene',
+    'kind',
+    type=click.Choice(list(SCENES)),
+    default='room',
+    show_default=True,
+    help='Rooms with boxes, or with a ball and a cylinder as well.',
+)
+@click.option('--width', type=click.IntRange(16, 4096), default=640, show_default=True)
+@click.option('--height', type=click.IntRange(16, 4096), default=480, show_default=True)
+@output_option
+def kinect(
+    scenes: int,
+    frames: int,
+    seed: int,
+    sensor_seed: int,
+    noise: str,
+    kind: str,
+    width: int,
+    height: int,
+    output: Path,
+) -> None:
+    """Rooms as a Kinect sees them.
+
+    \b
+    OUTPUT/depth/NAME.png   depth, 16 bits, millimetres, 0 = no measurement
+    OUTPUT/truth/NAME.png   true regions, 16 bits: 0 = no measurement,
+                            65535 = not planar, else a label
+    OUTPUT/planes.csv       plane of each region: normal . p + distance = 0,
+                            metres, optical frame; regions of the same face
+                            of a scene's solids share the number face
+    OUTPUT/camera.yaml      intrinsics
+    OUTPUT/bag              all depth images, as a rosbag2 (mcap) at 30 Hz
+
+    NAME is the scene's seed, and the number of the frame where there are several. Without noise
+    the images are rounded to millimetres; the bag then holds exact metres (32FC1).
+    """
+    camera = kinect_camera(width, height)
+
+    def simulated() -> Iterator[tuple[str, Frame]]:
+        for number in range(seed, seed + scenes):
+            scene = SCENES[kind](number, frames)
+            for frame in range(frames):
+                name = f'{number:06d}' if frames == 1 else f'{number:06d}_{frame:06d}'
+                yield (
+                    name,
+                    simulate_kinect(
+                        scene,
+                        camera,
+                        frame=frame,
+                        noise=noise,
+                        sensor_seed=sensor_seed,
+                        seed=number,
+                    ),
+                )
+
+    count = scenes * frames
+    with _new_folder(output) as folder:
+        write_camera(folder / 'camera.yaml', camera)
+        with (
+            _TruthTable(folder / 'planes.csv') as table,
+            DepthBagWriter(folder / 'bag', camera) as bag,
+        ):
+            for index, (name, image) in enumerate(options.progress(simulated(), count, 'image')):
+                depth = image.depth
+                if depth.dtype != np.uint16:
+                    depth = np.rint(1000 * depth).astype(np.uint16)
+                write_image(folder / 'depth' / f'{name}.png', depth)
+                write_image(folder / 'truth' / f'{name}.png', image.labels)
+                table.write(name, image.planes)
+                bag.write(image.depth, 10**9 + round(index * 1e9 / 30))
+    click.echo(f'{output}: {count} images')
+
+
+class _TruthTable:
+    """CSV of the planes of all images."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> _TruthTable:
+        self._file = self.path.open('w', newline='')
+        self._rows = csv.writer(self._file, lineterminator='\n')
+        normal = ('normal_x', 'normal_y', 'normal_z')
+        self._rows.writerow(['image', 'label', 'face', *normal, 'distance', 'count'])
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._file.close()
+
+    def write(self, image: str, planes: list[TruePlane]) -> None:
+        """Append the planes of an image."""
+        for plane in planes:
+            equation = (f'{value:.9g}' for value in (*plane.normal, plane.distance))
+            self._rows.writerow([image, plane.label, plane.face, *equation, plane.count])
+
+
+@contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that appears under its name once it is complete."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise click.ClickException(f'{path}: exists already, not overwritten')
+    with replacing(path) as partial:
+        partial.mkdir()
+        yield partial

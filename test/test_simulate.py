@@ -1,0 +1,96 @@
+"""The command `rangeseg simulate`: what it writes, and that it writes it whole."""
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rangeseg_ros.cli.simulate import command
+from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.images import read_depth, read_labels
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import curved_scene
+
+SMALL = ['--width', '160', '--height', '120']
+
+
+def simulate(*arguments):
+    return CliRunner().invoke(command, [str(argument) for argument in arguments])
+
+
+def test_kinect_folder_holds_the_scenes(tmp_path):
+    output = tmp_path / 'rooms'
+    result = simulate(
+        'kinect', '--scenes', 2, '--frames', 2, '--seed', 7, '--scene', 'curved', *SMALL,
+        '--sensor-seed', 3, '--output', output,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert [path.name for path in tmp_path.iterdir()] == ['rooms']
+    names = ['000007_000000', '000007_000001', '000008_000000', '000008_000001']
+    for kind in ('depth', 'truth'):
+        assert sorted(path.stem for path in (output / kind).iterdir()) == names
+
+    camera = read_camera(output / 'camera.yaml')
+    expected = simulate_kinect(curved_scene(8, 2), camera, frame=1, seed=8, sensor_seed=3)
+    assert camera == kinect_camera(160, 120)
+    assert np.array_equal(read_depth(output / 'depth' / f'{names[3]}.png'), expected.depth)
+    truth = read_labels(output / 'truth' / f'{names[3]}.png')
+    assert np.array_equal(truth, expected.labels)
+
+    with (output / 'planes.csv').open() as file:
+        rows = [row for row in csv.DictReader(file) if row['image'] == names[3]]
+    assert len(rows) == len(expected.planes)
+    for row, plane in zip(rows, expected.planes, strict=True):
+        assert [int(row['label']), int(row['face'])] == [plane.label, plane.face]
+        assert int(row['count']) == (truth == plane.label).sum()
+        normal = [float(row[f'normal_{axis}']) for axis in 'xyz']
+        assert normal == pytest.approx(plane.normal, abs=1e-8)
+        assert float(row['distance']) == pytest.approx(plane.distance, abs=1e-7)
+
+    with DepthBag(output / 'bag') as bag:
+        frames = list(bag)
+    assert len(frames) == 4
+    assert np.array_equal(frames[3].depth, expected.depth)
+    assert frames[3].stamp - frames[0].stamp == 100_000_000
+
+
+def test_noise_free_png_is_rounded_and_bag_exact(tmp_path):
+    output = tmp_path / 'rooms'
+    result = simulate('kinect', '--scenes', 1, '--noise', 'none', *SMALL, '--output', output)
+    assert result.exit_code == 0, result.output
+    depth = cv2.imread(str(output / 'depth' / '000000.png'), cv2.IMREAD_UNCHANGED)
+    assert depth.dtype == np.uint16
+    with DepthBag(output / 'bag') as bag:
+        (frame,) = bag
+    assert frame.depth.dtype == np.float32
+    assert np.abs(1000 * frame.depth - depth).max() <= 0.501
+
+
+def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch):
+    output = tmp_path / 'rooms'
+    output.mkdir()
+    (output / 'precious').touch()
+    result = simulate('kinect', '--output', output)
+    assert result.exit_code != 0 and 'exists already' in result.output
+
+    def fail(*_arguments, **_options):
+        raise OSError('disk full')
+
+    monkeypatch.setattr('rangeseg_ros.cli.simulate.write_image', fail)
+    result = simulate('kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other')
+    assert isinstance(result.exception, OSError)
+    assert [path.name for path in tmp_path.iterdir()] == ['rooms']
+
+
+@pytest.mark.parametrize(
+    ('option', 'value'),
+    [('--noise', 'loud'), ('--scenes', 0), ('--seed', -1), ('--width', 1), ('--scene', 'desert')],
+)
+def test_bad_option(tmp_path, option, value):
+    result = simulate('kinect', option, value, '--output', tmp_path / 'rooms')
+    assert result.exit_code == 2
+    assert option in result.output and str(value) in result.output
+    assert not any(tmp_path.iterdir())
