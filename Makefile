@@ -1,0 +1,39 @@
+# Needs python3 with venv, and make. A sourced ROS 2 is used where there is one: its rclpy then
+# comes before any wheel, through a virtual environment that sees the system's packages.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
+
+.PHONY: test demo lint clean
+
+test: $(VENV)/installed
+	$(BIN)/python -m pytest
+
+demo: $(VENV)/installed
+	rm -rf demo
+	$(BIN)/rangeseg simulate kinect --scenes 5 --seed 1 --output demo/simulated
+	$(BIN)/rangeseg replay demo/simulated/bag --output demo/planes
+	@echo 'Labels, overlays and planes.csv are in $(CURDIR)/demo/planes'
+
+lint: $(VENV)/linters
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+# Editable, so that the sources in this folder are what runs.
+$(VENV)/installed: setup.py setup.cfg pyproject.toml
+	$(PYTHON) -m venv $(SYSTEM_ROS) $(VENV)
+	$(BIN)/pip install --quiet --editable '.[test]'
+ifeq ($(SYSTEM_ROS),)
+	$(BIN)/pip install --quiet --only-binary :all: --editable '.[jazzy]' || \
+	  echo 'No ROS 2 wheels for this platform: the tests of the node will be skipped.'
+endif
+	touch $@
+
+$(VENV)/linters: $(VENV)/installed
+	$(BIN)/pip install --quiet --editable '.[lint]'
+	touch $@
+
+clean:
+	rm -rf $(VENV) demo build install log dist *.egg-info

@@ -1,0 +1,66 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = 'rangeseg_ros'
+share = f'share/{package_name}'
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    description='Planar segmentation of range images by multi-label graph cuts, for ROS 2',
+    long_description=open('README.md', encoding='utf-8').read(),
+    long_description_content_type='text/markdown',
+    author='rangeseg_ros maintainers',
+    author_email='rangeseg-ros@example.org',
+    maintainer='rangeseg_ros maintainers',
+    maintainer_email='rangeseg-ros@example.org',
+    license='GPL-3.0-or-later',
+    packages=find_packages(include=[package_name, f'{package_name}.*']),
+    package_data={package_name: ['py.typed']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
+        (share, ['package.xml']),
+        (f'{share}/launch', glob('launch/*.py')),
+        (f'{share}/params', glob('params/*')),
+        # `ros2 run` looks here. colcon puts the console scripts here by setup.cfg, pip does not.
+        (f'lib/{package_name}', glob('scripts/*')),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'click>=8.0',
+        'lz4',
+        'mcap>=1.0',
+        'numpy>=1.26',
+        'opencv-python-headless>=4.6',
+        'PyMaxflow>=1.3',
+        'PyYAML>=5.4',
+        'rosbags>=0.11',
+        'scipy>=1.11',
+        'shapely>=2.0',
+        'tqdm>=4.60',
+    ],
+    extras_require={
+        'test': ['hypothesis>=6.90', 'pytest>=7.4'],
+        'lint': ['mypy>=1.8', 'ruff>=0.4', 'types-PyYAML'],
+        # The node where no ROS 2 is installed: rclpy over Fast DDS as wheels. A sourced ROS 2 has
+        # all of these, so do not install this extra beside one.
+        'jazzy': [
+            'ros-jazzy-rclpy',
+            'ros-jazzy-rmw-fastrtps-cpp',
+            'ros-jazzy-sensor-msgs',
+            'ros-jazzy-geometry-msgs',
+            'ros-jazzy-std-msgs',
+            'ros-jazzy-shape-msgs',
+            'ros-jazzy-visualization-msgs',
+            'ros-jazzy-diagnostic-msgs',
+        ],
+    },
+    zip_safe=True,
+    entry_points={
+        'console_scripts': [
+            'rangeseg = rangeseg_ros.cli.main:main',
+            'segment_planes = rangeseg_ros.ros.node:main',
+        ],
+    },
+)
