@@ -12,7 +12,7 @@ test: $(VENV)/installed
 
 demo: $(VENV)/installed
 	rm -rf demo
-	$(BIN)/rangeseg simulate kinect --scenes 5 --seed 1 --output demo/simulated
+	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 15 --seed 1 --output demo/simulated
 	$(BIN)/rangeseg replay demo/simulated/bag --output demo/planes
 	@echo 'Labels, overlays and planes.csv are in $(CURDIR)/demo/planes'
 

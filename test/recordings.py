@@ -1,0 +1,116 @@
+"""Recordings for tests, in every format, written with rosbags alone."""
+
+import struct
+
+import cv2
+import numpy as np
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED = 'sensor_msgs/msg/CompressedImage'
+CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+ROS1 = get_typestore(Stores.ROS1_NOETIC)
+ROS2 = get_typestore(Stores.ROS2_JAZZY)
+SUFFIXES = {'mcap': '', 'sqlite3': '', 'rosbag1': '.bag'}
+
+
+def depth_images(count, height=48, width=64):
+    """Different, incompressible images: (count, H, W) uint16."""
+    noise = np.random.default_rng(0)
+    return noise.integers(0, 5000, (count, height, width)).astype(np.uint16)
+
+
+class Recording:
+    """Messages to record: `add` them, then `write`."""
+
+    def __init__(self, ros1=False):
+        self.store = ROS1 if ros1 else ROS2
+        self.ros1 = ros1
+        self.messages = []
+
+    def header(self, stamp, frame_id='optical'):
+        types = self.store.types
+        time = types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
+        fields = {'seq': 0} if self.ros1 else {}
+        return types['std_msgs/msg/Header'](stamp=time, frame_id=frame_id, **fields)
+
+    def add_image(self, stamp, image, encoding='16UC1', topic='/camera/depth/image_rect'):
+        step = image.strides[0]
+        message = self.store.types[IMAGE](
+            header=self.header(stamp),
+            height=image.shape[0],
+            width=image.shape[1],
+            encoding=encoding,
+            is_bigendian=0,
+            step=step,
+            data=np.ascontiguousarray(image).view(np.uint8).ravel(),
+        )
+        self.messages.append((stamp, topic, IMAGE, message))
+
+    def add_compressed(self, stamp, image, topic='/camera/depth/image_rect/compressedDepth'):
+        png = cv2.imencode('.png', image)[1].tobytes()
+        message = self.store.types[COMPRESSED](
+            header=self.header(stamp),
+            format='16UC1; compressedDepth png',
+            data=np.frombuffer(struct.pack('<iff', 0, 0, 0) + png, np.uint8),
+        )
+        self.messages.append((stamp, topic, COMPRESSED, message))
+
+    def add_camera(
+        self, stamp, width=64, height=48, focal=50.0, topic='/camera/depth/camera_info'
+    ):
+        k = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1])
+        matrices = {
+            'd': np.zeros(5),
+            'k': k,
+            'r': np.eye(3).ravel(),
+            'p': np.insert(k, (3, 6, 9), 0.0),
+        }
+        if self.ros1:
+            matrices = {name.upper(): matrix for name, matrix in matrices.items()}
+        message = self.store.types[CAMERA_INFO](
+            header=self.header(stamp),
+            height=height,
+            width=width,
+            distortion_model='plumb_bob',
+            binning_x=0,
+            binning_y=0,
+            roi=self.store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
+            **matrices,
+        )
+        self.messages.append((stamp, topic, CAMERA_INFO, message))
+
+    def write(self, path, storage='mcap'):
+        """Write all messages; the file that holds them."""
+        if self.ros1:
+            writer = rosbag1.Writer(path)
+            serialize = self.store.serialize_ros1
+        else:
+            plugin = {
+                'mcap': rosbag2.StoragePlugin.MCAP,
+                'sqlite3': rosbag2.StoragePlugin.SQLITE3,
+            }[storage]
+            writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
+            serialize = self.store.serialize_cdr
+        with writer:
+            connections = {}
+            for stamp, topic, kind, message in self.messages:
+                if topic not in connections:
+                    connections[topic] = writer.add_connection(topic, kind, typestore=self.store)
+                writer.write(connections[topic], stamp, serialize(message, kind))
+        if self.ros1:
+            return path
+        (file,) = [*path.glob('*.mcap'), *path.glob('*.db3')]
+        return file
+
+
+def record(path, storage, images, compressed=False):
+    """Record `images` with their camera at 30 Hz; the file that holds the messages."""
+    recording = Recording(ros1=storage == 'rosbag1')
+    for index, image in enumerate(images):
+        stamp = 10**18 + index * 33_333_333
+        recording.add_camera(stamp, image.shape[1], image.shape[0])
+        add = recording.add_compressed if compressed else recording.add_image
+        add(stamp, image)
+    return recording.write(path, storage)

@@ -1,0 +1,215 @@
+"""Recordings in, depth frames out: every format, whole, odd and damaged."""
+
+import shutil
+
+import numpy as np
+import pytest
+from recordings import SUFFIXES, Recording, depth_images, record
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthBagWriter
+
+STORAGES = tuple(SUFFIXES)
+
+
+def read(path, **topics):
+    with DepthBag(path, **topics) as bag:
+        return list(bag)
+
+
+@pytest.mark.parametrize('compressed', [False, True])
+@pytest.mark.parametrize('storage', STORAGES)
+def test_every_format_gives_the_frames(tmp_path, storage, compressed):
+    images = depth_images(5)
+    path = tmp_path / f'bag{SUFFIXES[storage]}'
+    file = record(path, storage, images, compressed)
+    for source in {path, file}:
+        with DepthBag(source) as bag:
+            assert len(bag) == 5
+            assert bag.camera_topic == '/camera/depth/camera_info'
+            frames = list(bag)
+        assert [frame.stamp for frame in frames] == [10**18 + i * 33_333_333 for i in range(5)]
+        assert {frame.frame_id for frame in frames} == {'optical'}
+        assert {frame.camera for frame in frames} == {Camera(64, 48, 50.0, 50.0, 31.5, 23.5)}
+        np.testing.assert_array_equal([frame.depth for frame in frames], images)
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+@pytest.mark.parametrize('share', [0.3, 0.5, 0.9])
+def test_a_truncated_recording_gives_the_frames_before_the_damage(tmp_path, storage, share):
+    images = depth_images(40, 240, 320)
+    path = tmp_path / f'bag{SUFFIXES[storage]}'
+    file = record(path, storage, images)
+    size = file.stat().st_size
+    with file.open('r+b') as stream:
+        stream.truncate(int(size * share))
+    frames = []
+    with DepthBag(path) as bag:
+        count = len(bag)
+        with pytest.raises(DamagedBagError, match=f'damaged after {count} frames: .'):
+            for frame in bag:
+                frames.append(frame)
+    assert len(frames) == count
+    # What was cut through is lost: an image, or the chunk of at most 1 MB that it is in.
+    assert 40 * share - 9 <= count <= 40 * share
+    np.testing.assert_array_equal([frame.depth for frame in frames], images[:count])
+
+
+@pytest.mark.parametrize('storage', STORAGES)
+def test_damage_in_the_middle_never_escapes_as_another_error(tmp_path, storage):
+    images = depth_images(20)
+    file = record(tmp_path / f'bag{SUFFIXES[storage]}', storage, images)
+    whole = file.read_bytes()
+    noise = np.random.default_rng(1)
+    for _ in range(60):
+        start = int(noise.integers(len(whole)))
+        length = int(noise.integers(1, 2000))
+        garbage = noise.integers(0, 256, length, np.uint8).tobytes()
+        file.write_bytes((whole[:start] + garbage + whole[start + length :])[: len(whole)])
+        try:
+            frames = read(file)
+        except BagError as error:
+            assert str(file) in str(error)
+        else:
+            assert len(frames) <= 20
+
+
+def test_a_recording_without_its_metadata_is_read(tmp_path):
+    images = depth_images(3)
+    record(tmp_path / 'bag', 'mcap', images)
+    (tmp_path / 'bag' / 'metadata.yaml').unlink()
+    np.testing.assert_array_equal([f.depth for f in read(tmp_path / 'bag')], images)
+
+
+def test_parts_of_a_recording_are_read_in_order(tmp_path):
+    images = depth_images(12)
+    (tmp_path / 'bag').mkdir()
+    for index, image in enumerate(images):
+        part = record(tmp_path / 'part', 'mcap', image[None])
+        part.rename(tmp_path / 'bag' / f'bag_{index}.mcap')
+        shutil.rmtree(tmp_path / 'part')
+    np.testing.assert_array_equal([f.depth for f in read(tmp_path / 'bag')], images)
+
+
+def test_depth_is_found_by_name_among_other_images(tmp_path):
+    recording = Recording()
+    recording.add_image(1, np.zeros((48, 192), np.uint8), 'rgb8', '/camera/color/image_raw')
+    recording.add_image(1, depth_images(1)[0], 'mono16', '/camera/infra/image_raw')
+    recording.add_camera(1, topic='/camera/color/camera_info')
+    recording.add_camera(1, topic='/camera/infra/camera_info')
+    recording.add_camera(1, topic='/camera/depth/camera_info')
+    recording.add_compressed(2, depth_images(1)[0])
+    recording.add_image(2, depth_images(1)[0])
+    recording.write(tmp_path / 'bag')
+    with DepthBag(tmp_path / 'bag') as bag:
+        assert bag.depth_topic == '/camera/depth/image_rect'
+        assert bag.camera_topic == '/camera/depth/camera_info'
+    with DepthBag(tmp_path / 'bag', '/camera/depth/image_rect/compressedDepth') as bag:
+        assert bag.camera_topic == '/camera/depth/camera_info'
+
+
+def test_depth_is_found_by_encoding_where_no_name_tells(tmp_path):
+    recording = Recording()
+    recording.add_image(1, np.zeros((48, 192), np.uint8), 'rgb8', '/a/image')
+    recording.add_image(1, np.ones((48, 64), np.float32), '32FC1', '/b/image')
+    recording.add_camera(1, topic='/camera_info')
+    recording.write(tmp_path / 'bag')
+    with DepthBag(tmp_path / 'bag') as bag:
+        assert (bag.depth_topic, bag.camera_topic) == ('/b/image', '/camera_info')
+
+
+def test_camera_changes_on_the_way(tmp_path):
+    recording = Recording()
+    images = depth_images(3)
+    recording.add_image(1, images[0])  # before any camera_info: the first one counts
+    recording.add_camera(2, focal=50.0)
+    recording.add_image(3, images[1])
+    recording.add_camera(4, focal=60.0)
+    recording.add_image(5, images[2])
+    recording.write(tmp_path / 'bag')
+    assert [frame.camera.fx for frame in read(tmp_path / 'bag')] == [50.0, 50.0, 60.0]
+
+
+def test_errors_list_the_topics(tmp_path):
+    recording = Recording()
+    recording.add_camera(1, topic='/left/camera_info')
+    recording.add_camera(1, topic='/right/camera_info')
+    recording.write(tmp_path / 'cameras')
+    with pytest.raises(BagError, match=r'no depth image; topics: /left/camera_info \[sensor_msgs'):
+        DepthBag(tmp_path / 'cameras')
+    recording.add_image(1, depth_images(1)[0])
+    recording.write(tmp_path / 'both')
+    with pytest.raises(BagError, match=r'no camera_info for .*/right/camera_info'):
+        DepthBag(tmp_path / 'both')
+    with pytest.raises(BagError, match=r'no depth image on /nowhere; topics: /camera'):
+        DepthBag(tmp_path / 'both', '/nowhere')
+    with pytest.raises(BagError, match=r'no camera_info on /nowhere; topics: /camera'):
+        DepthBag(tmp_path / 'both', None, '/nowhere')
+
+
+def test_errors_name_encoding_size_and_focal_length(tmp_path):
+    colour = Recording()
+    colour.add_camera(1)
+    colour.add_image(1, np.zeros((48, 64), np.uint8), '8UC1')
+    colour.write(tmp_path / 'colour')
+    with pytest.raises(BagError, match="'8UC1'"):
+        DepthBag(tmp_path / 'colour', '/camera/depth/image_rect')
+    sizes = Recording()
+    sizes.add_camera(1, width=32)
+    sizes.add_image(1, depth_images(1)[0])
+    sizes.write(tmp_path / 'sizes')
+    with pytest.raises(BagError, match=r'64x48, but .* 32x48'):
+        DepthBag(tmp_path / 'sizes')
+    focal = Recording()
+    focal.add_camera(1, focal=0.0)
+    focal.add_image(1, depth_images(1)[0])
+    focal.write(tmp_path / 'focal')
+    with pytest.raises(BagError, match='focal length fx'):
+        DepthBag(tmp_path / 'focal')
+
+
+def test_what_is_no_bag(tmp_path):
+    with pytest.raises(BagError, match='No such file'):
+        DepthBag(tmp_path / 'missing')
+    for name in ('text.bag', 'text.mcap', 'text.db3', 'text.txt'):
+        (tmp_path / name).write_text('no bag\n' * 30)
+        with pytest.raises(BagError, match=f'{name}: not a readable bag'):
+            DepthBag(tmp_path / name)
+        (tmp_path / name).write_text('')
+        with pytest.raises(BagError, match=f'{name}: not a readable bag'):
+            DepthBag(tmp_path / name)
+    (tmp_path / 'empty').mkdir()
+    with pytest.raises(BagError, match='not a readable bag'):
+        DepthBag(tmp_path / 'empty')
+
+
+@pytest.mark.parametrize('dtype', [np.uint16, np.float32])
+def test_writer_and_reader_agree(tmp_path, dtype):
+    camera = Camera(64, 48, 51.0, 52.0, 30.0, 20.0)
+    images = depth_images(4).astype(dtype)
+    if dtype == np.float32:
+        images[0, 0, :3] = np.nan, np.inf, -1
+    with DepthBagWriter(tmp_path / 'bag', camera, 'eye') as bag:
+        for index, image in enumerate(images):
+            bag.write(image, 5 + index * 10**9)
+    frames = read(tmp_path / 'bag')
+    assert [frame.stamp for frame in frames] == [5 + index * 10**9 for index in range(4)]
+    assert {(frame.frame_id, frame.camera) for frame in frames} == {('eye', camera)}
+    np.testing.assert_array_equal([frame.depth for frame in frames], images)
+    assert frames[0].depth.dtype == dtype
+
+
+def test_writer_leaves_nothing_half_written(tmp_path):
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    with (
+        pytest.raises(BagError, match='uint16 or float32'),
+        DepthBagWriter(tmp_path / 'bag', camera) as bag,
+    ):
+        bag.write(depth_images(1)[0], 1)
+        bag.write(depth_images(1)[0][:10], 2)
+    assert list(tmp_path.iterdir()) == []
+    with DepthBagWriter(tmp_path / 'bag', camera) as bag:
+        bag.write(depth_images(1)[0], 1)
+    with pytest.raises(BagError, match='exists already'), DepthBagWriter(tmp_path / 'bag', camera):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ['bag']
