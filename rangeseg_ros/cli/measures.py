@@ -60,6 +60,10 @@ json_file = click.option(
     help='Write the figures to this file.',
 )
 
+jobs = click.option(
+    '--jobs', type=click.IntRange(min=1), help='Processes.  [default: one for each core]'
+)
+
 
 def write_json(path: Path, figures: Mapping[str, Any]) -> None:
     """Write figures as JSON, undefined ones as null."""

@@ -6,7 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rangeseg_ros.evaluation.hoover import Overlap, classify, overlap_figures
+import numpy as np
+
+from rangeseg_ros.evaluation.hoover import (
+    Overlap,
+    angle_errors,
+    classify,
+    overlap_figures,
+    plane_errors,
+)
+from rangeseg_ros.evaluation.measure import Measurement
 
 TOLERANCES = (0.51, 0.6, 0.7, 0.8, 0.9, 0.95)
 COUNTS = ('regions', 'correct', 'over', 'under', 'missed', 'noise')
@@ -26,6 +35,49 @@ def compared(overlaps: Mapping[str, Overlap], tolerances: Sequence[float]) -> di
     figures = _figures(list(overlaps.values()), tolerances)
     single = {name: _figures([overlap], tolerances) for name, overlap in overlaps.items()}
     return {'images': len(overlaps), **figures, 'per_image': single}
+
+
+def evaluated(measurements: Sequence[Measurement], tolerances: Sequence[float]) -> dict[str, Any]:
+    """Figures of `compared`, and the errors of angles and planes where the truth knows them.
+
+    Returns
+    -------
+    dict
+        As `compared`, and for each tolerance `angle_mean` and `angle_std`, degrees, mean and
+        standard deviation of an image's angle errors averaged over the images, and of the planes
+        of all correct regions `normal_median`, `normal_worst`, degrees, and `offset_median`,
+        `offset_worst`, metres; NaN where there is nothing to measure. `milliseconds`: median
+        time of a segmentation.
+    """
+    figures = compared({item.name: item.overlap for item in measurements}, tolerances)
+    for tolerance in tolerances:
+        figures['tolerances'][f'{tolerance:g}'].update(_geometry(measurements, tolerance))
+    figures['milliseconds'] = float(np.median([sum(m.timings.values()) for m in measurements]))
+    return figures
+
+
+def _geometry(measurements: Sequence[Measurement], tolerance: float) -> dict[str, float]:
+    angles, planes = [], [np.zeros((0, 2))]
+    for item in measurements:
+        matches = classify(item.overlap, tolerance).matches
+        normals = {label: plane[:3] for label, plane in item.found_planes.items()}
+        errors = angle_errors(item.angles, normals, matches)
+        if errors.size:
+            angles.append((errors.mean(), errors.std()))
+        planes.append(plane_errors(item.true_planes, item.found_planes, matches))
+    mean, std = np.mean(angles, axis=0) if angles else (math.nan, math.nan)
+    pooled = np.vstack(planes)
+    if not len(pooled):
+        pooled = np.full((1, 2), math.nan)
+    median, worst = np.median(pooled, axis=0), pooled.max(axis=0)
+    return {
+        'angle_mean': float(mean),
+        'angle_std': float(std),
+        'normal_median': float(median[0]),
+        'normal_worst': float(worst[0]),
+        'offset_median': float(median[1]),
+        'offset_worst': float(worst[1]),
+    }
 
 
 def _figures(overlaps: Sequence[Overlap], tolerances: Sequence[float]) -> dict[str, Any]:

@@ -1,0 +1,79 @@
+"""`rangeseg evaluate`: the segmenter measured on images with ground truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from rangeseg_ros.cli import measures, options
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.evaluation.datasets import find_cases
+from rangeseg_ros.evaluation.figures import evaluated, table
+from rangeseg_ros.evaluation.measure import Task, run_all
+from rangeseg_ros.io.params import read_config
+
+
+@click.command(cls=measures.ToleranceCommand)
+@click.argument('folder', metavar='DIR', type=options.FOLDER)
+@options.params
+@click.option(
+    '--method',
+    type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
+    help='Method, in place of that of the parameters.',
+)
+@measures.tolerance
+@click.option(
+    '--min-pixels',
+    type=click.IntRange(min=1),
+    help='Regions of the truth of depth images that are smaller do not count.  [default: 1000]',
+)
+@click.option(
+    '--split', type=click.Choice(['train', 'test']), help='Only this part of a segcomp set.'
+)
+@measures.jobs
+@click.option(
+    '--output',
+    type=click.Path(file_okay=False, path_type=Path),
+    help="Folder for each image's labels and a picture of truth and segmentation at tolerance "
+    '0.8: correct white, over-segmented green, under-segmented blue, missed orange, noise red.',
+)
+@measures.json_file
+def command(
+    folder: Path,
+    params_file: Path | None,
+    method: str | None,
+    tolerances: tuple[float, ...],
+    min_pixels: int | None,
+    split: str | None,
+    jobs: int | None,
+    output: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Segment the images in DIR and compare the results with their ground truth.
+
+    \b
+    Known layouts of DIR:
+      abw.test.N.range, perc.test.N (or train) with .gt-seg, .gt-ang
+      depth/*.png, truth/*.png, camera.yaml, as `simulate kinect` writes
+      folders of depth.png, truth.png and camera.txt (fx fy cx cy)
+      labelled laser scans *.pcd (x forward, z up, intensity >= 10)
+
+    Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
+    with errors of angles and planes where the truth knows them, and each image in `per_image`.
+    """
+    config = read_config(params_file, **({'method': method} if method else {}))
+    cases = [
+        case
+        for case in find_cases(folder, min_pixels)
+        if split is None or getattr(case, 'split', split) == split
+    ]
+    if not cases:
+        raise click.ClickException(f'{folder}: no {split} images')
+    tasks = [Task(case, config, pictures=output) for case in cases]
+    found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
+    figures = evaluated(found, tolerances)
+    click.echo(f'{folder}: {len(cases)} images, method {config.method}')
+    click.echo(table(figures))
+    if json_file:
+        measures.write_json(json_file, figures)

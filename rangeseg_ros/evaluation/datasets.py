@@ -1,0 +1,293 @@
+"""Range images with ground truth in files: which layouts are known, and how they are read."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.camera import Camera, CameraError
+from rangeseg_ros.core.range_image import RangeImage, RangeImageError
+from rangeseg_ros.evaluation.label_files import (
+    EvaluationError,
+    Truth,
+    as_truth,
+    read_label_image,
+)
+from rangeseg_ros.evaluation.segcomp import (
+    FIRST_REGION,
+    RegionAngle,
+    SegcompError,
+    read_angles,
+    read_perceptron,
+    read_raster,
+)
+from rangeseg_ros.evaluation.segcomp_geometry import (
+    abw_calibration,
+    abw_range_image,
+    perceptron_range_image,
+)
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.io.pcd import PcdError, read_pcd
+
+
+class Sample(NamedTuple):
+    """A range image and what is known about it.
+
+    Attributes
+    ----------
+    image : RangeImage
+        What is segmented.
+    truth : Truth
+        Its regions.
+    angles : list of RegionAngle
+        Angles between regions, where known, in the labels of `truth`.
+    planes : dict
+        Plane (nx, ny, nz, d) of each region of `truth`, where known.
+    """
+
+    image: RangeImage
+    truth: Truth
+    angles: list[RegionAngle]
+    planes: dict[int, NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One image of a data set, not yet read.
+
+    Attributes
+    ----------
+    name : str
+        Unique in its data set.
+    image, truth : Path
+        Files of the range image and of the ground truth.
+    """
+
+    name: str
+    image: Path
+    truth: Path
+
+    def load(self) -> Sample:
+        """Read the files.
+
+        Raises
+        ------
+        ValueError
+            A missing or malformed file, or a truth of another size than the image; the message
+            names the file.
+        """
+        sample = self._read()
+        sizes = ['x'.join(map(str, a.shape[::-1])) for a in (sample.truth.labels, sample.image)]
+        if sizes[0] != sizes[1]:
+            raise EvaluationError(f'{self.truth}: truth is {sizes[0]}, its image {sizes[1]}')
+        return sample
+
+    def _read(self) -> Sample:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SegcompCase(Case):
+    """Image of the ABW or Perceptron set, real or simulated.
+
+    Attributes
+    ----------
+    sensor : {'abw', 'perc'}
+    split : {'train', 'test'}
+    number : int
+        In its split; the ABW calibration depends on it.
+    """
+
+    sensor: str = 'abw'
+    split: str = 'test'
+    number: int = 0
+
+    def _read(self) -> Sample:
+        if self.sensor == 'abw':
+            values = read_raster(self.image)
+            with _naming(self.image):
+                image = abw_range_image(values, abw_calibration(self.number, self.split))
+        else:
+            image = perceptron_range_image(read_perceptron(self.image))
+        truth = Truth(read_label_image(self.truth), None)
+        angle_file = self.truth.with_suffix('.gt-ang')
+        shift = FIRST_REGION - 1
+        angles = [
+            RegionAngle(a - shift, b - shift, degrees)
+            for a, b, degrees in (read_angles(angle_file) if angle_file.exists() else [])
+        ]
+        return Sample(image, truth, angles, {})
+
+
+@dataclass(frozen=True)
+class DepthCase(Case):
+    """Depth image with intrinsics and true regions.
+
+    Attributes
+    ----------
+    camera : Path
+        ROS camera calibration, or a text file of fx fy cx cy.
+    planes : dict
+        Plane of each region, where known.
+    min_pixels : int
+        Smaller regions of the truth do not count.
+    """
+
+    camera: Path = Path()
+    planes: Mapping[int, tuple[float, ...]] = field(default_factory=dict)
+    min_pixels: int = 1
+
+    def _read(self) -> Sample:
+        depth = read_depth(self.image)
+        camera = _camera(self.camera, depth.shape)
+        with _naming(self.image):
+            image = RangeImage.from_depth(depth, camera)
+        truth = as_truth(read_label_image(self.truth), self.min_pixels)
+        planes = {label: np.array(plane) for label, plane in self.planes.items()}
+        return Sample(image, truth, [], planes)
+
+
+@dataclass(frozen=True)
+class ScanCase(Case):
+    """Organised laser scan of the SynPEB kind: x forward, z up, `intensity` >= 10 the plane."""
+
+    def _read(self) -> Sample:
+        fields = read_pcd(self.image)
+        missing = {'x', 'y', 'z', 'intensity'} - fields.keys()
+        if missing:
+            raise PcdError(f'{self.image}: no field {", ".join(sorted(missing))}')
+        # Such scans count their columns from right to left.
+        x, y, z, label = (fields[name][:, ::-1] for name in ('x', 'y', 'z', 'intensity'))
+        image = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))
+        planar = np.isfinite(label) & (label >= FIRST_REGION)
+        labels = np.where(planar, label, 0).astype(np.uint16)
+        return Sample(image, Truth(labels, None), [], {})
+
+
+_SEGCOMP = re.compile(r'(abw|perc)\.(train|test)\.(\d+)')
+
+
+def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
+    """The images with ground truth in a folder, in natural order.
+
+    Known layouts: segcomp (`abw.test.N.range`, `perc.test.N` and train, with `.gt-seg`, perhaps
+    `.gt-ang`); `depth/*.png` with `truth/*.png` and `camera.yaml` (perhaps `planes.csv`), as
+    `rangeseg simulate kinect` writes it; folders of `depth.png`, `truth.png` and `camera.txt` or
+    `camera.yaml`; labelled scans `*.pcd`.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to look into.
+    min_pixels : int, optional
+        Regions of the truth of depth images that are smaller do not count; 1000 when not given,
+        as both simulated and hand-drawn truth have slivers.
+
+    Raises
+    ------
+    EvaluationError
+        None of the layouts, or an image without ground truth.
+    """
+    least = 1000 if min_pixels is None else min_pixels
+    for layout in (
+        _segcomp_cases(folder),
+        _depth_cases(folder, least),
+        _nested_cases(folder, least),
+        (ScanCase(path.stem, path, path) for path in _sorted(folder, '*.pcd')),
+    ):
+        cases = list(layout)
+        if cases:
+            return cases
+    raise EvaluationError(
+        f'{folder}: no range images of a known layout (segcomp, depth/ with truth/, '
+        'folders of depth.png and truth.png, *.pcd)'
+    )
+
+
+def _segcomp_cases(folder: Path) -> Iterator[Case]:
+    for path in _sorted(folder, '*'):
+        match = _SEGCOMP.match(path.name)
+        if not match or path.name not in (match[0], f'{match[0]}.range'):
+            continue
+        truth = folder / f'{match[0]}.gt-seg'
+        _require(path, truth)
+        yield SegcompCase(match[0], path, truth, match[1], match[2], int(match[3]))
+
+
+def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
+    planes = _true_planes(folder / 'planes.csv')
+    for path in _sorted(folder, 'depth/*.png'):
+        truth = folder / 'truth' / path.name
+        _require(path, truth)
+        camera = folder / 'camera.yaml'
+        yield DepthCase(path.stem, path, truth, camera, planes.get(path.stem, {}), min_pixels)
+
+
+def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
+    for path in sorted(folder.glob('**/depth.png')):
+        truth = path.with_name('truth.png')
+        _require(path, truth)
+        camera = path.with_name('camera.txt')
+        if not camera.exists():
+            camera = path.with_name('camera.yaml')
+        name = path.parent.relative_to(folder).as_posix().replace('/', '_')
+        yield DepthCase(
+            folder.name if name == '.' else name, path, truth, camera, min_pixels=min_pixels
+        )
+
+
+def _sorted(folder: Path, pattern: str) -> list[Path]:
+    return sorted(folder.glob(pattern), key=natural_order)
+
+
+def _require(image: Path, truth: Path) -> None:
+    if not truth.is_file():
+        raise EvaluationError(f'{image}: no ground truth {truth.name}')
+
+
+def _true_planes(path: Path) -> dict[str, dict[int, tuple[float, ...]]]:
+    """Planes of the regions of each image, from the CSV of simulated images."""
+    planes: dict[str, dict[int, tuple[float, ...]]] = {}
+    if not path.exists():
+        return planes
+    with path.open(newline='') as file:
+        try:
+            for row in csv.DictReader(file):
+                names = ('normal_x', 'normal_y', 'normal_z', 'distance')
+                plane = tuple(float(row[name]) for name in names)
+                planes.setdefault(row['image'], {})[int(row['label'])] = plane
+        except (KeyError, TypeError, ValueError, csv.Error):
+            raise EvaluationError(f'{path}: malformed table of planes') from None
+    return planes
+
+
+def _camera(path: Path, shape: tuple[int, ...]) -> Camera:
+    if path.suffix != '.txt':
+        return read_camera(path)
+    try:
+        fx, fy, cx, cy = (float(word) for word in path.read_text().split())
+    except OSError as error:
+        raise CameraError(f'{path}: {error.strerror}') from None
+    except ValueError:
+        raise CameraError(f'{path}: must hold fx fy cx cy') from None
+    with _naming(path):
+        return Camera(shape[1], shape[0], fx, fy, cx, cy)
+
+
+@contextmanager
+def _naming(path: Path) -> Iterator[None]:
+    """Put the file's name into what is raised."""
+    try:
+        yield
+    except (RangeImageError, CameraError, SegcompError) as error:
+        raise type(error)(f'{path}: {error}') from None

@@ -1,0 +1,181 @@
+"""Running the segmenter over a data set, on all cores, and what is kept of each image."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+import rangeseg_ros.core
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.evaluation.datasets import Case, Sample
+from rangeseg_ros.evaluation.hoover import Overlap, classify
+from rangeseg_ros.evaluation.pictures import class_picture
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import write_image
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """All that the figures of an image are computed from.
+
+    Attributes
+    ----------
+    name : str
+        Of the image.
+    overlap : Overlap
+        Of truth and segmentation: gives every metric at every tolerance.
+    angles : list
+        (label, label, degrees) of the truth, where known.
+    true_planes, found_planes : dict
+        Plane (nx, ny, nz, d) of each label, where known.
+    energy : float
+        Of the labelling.
+    timings : dict
+        Milliseconds per stage.
+    """
+
+    name: str
+    overlap: Overlap
+    angles: list[tuple[int, int, float]]
+    true_planes: dict[int, list[float]]
+    found_planes: dict[int, list[float]]
+    energy: float
+    timings: dict[str, float]
+
+    def to_json(self) -> str:
+        """All fields as JSON."""
+        record = {item.name: getattr(self, item.name) for item in fields(self)}
+        record['overlap'] = {
+            item.name: getattr(self.overlap, item.name).tolist() for item in fields(Overlap)
+        }
+        return json.dumps(record)
+
+    @classmethod
+    def from_json(cls, text: str) -> Measurement:
+        """The inverse of `to_json`."""
+        record = json.loads(text)
+        arrays = {name: np.array(values, np.int64) for name, values in record['overlap'].items()}
+        arrays['pairs'] = arrays['pairs'].reshape(-1, 2)
+        record['overlap'] = Overlap(**arrays)
+        for name in ('true_planes', 'found_planes'):
+            record[name] = {int(label): plane for label, plane in record[name].items()}
+        return cls(**record)
+
+
+@dataclass(frozen=True)
+class Task:
+    """An image, the parameters to segment it with, and where to leave what.
+
+    Attributes
+    ----------
+    case : Case
+        The image.
+    config : Config
+        Parameters of the segmenter.
+    cache : Path or None
+        Folder of finished measurements: what is there is not computed again.
+    pictures : Path or None
+        Folder for <name>_labels.png and <name>_classes.png.
+    """
+
+    case: Case
+    config: Config
+    cache: Path | None = None
+    pictures: Path | None = None
+
+    def run(self) -> Measurement:
+        """Segment the image and measure it, or take the measurement from the cache."""
+        if self.cache is None:
+            return self._measure()
+        path = self.cache / f'{self.case.name}-{self._key()}.json'
+        if path.exists():
+            return Measurement.from_json(path.read_text())
+        measurement = self._measure()
+        with replacing(path) as partial:
+            partial.write_text(measurement.to_json())
+        return measurement
+
+    def _measure(self) -> Measurement:
+        sample = self.case.load()
+        result = Segmenter(self.config).segment(sample.image)
+        overlap = sample.truth.compare(result.labels)
+        if self.pictures:
+            self._draw(sample, result.labels, overlap)
+        return Measurement(
+            self.case.name,
+            overlap,
+            [(a, b, degrees) for a, b, degrees in sample.angles],
+            {label: [float(x) for x in plane] for label, plane in sample.planes.items()},
+            {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
+            float(result.energy),
+            result.timings,
+        )
+
+    def _draw(self, sample: Sample, labels: np.ndarray, overlap: Overlap) -> None:
+        assert self.pictures
+        picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
+        write_image(self.pictures / f'{self.case.name}_labels.png', labels)
+        write_image(self.pictures / f'{self.case.name}_classes.png', picture)
+
+    def _key(self) -> str:
+        """Digest of all that the measurement depends on: code, parameters, files."""
+        digest = hashlib.sha256(_code_digest())
+        digest.update(repr((asdict(self.config), self.case)).encode())
+        for path in (self.case.image, self.case.truth):
+            digest.update(path.read_bytes())
+        return digest.hexdigest()[:16]
+
+
+@cache
+def _code_digest() -> bytes:
+    digest = hashlib.sha256()
+    for path in sorted(Path(next(iter(rangeseg_ros.core.__path__))).glob('*.py')):
+        digest.update(path.read_bytes())
+    return digest.digest()
+
+
+def run_all(tasks: Sequence[Task], jobs: int | None = None) -> Iterator[Measurement]:
+    """Run tasks on all cores (or `jobs` processes); yields their measurements in order.
+
+    Raises
+    ------
+    ValueError, OSError
+        The first task's that fails; those that have not begun are dropped.
+    """
+    jobs = min(jobs or os.cpu_count() or 1, len(tasks))
+    if jobs <= 1:
+        yield from map(_run, tasks)
+        return
+    # Spawned, not forked: OpenCV's threads do not survive a fork.
+    context = multiprocessing.get_context('spawn')
+    with ExitStack() as stack:
+        pool = ProcessPoolExecutor(jobs, context, initializer=cv2.setNumThreads, initargs=(1,))
+        stack.callback(pool.shutdown, cancel_futures=True)
+        yield from pool.map(_run, tasks)
+
+
+def _run(task: Task) -> Measurement:
+    return task.run()
+
+
+def grouped(
+    measurements: Iterable[Measurement], keys: Iterable[Any]
+) -> dict[Any, list[Measurement]]:
+    """Measurements by key, in the order of their first appearance."""
+    groups: dict[Any, list[Measurement]] = {}
+    for key, measurement in zip(keys, measurements, strict=True):
+        groups.setdefault(key, []).append(measurement)
+    return groups
