@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores
 
 from rangeseg_ros.core.camera import Camera, CameraError
 from rangeseg_ros.io.depth_encodings import (
@@ -23,7 +23,7 @@ from rangeseg_ros.io.depth_encodings import (
     decode_compressed,
     decode_image,
 )
-from rangeseg_ros.io.recordings import RecordingError, open_recording
+from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -276,7 +276,7 @@ class DepthBagWriter:
         self.path = Path(path)
         self.camera = camera
         self.frame_id = frame_id
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._store = message_types(Stores.ROS2_JAZZY)
 
     def __enter__(self) -> DepthBagWriter:
         if self.path.exists():

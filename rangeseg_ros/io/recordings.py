@@ -13,6 +13,7 @@ import sqlite3
 import struct
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
@@ -22,6 +23,7 @@ from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from rangeseg_ros.io.files import natural_order
 
@@ -132,8 +134,14 @@ def _deserializer(path: Path) -> Callable[[bytes, str], Any]:
     A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
     """
     if path.suffix == '.bag':
-        return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1
-    return get_typestore(Stores.ROS2_JAZZY).deserialize_cdr
+        return message_types(Stores.ROS1_NOETIC).deserialize_ros1
+    return message_types(Stores.ROS2_JAZZY).deserialize_cdr
+
+
+@cache
+def message_types(distribution: Stores) -> Typestore:
+    """Message types of a ROS distribution; compiled once, at their first use."""
+    return get_typestore(distribution)
 
 
 class _Record(NamedTuple):
