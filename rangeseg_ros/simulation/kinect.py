@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.simulation.scenes import Scene
-from rangeseg_ros.simulation.solids import cast
+from rangeseg_ros.simulation.solids import cast, cosine_of_incidence, lit
 from rangeseg_ros.simulation.truth import TruePlane, visible_regions
 
 NOISES = ('measured', 'correlated', 'independent', 'none')
@@ -98,20 +98,22 @@ def simulate_kinect(
     camera = camera or kinect_camera()
     pose = scene.poses[frame]
     rays = camera.rays.astype(np.float64)
-    depth, face = cast(scene.solids, pose.position, rays @ pose.rotation.T)
-    share = SHADOW_SHARE if noise == 'measured' else 1.0
-    face[_shadows(scene, frame, rays, depth, share * BASELINE)] = -1
+    world_rays = rays @ pose.rotation.T
+    depth, face = cast(scene.solids, pose.position, world_rays)
+    depth[face < 0] = 1.0
+    points = pose.position + depth[..., None] * world_rays
+    baseline = BASELINE * (SHADOW_SHARE if noise == 'measured' else 1.0)
+    projector = pose.position + baseline * pose.rotation[:, 0]
+    face[~lit(scene.solids, projector, points)] = -1
 
     planes = scene.planes(pose)
     image: NDArray[np.uint16] | NDArray[np.float32]
     if noise == 'none':
         image = np.where(face >= 0, depth, 0).astype(np.float32)
     else:
-        depth = np.where(face >= 0, depth, 1.0)
         random = np.random.default_rng([seed, frame, 4])
         if noise == 'measured':
-            slope = _slope(rays, face, planes)
-            points = depth[..., None] * (rays @ pose.rotation.T) + pose.position
+            slope = np.tan(np.arccos(cosine_of_incidence(rays, face, planes)))
             face[_blind(depth, slope, points, scene.dark, random)] = -1
             disparity = measured_disparity(depth, slope, sensor_seed, random)
         else:
@@ -217,35 +219,6 @@ def smooth_field(
     field = cv2.sepFilter2D(white, cv2.CV_64F, kernel_x, kernel_y) / gain
     inside: NDArray[np.float64] = field[pad_y : pad_y + shape[0], pad_x : pad_x + shape[1]]
     return inside
-
-
-def _shadows(
-    scene: Scene,
-    frame: int,
-    rays: NDArray[np.float64],
-    depth: NDArray[np.float64],
-    baseline: float,
-) -> NDArray[np.bool_]:
-    """(H, W) True where the projector does not reach the point that the camera sees."""
-    pose = scene.poses[frame]
-    projector = np.array([baseline, 0.0, 0.0])
-    seen = np.isfinite(depth)
-    towards = np.where(seen, depth, 1.0)[..., None] * rays - projector
-    reach, _ = cast(
-        scene.solids, pose.position + pose.rotation @ projector, towards @ pose.rotation.T
-    )
-    # The projector's ray ends at parameter 1 on the very surface, give or take rounding.
-    return seen & (reach < 1 - 1e-7)
-
-
-def _slope(
-    rays: NDArray[np.float64], face: NDArray[np.int32], planes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """(H, W) tangent of the angle between ray and normal; 0 on curved faces."""
-    normals = np.nan_to_num(planes[:, :3], nan=0.0)[face]
-    cosine = -(rays * normals).sum(axis=-1) / np.linalg.norm(rays, axis=-1)
-    cosine = np.where((face >= 0) & (cosine > 0), np.minimum(cosine, 1), 1.0)
-    return np.sqrt(1 - cosine**2) / cosine
 
 
 def _blind(
