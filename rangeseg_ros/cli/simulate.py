@@ -11,12 +11,27 @@ import click
 import numpy as np
 
 from rangeseg_ros.cli import options
+from rangeseg_ros.evaluation.segcomp import (
+    write_angles,
+    write_perceptron,
+    write_raster,
+    write_segmentation,
+)
+from rangeseg_ros.evaluation.segcomp_geometry import abw_calibration
 from rangeseg_ros.io.bags import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.kinect import NOISES, Frame, kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scanners import (
+    Scan,
+    abw_scene,
+    perceptron_scene,
+    simulate_abw,
+    simulate_perceptron,
+)
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
+from rangeseg_ros.simulation.segcomp_truth import ground_truth, region_angles
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
@@ -33,6 +48,14 @@ output_option = click.option(
     type=click.Path(path_type=Path),
     required=True,
     help='Folder to make; it must not exist, or be empty.',
+)
+
+sets_option = click.option(
+    '--scenes',
+    type=click.IntRange(min=1),
+    default=40,
+    show_default=True,
+    help='How many; 40 as in the real sets, 10 of them for training.',
 )
 
 
@@ -140,6 +163,80 @@ def kinect(
                 table.write(name, image.planes)
                 bag.write(image.depth, 10**9 + round(index * 1e9 / 30))
     click.echo(f'{output}: {count} images')
+
+
+@command.command()
+@sets_option
+@seed_option
+@output_option
+def abw(scenes: int, seed: int, output: Path) -> None:
+    """Polyhedra as the ABW structured-light scanner sees them, in segcomp's files.
+
+    \b
+    OUTPUT/abw.SPLIT.N.range    512x512, 8 bits, 0 = shadow
+    OUTPUT/abw.SPLIT.N.gt-seg   true regions, from 10; 2 = shadow
+    OUTPUT/abw.SPLIT.N.gt-ang   angles between regions that touch
+    OUTPUT/planes.csv           plane of each region, metres, optical frame
+
+    SPLIT is train for the first quarter of the scenes (at most 10), and test for the others.
+    """
+
+    def write(name: Path, split: str, number: int, scene_seed: int) -> Scan:
+        calibration = abw_calibration(number, split)
+        scan = simulate_abw(abw_scene(scene_seed), calibration, scene_seed)
+        write_raster(f'{name}.range', scan.values)
+        return scan
+
+    _write_segcomp_set(output, 'abw', scenes, seed, write)
+
+
+@command.command()
+@sets_option
+@seed_option
+@output_option
+def perceptron(scenes: int, seed: int, output: Path) -> None:
+    """Polyhedra as the Perceptron laser scanner sees them, in segcomp's files.
+
+    \b
+    OUTPUT/perc.SPLIT.N          512x512, 12 bits
+    OUTPUT/perc.SPLIT.N.gt-seg   true regions, from 10
+    OUTPUT/perc.SPLIT.N.gt-ang   angles between regions that touch
+    OUTPUT/planes.csv            plane of each region, metres, optical frame
+
+    SPLIT is train for the first quarter of the scenes (at most 10), and test for the others.
+    """
+
+    def write(name: Path, split: str, number: int, scene_seed: int) -> Scan:
+        scan = simulate_perceptron(perceptron_scene(scene_seed), scene_seed)
+        write_perceptron(name, scan.values)
+        return scan
+
+    _write_segcomp_set(output, 'perc', scenes, seed, write)
+
+
+def _write_segcomp_set(
+    output: Path,
+    sensor: str,
+    scenes: int,
+    seed: int,
+    write: Callable[[Path, str, int, int], Scan],
+) -> None:
+    """Write images by `write(path, split, number, scene's seed)`, and their ground truth."""
+    training = min(scenes // 4, 10)
+    regions = 0
+    with _new_folder(output) as folder, _TruthTable(folder / 'planes.csv') as table:
+        for index in options.progress(range(scenes), scenes, 'image'):
+            split, number = ('train', index) if index < training else ('test', index - training)
+            path = folder / f'{sensor}.{split}.{number}'
+            image, planes = ground_truth(write(path, split, number, seed + index))
+            write_segmentation(f'{path}.gt-seg', image)
+            write_angles(f'{path}.gt-ang', region_angles(image, planes))
+            table.write(path.name, planes)
+            regions += len(planes)
+    click.echo(
+        f'{output}: {training} training and {scenes - training} test images, '
+        f'{regions / scenes:.1f} regions each'
+    )
 
 
 class _TruthTable:
