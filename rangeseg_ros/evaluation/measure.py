@@ -6,13 +6,12 @@ import hashlib
 import json
 import multiprocessing
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -169,13 +168,3 @@ def run_all(tasks: Sequence[Task], jobs: int | None = None) -> Iterator[Measurem
 
 def _run(task: Task) -> Measurement:
     return task.run()
-
-
-def grouped(
-    measurements: Iterable[Measurement], keys: Iterable[Any]
-) -> dict[Any, list[Measurement]]:
-    """Measurements by key, in the order of their first appearance."""
-    groups: dict[Any, list[Measurement]] = {}
-    for key, measurement in zip(keys, measurements, strict=True):
-        groups.setdefault(key, []).append(measurement)
-    return groups
