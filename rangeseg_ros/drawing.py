@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import colorsys
 from collections.abc import Sequence
 from functools import cache
 
@@ -12,24 +11,30 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.planes import Plane
 
-_GOLDEN = (5**0.5 - 1) / 2
-
 
 def colours(ids: Sequence[int] | NDArray) -> NDArray[np.uint8]:
-    """Colours of plane ids, (N, 3) RGB: always the same, and far apart for near ids.
+    """Colours of plane ids, (N, 3) RGB: always the same, and easy to tell apart.
 
-    Hues are a golden angle apart, which keeps any run of them spread around the circle; three
-    brightnesses tell later ids of a similar hue apart.
+    There are 48 of them, each as far from all before it as the eye can tell in CIE L*a*b* (Glasbey
+    et al., Color Research and Application 32, 2007); greys are left to what has no plane.
     """
-    return np.array([_colour(int(number)) for number in ids], np.uint8).reshape(-1, 3)
+    return _palette()[(np.asarray(ids, int) - 1) % len(_palette())]
 
 
 @cache
-def _colour(number: int) -> tuple[int, int, int]:
-    hue = number * _GOLDEN % 1
-    saturation, value = ((0.85, 1.0), (0.6, 1.0), (0.95, 0.75))[number // 13 % 3]
-    red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
-    return round(255 * red), round(255 * green), round(255 * blue)
+def _palette() -> NDArray[np.uint8]:
+    steps = np.linspace(0, 1, 12, dtype=np.float32)
+    rgb = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
+    lab = cv2.cvtColor(rgb[None], cv2.COLOR_RGB2LAB)[0]
+    lightness, chroma = lab[:, 0], np.hypot(lab[:, 1], lab[:, 2])
+    bright = (lightness > 45) & (lightness < 90) & (chroma > 55)
+    rgb, lab = rgb[bright], lab[bright]
+    chosen = [int(np.argmin(np.linalg.norm(lab - (60, 0, -60), axis=1)))]
+    nearest = np.full(len(lab), np.inf)
+    for _ in range(47):
+        nearest = np.minimum(nearest, np.linalg.norm(lab - lab[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(nearest)))
+    return np.round(255 * rgb[chosen]).astype(np.uint8)
 
 
 def grey(inverse: NDArray) -> NDArray[np.uint8]:

@@ -1,0 +1,225 @@
+"""Depth images, cameras, parameter files and plane tables: what is read back, what is refused."""
+
+import csv
+from dataclasses import fields
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
+from rangeseg_ros.io.cameras import read_camera, write_camera
+from rangeseg_ros.io.files import natural_order, replacing
+from rangeseg_ros.io.images import ImageFileError, read_depth, read_labels, write_image
+from rangeseg_ros.io.params import read_config, read_params
+from rangeseg_ros.io.planes import PlaneTable, columns
+
+
+def test_depth_of_16_bits_and_floats(tmp_path):
+    depth = np.array([[0, 1, 65535], [700, 800, 900]], np.uint16)
+    metres = np.array([[np.nan, np.inf, 1.5], [-1, 0, 2]], np.float32)
+    for name, image in (('a.png', depth), ('a.tif', depth), ('b.tiff', metres)):
+        cv2.imwrite(str(tmp_path / name), image)
+        read = read_depth(tmp_path / name)
+        assert read.dtype == image.dtype
+        np.testing.assert_array_equal(read, image)
+
+
+def test_what_is_no_depth_image_is_named(tmp_path):
+    for name, image, message in (
+        ('colour.png', np.zeros((4, 5, 3), np.uint16), 'one channel, not 3'),
+        ('eight.png', np.zeros((4, 5), np.uint8), '16-bit or float, not uint8'),
+    ):
+        cv2.imwrite(str(tmp_path / name), image)
+        with pytest.raises(ImageFileError, match=f'{name}: .*{message}'):
+            read_depth(tmp_path / name)
+    with pytest.raises(ImageFileError, match=r'none\.png: No such file'):
+        read_depth(tmp_path / 'none.png')
+    with pytest.raises(ImageFileError, match='Is a directory'):
+        read_depth(tmp_path)
+    for content in (b'', b'no image', b'\x89PNG\r\n\x1a\n'):
+        (tmp_path / 'text.png').write_bytes(content)
+        with pytest.raises(ImageFileError, match=r'text\.png: not a readable image'):
+            read_depth(tmp_path / 'text.png')
+
+
+def test_a_truncated_image_is_refused(tmp_path):
+    path = tmp_path / 'cut.png'
+    noise = np.random.default_rng(0).integers(0, 65535, (60, 80)).astype(np.uint16)
+    write_image(path, noise)
+    whole = path.read_bytes()
+    for length in (len(whole) // 4, len(whole) // 2, len(whole) - 50):
+        path.write_bytes(whole[:length])
+        with pytest.raises(ImageFileError, match='not a readable image'):
+            read_depth(path)
+
+
+def test_labels_are_written_and_read_back(tmp_path):
+    labels = np.array([[0, 1], [300, 65535]], np.uint16)
+    write_image(tmp_path / 'folder' / 'labels.png', labels)
+    np.testing.assert_array_equal(read_labels(tmp_path / 'folder' / 'labels.png'), labels)
+    assert [path.name for path in (tmp_path / 'folder').iterdir()] == ['labels.png']
+
+
+def test_pictures_are_rgb(tmp_path):
+    red = np.zeros((2, 2, 3), np.uint8)
+    red[..., 0] = 255
+    write_image(tmp_path / 'red.png', red)
+    assert cv2.imread(str(tmp_path / 'red.png'))[0, 0].tolist() == [0, 0, 255]
+    with pytest.raises(ImageFileError, match='label image must have one channel'):
+        read_labels(tmp_path / 'red.png')
+
+
+def test_a_failed_write_leaves_what_was_there(tmp_path):
+    path = tmp_path / 'file'
+    path.write_text('old')
+    with pytest.raises(RuntimeError), replacing(path) as partial:
+        partial.write_text('half')
+        raise RuntimeError
+    assert path.read_text() == 'old'
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@given(st.text(min_size=1), st.text(min_size=1))
+def test_natural_order_compares_any_names(one, other):
+    from pathlib import Path
+
+    sorted([Path(one), Path(other)], key=natural_order)
+
+
+def test_natural_order_counts(tmp_path):
+    names = ['frame_10.png', 'frame_2.png', 'frame_1.png']
+    ordered = sorted((tmp_path / name for name in names), key=natural_order)
+    assert [path.name for path in ordered] == ['frame_1.png', 'frame_2.png', 'frame_10.png']
+
+
+def test_camera_is_written_and_read_back(tmp_path):
+    camera = Camera(320, 240, 262.5, 261.25, 159.75, 119.5)
+    write_camera(tmp_path / 'camera.yaml', camera)
+    assert read_camera(tmp_path / 'camera.yaml') == camera
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        ('', 'not a camera calibration'),
+        ('- 1', 'not a camera calibration'),
+        ('a: [', 'not a YAML file'),
+        ('image_width: 4', "lacks 'image_height'"),
+        ('{image_width: 4, image_height: 3}', "lacks 'camera_matrix'"),
+        ('{image_width: 4, image_height: 3, camera_matrix: 5}', 'malformed'),
+        ('{image_width: x, image_height: 3, camera_matrix: {data: []}}', 'x'),
+        ('{image_width: 4, image_height: 3, camera_matrix: {data: [1, 2]}}', '9 values, not 2'),
+        (
+            '{image_width: 4, image_height: 3, camera_matrix: {data: [0,0,1,0,9,1,0,0,1]}}',
+            'focal length fx must be positive',
+        ),
+        (
+            '{image_width: 4, image_height: 3, camera_matrix: {data: [.nan,0,1,0,9,1,0,0,1]}}',
+            'fx must be finite',
+        ),
+    ],
+)
+def test_what_is_no_camera_is_named(tmp_path, content, message):
+    path = tmp_path / 'camera.yaml'
+    path.write_text(content)
+    with pytest.raises(CameraError, match=message) as caught:
+        read_camera(path)
+    assert str(path) in str(caught.value)
+    with pytest.raises(CameraError, match='No such file'):
+        read_camera(tmp_path / 'none.yaml')
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=3),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner),
+        max_leaves=6,
+    ),
+    st.sampled_from(['image_width', 'image_height', 'camera_matrix', 'projection_matrix']),
+)
+def test_any_calibration_is_a_camera_or_the_declared_error(tmp_path_factory, value, key):
+    path = tmp_path_factory.mktemp('camera') / 'camera.yaml'
+    write_camera(path, Camera(4, 3, 5.0, 5.0, 1.5, 1.0))
+    calibration = yaml.safe_load(path.read_text())
+    calibration[key] = value
+    path.write_text(yaml.safe_dump(calibration))
+    try:
+        read_camera(path)
+    except CameraError as error:
+        assert '\n' not in str(error).strip()
+
+
+def test_flat_and_ros_parameter_files_say_the_same(tmp_path):
+    path = tmp_path / 'params.yaml'
+    for content in (
+        'smoothness: 12.5',
+        'segment_planes: {ros__parameters: {smoothness: 12.5}}',
+        '/**: {ros__parameters: {smoothness: 1.0}}\n'
+        'other_node: {ros__parameters: {nonsense: 3}}\n'
+        '/robot/segment_planes: {ros__parameters: {smoothness: 12.5}}',
+    ):
+        path.write_text(content)
+        assert read_config(path) == Config(smoothness=12.5)
+    path.write_text('')
+    assert read_config(path) == read_config(None) == Config()
+    assert read_config(path, smoothness=3.0) == Config(smoothness=3.0)
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        ('- 1', 'not a mapping'),
+        ('a: [', 'not a YAML file'),
+        ('smoothnes: 3', "unknown parameter 'smoothnes'"),
+        ('smoothness: -3', r'smoothness must be in \[0, 10000\]'),
+        ('smoothness: soft', 'smoothness must be of type float'),
+        ('3: 4', 'unknown parameter 3'),
+        ('node: {ros__parameters: {smoothness: 1.0}}', 'no ros__parameters of segment_planes'),
+    ],
+)
+def test_bad_parameters_are_named(tmp_path, content, message):
+    path = tmp_path / 'params.yaml'
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_config(path)
+    assert str(path) in str(caught.value)
+    with pytest.raises(ConfigError, match='No such file'):
+        read_params(tmp_path / 'none.yaml')
+
+
+def _plane(**changes):
+    values = {
+        'label': 1,
+        'id': 7,
+        'normal': np.array([0.0, 0.6, -0.8]),
+        'distance': 1.25,
+        'covariance': np.arange(16.0).reshape(4, 4),
+        'centroid': np.array([0.1, 0.2, 1.7]),
+        'count': 500,
+        'rms': 0.001,
+        'area': 0.25,
+        'hull': np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]),
+    }
+    known = {field.name for field in fields(Plane)}
+    return Plane(**{name: value for name, value in {**values, **changes}.items() if name in known})
+
+
+def test_plane_table(tmp_path):
+    path = tmp_path / 'planes.csv'
+    with PlaneTable(path, ('frame',)) as table:
+        assert path.read_text() == ','.join(['frame', *columns()]) + '\n'
+        table.write([_plane(), _plane(label=2)], 0)
+        table.write([], 1)
+        table.write([_plane(distance=1 / 3)], 2)
+        with path.open() as file:  # on disk before the table is closed
+            rows = list(csv.DictReader(file))
+    assert [(row['frame'], row['label']) for row in rows] == [('0', '1'), ('0', '2'), ('2', '1')]
+    assert [float(rows[0][f'normal_{axis}']) for axis in 'xyz'] == [0.0, 0.6, -0.8]
+    assert float(rows[0]['covariance_yd']) == 7.0  # normal_y with distance
+    assert float(rows[2]['distance']) == pytest.approx(1 / 3, rel=1e-8)
+    assert rows[0]['hull'] == '0 0 1;1 0 1;0 1 1'
+    assert all(None not in row and None not in row.values() for row in rows)

@@ -1,0 +1,269 @@
+"""The commands segment, pack and replay, as a user starts them."""
+
+import csv
+import signal
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from recordings import SUFFIXES, Recording, depth_images, record
+
+from rangeseg_ros import Camera
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.images import read_labels, write_image
+
+COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Working folder with camera.yaml and two depth images, one of them of a wall."""
+    monkeypatch.chdir(tmp_path)
+    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    write_image(tmp_path / 'depth' / '2.png', np.full((48, 64), 1500, np.uint16))
+    write_image(tmp_path / 'depth' / '10.png', np.zeros((48, 64), np.uint16))
+    return tmp_path
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command: the exit code, standard output and error."""
+
+    def run_command(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['rangeseg', *map(str, arguments)])
+        with pytest.raises(SystemExit) as done:
+            main()
+        return done.value.code or 0, *capsys.readouterr()
+
+    return run_command
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob('*') if path.is_file())
+
+
+def test_segment_writes_labels_overlay_and_planes(folder, run):
+    code, output, error = run(
+        'segment', 'depth/2.png', 'depth/10.png', '--camera', 'camera.yaml', '--output', 'out/here'
+    )
+    assert (code, error) == (0, '')
+    kinds = ('labels.png', 'overlay.png', 'planes.csv')
+    assert files(folder / 'out/here') == sorted(f'{n}_{kind}' for n in (2, 10) for kind in kinds)
+    labels = read_labels(folder / 'out/here/2_labels.png')
+    assert labels.shape == (48, 64)
+    with (folder / 'out/here/2_planes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert {int(row['label']) for row in rows} == set(np.unique(labels)) - {0}
+    assert 'depth/10.png: no plane: no valid depth' in output
+    assert cv2.imread('out/here/2_overlay.png').shape == (48, 64, 3)
+
+
+def test_segment_reads_floats_and_scales(folder, run):
+    cv2.imwrite('metres.tiff', np.full((48, 64), 1.5, np.float32))
+    write_image(folder / 'fifths.png', np.full((48, 64), 7500, np.uint16))
+    assert run('segment', 'metres.tiff', '--camera', 'camera.yaml', '--output', 'a')[0] == 0
+    scaled = ('--camera', 'camera.yaml', '--output', 'a', '--depth-scale', '0.0002')
+    assert run('segment', 'fifths.png', *scaled)[0] == 0
+    assert run('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'a')[0] == 0
+    wall = (folder / 'a/2_planes.csv').read_text()
+    assert (folder / 'a/metres_planes.csv').read_text() == wall
+    assert (folder / 'a/fifths_planes.csv').read_text() == wall
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 9), (9, 1), (3, 3)])
+@pytest.mark.parametrize('value', [0, np.nan, np.inf, -1, 1e-30, 1e30, 2])
+def test_degenerate_images_give_no_exception(folder, run, shape, value):
+    cv2.imwrite('x.tiff', np.full(shape, value, np.float32))
+    height, width = shape
+    write_camera(folder / 'small.yaml', Camera(width, height, 50.0, 50.0, 0.0, 0.0))
+    code, output, error = run('segment', 'x.tiff', '--camera', 'small.yaml', '--output', 'out')
+    assert (code, error) == (0, '')
+    assert read_labels(folder / 'out/x_labels.png').shape == shape
+    if not 0 < value < np.inf:
+        assert output == 'x.tiff: no plane: no valid depth\n'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['none.png'], "File 'none.png' does not exist"),
+        (['depth/2.png', '--depth-scale', '0'], '--depth-scale'),
+        (['depth/2.png', '--camera', 'none.yaml'], "File 'none.yaml' does not exist"),
+        (['depth/2.png', '--camera', 'bad.yaml'], 'bad.yaml: focal length fy'),
+        (['depth/2.png', '--params', 'params.yaml'], "params.yaml: unknown parameter 'smooth'"),
+        (['depth/2.png', '--params', 'range.yaml'], 'smoothness must be in [0, 10000]'),
+        (['colour.png'], 'colour.png: depth image must have one channel'),
+        (['eight.png'], 'eight.png: depth image must be 16-bit'),
+        (['text.png'], 'text.png: not a readable image'),
+        (['large.png'], 'large.png: depth image is 65x48, its camera 64x48'),
+        (['depth/2.png', 'other/2.png'], '2 images named 2'),
+        ([], 'Missing argument'),
+    ],
+)
+def test_bad_input_of_segment_is_one_line_and_code_2(folder, run, arguments, message):
+    (folder / 'bad.yaml').write_text(
+        (folder / 'camera.yaml').read_text().replace('50.0, 23.5', '-50.0, 23.5')
+    )
+    (folder / 'params.yaml').write_text('smooth: 3')
+    (folder / 'range.yaml').write_text('smoothness: -3')
+    (folder / 'text.png').write_text('no image')
+    cv2.imwrite('colour.png', np.zeros((48, 64, 3), np.uint16))
+    cv2.imwrite('eight.png', np.zeros((48, 64), np.uint8))
+    cv2.imwrite('large.png', np.zeros((48, 65), np.uint16))
+    write_image(folder / 'other/2.png', np.zeros((48, 64), np.uint16))
+    camera = [] if '--camera' in arguments else ['--camera', 'camera.yaml']
+    code, output, error = run('segment', *arguments, *camera, '--output', 'out')
+    assert code == 2
+    assert output == ''
+    assert error.startswith('rangeseg: ')
+    assert error.count('\n') == 1
+    assert message in error
+    assert not (folder / 'out').exists()
+
+
+def test_pack_and_replay(folder, run):
+    assert run('pack', 'depth', '--camera', 'camera.yaml', '--output', 'bag', '--rate', 4)[0] == 0
+    with DepthBag(folder / 'bag') as bag:
+        frames = list(bag)
+    assert [frame.stamp for frame in frames] == [1_000_000_000, 1_250_000_000]
+    assert [int(frame.depth.max()) for frame in frames] == [1500, 0]  # 2 before 10
+    code, output, error = run('replay', 'bag', '--output', 'out')
+    assert (code, error) == (0, '')
+    stems = ('000000_1.000000000', '000001_1.250000000')
+    pictures = [f'{stem}_{kind}.png' for stem in stems for kind in ('labels', 'overlay')]
+    assert files(folder / 'out') == [*pictures, 'planes.csv']
+    assert '1 frames without a plane: no valid depth' in output
+    assert 'out: 2 frames' in output
+    run('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'same')
+    np.testing.assert_array_equal(
+        read_labels(folder / 'out' / f'{stems[0]}_labels.png'),
+        read_labels(folder / 'same/2_labels.png'),
+    )
+    with (folder / 'out/planes.csv').open() as file:
+        rows = [row for row in csv.DictReader(file) if row.pop('frame') == '0']
+    assert {row.pop('stamp') for row in rows} <= {'1.000000000'}
+    with (folder / 'same/2_planes.csv').open() as file:
+        assert rows == list(csv.DictReader(file))
+
+
+def test_pack_scales_to_metres(folder, run):
+    options = ('--camera', 'camera.yaml', '--output', 'bag', '--depth-scale', 0.0002)
+    assert run('pack', 'depth', *options)[0] == 0
+    with DepthBag(folder / 'bag') as bag:
+        depth = next(iter(bag)).depth
+    assert depth.dtype == np.float32
+    np.testing.assert_allclose(depth, 0.3, rtol=1e-6)
+
+
+def test_bad_input_of_pack(folder, run):
+    def refused(*arguments):
+        code, _, error = run('pack', *arguments, '--camera', 'camera.yaml', '--output', 'bag')
+        assert code == 2
+        assert error.count('\n') == 1
+        assert not (folder / 'bag').exists()
+        assert not list(folder.glob('.bag*'))
+        return error
+
+    assert "Directory 'none' does not exist" in refused('none')
+    (folder / 'empty').mkdir()
+    assert 'empty: no .png' in refused('empty')
+    assert '--rate' in refused('depth', '--rate', 0)
+    write_image(folder / 'depth/11.png', np.zeros((48, 65), np.uint16))
+    assert 'depth/11.png: depth image must be' in refused('depth')
+    (folder / 'depth/11.png').unlink()
+    (folder / 'bag').mkdir()
+    code, _, error = run('pack', 'depth', '--camera', 'camera.yaml', '--output', 'bag')
+    assert (code, error) == (2, 'rangeseg: bag: exists already, not overwritten\n')
+
+
+def test_several_bags_are_one_sequence(folder, run):
+    for name in ('a', 'b'):
+        record(folder / name, 'mcap', depth_images(2) * 0)
+    assert run('replay', 'a', 'b', '--output', 'out')[0] == 0
+    labels = [name[:6] for name in files(folder / 'out') if name.endswith('_labels.png')]
+    assert labels == ['000000', '000001', '000002', '000003']
+
+
+@pytest.mark.parametrize('storage', SUFFIXES)
+def test_a_truncated_bag_is_reported_and_its_first_frames_are_kept(folder, run, storage):
+    path = folder / f'bag{SUFFIXES[storage]}'
+    file = record(path, storage, np.zeros((16, 240, 320), np.uint16))
+    with file.open('r+b') as stream:
+        stream.truncate(file.stat().st_size // 2)
+    record(folder / 'whole', 'mcap', depth_images(1) * 0)
+    with DepthBag(path) as bag:
+        count = len(bag)
+    assert count > 5
+    code, output, error = run('replay', path, 'whole', '--output', 'out')
+    assert code == 1
+    assert error.startswith(f'rangeseg: {path}: damaged after {count} frames: ')
+    assert error.count('\n') == 1
+    assert f'out: {count + 1} frames' in output
+    assert sum(name.endswith('_labels.png') for name in files(folder / 'out')) == count + 1
+
+
+def test_bad_input_of_replay_leaves_nothing(folder, run):
+    record(folder / 'good', 'mcap', depth_images(1))
+    bad = Recording()
+    bad.add_camera(1)
+    bad.write(folder / 'bad')
+    for arguments, message in (
+        (['good', 'none'], 'none: No such file'),
+        (['good', 'bad'], 'bad: no depth image; topics: /camera/depth/camera_info'),
+        (['good', '--depth-topic', '/x'], 'no depth image on /x; topics: '),
+        (['good', '--camera-topic', '/x'], 'no camera_info on /x; topics: '),
+        (['camera.yaml'], 'camera.yaml: not a readable bag'),
+    ):
+        code, output, error = run('replay', *arguments, '--output', 'out')
+        assert (code, output, error.count('\n')) == (2, '', 1)
+        assert message in error
+        assert not (folder / 'out').exists()
+
+
+def test_an_interrupted_replay_leaves_whole_files(folder):
+    record(folder / 'bag', 'mcap', np.full((1000, 48, 64), 1500, np.uint16))
+    replay = subprocess.Popen(
+        [*COMMAND, 'replay', 'bag', '--output', 'out'],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while len(list(folder.glob('out/*_labels.png'))) < 3:
+            assert replay.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        replay.send_signal(signal.SIGINT)
+        _, error = replay.communicate(timeout=60)
+    finally:
+        replay.kill()
+    assert replay.returncode == 130
+    assert b'Traceback' not in error
+    labels = sorted(folder.glob('out/*_labels.png'))
+    assert 3 <= len(labels) < 1000
+    for path in labels:
+        assert read_labels(path).shape == (48, 64)
+    with (folder / 'out/planes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert all(None not in row and None not in row.values() for row in rows)
+    frames = {int(row['frame']) for row in rows}
+    assert frames <= set(range(len(labels)))
+    assert not [path for path in (folder / 'out').iterdir() if path.name.startswith('.')]
+
+
+def test_help_of_every_command(folder, run):
+    code, output, _ = run('--help')
+    assert code == 0
+    for name in ('segment', 'pack', 'replay'):
+        assert name in output
+        code, text, _ = run(name, '--help')
+        assert code == 0
+        assert '--output' in text
+    assert run('nonsense')[0] == 2
+    assert run('--version')[1].startswith('rangeseg')
