@@ -1,0 +1,307 @@
+"""`rangeseg evaluate` on small scenes whose regions and planes are known exactly."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from test_pcd import literal_lzf
+
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.evaluation import segcomp
+from rangeseg_ros.evaluation.datasets import ScanCase, SegcompCase, find_cases
+from rangeseg_ros.evaluation.hoover import classify
+from rangeseg_ros.evaluation.measure import Measurement, Task, run_all
+from rangeseg_ros.evaluation.pictures import (
+    CORRECT,
+    MISSED,
+    NO_DATA,
+    NOISE,
+    OVER,
+    class_picture,
+)
+from rangeseg_ros.evaluation.segcomp_geometry import abw_calibration
+from rangeseg_ros.io.cameras import write_camera
+
+CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
+# Two walls that meet in the vertical line x = 0, z = 2.
+LEFT = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
+RIGHT = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
+
+
+def corner(rays):
+    """Distance along rays from the origin to a corner of two walls, and labels 1 and 2."""
+    reach = np.stack([-plane[3] / (rays @ plane[:3]) for plane in (LEFT, RIGHT)])
+    reach[reach <= 0] = np.inf
+    return reach.min(axis=0), (reach.argmin(axis=0) + 1).astype(np.uint16)
+
+
+def depth_and_truth():
+    depth, truth = corner(CAMERA.rays.astype(float))
+    depth = np.rint(1000 * depth).astype(np.uint16)
+    depth[:6], truth[:6] = 0, 0
+    return depth, truth
+
+
+@pytest.fixture
+def simulated(tmp_path):
+    """Folder as `rangeseg simulate kinect` writes it."""
+    folder = tmp_path / 'set'
+    depth, truth = depth_and_truth()
+    for kind, image in (('depth', depth), ('truth', truth)):
+        (folder / kind).mkdir(parents=True)
+        for name in ('000002', '000010'):
+            assert cv2.imwrite(str(folder / kind / f'{name}.png'), image)
+    write_camera(folder / 'camera.yaml', CAMERA)
+    with (folder / 'planes.csv').open('w', newline='') as file:
+        rows = csv.writer(file)
+        rows.writerow(['image', 'label', 'normal_x', 'normal_y', 'normal_z', 'distance'])
+        rows.writerows(
+            [name, label, *plane]
+            for name in ('000002', '000010')
+            for label, plane in ((1, LEFT), (2, RIGHT))
+        )
+    return folder
+
+
+@pytest.fixture
+def evaluate(tmp_path, monkeypatch, capsys):
+    """Run `rangeseg evaluate`; returns exit code, figures (or None), stdout and stderr."""
+
+    def run(*args):
+        output = tmp_path / 'figures.json'
+        words = ['evaluate', '--method', 'normals', '--jobs', '1', *map(str, args)]
+        monkeypatch.setattr('sys.argv', ['rangeseg', *words, '--json', str(output)])
+        with pytest.raises(SystemExit) as end:
+            main()
+        figures = json.loads(output.read_text()) if output.exists() else None
+        captured = capsys.readouterr()
+        return end.value.code or 0, figures, captured.out, captured.err
+
+    return run
+
+
+def test_depth_images_with_known_planes(simulated, evaluate):
+    code, figures, out, _ = evaluate(simulated, '--tolerance', '0.8', '0.9')
+    assert code == 0
+    assert list(figures['per_image']) == ['000002', '000010']
+    row = figures['tolerances']['0.8']
+    assert (row['regions'], row['correct'], row['missed'], row['noise']) == (4, 4, 0, 0)
+    assert row['mean_iou'] > 0.9
+    # Depth is rounded to 1 mm at about 2 m; nothing else is wrong.
+    assert row['normal_worst'] < 0.5 and row['offset_worst'] < 0.005
+    assert row['angle_mean'] is None
+    # The table has averages over the images.
+    assert out.splitlines()[2].split()[:3] == ['0.8', '2.00', '2.00']
+
+
+def test_small_true_regions_do_not_count(simulated, evaluate):
+    path = simulated / 'truth' / '000002.png'
+    truth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    truth[40:43, 5:8] = 3
+    assert cv2.imwrite(str(path), truth)
+    assert evaluate(simulated)[1]['tolerances']['0.8']['regions'] == 4
+    assert evaluate(simulated, '--min-pixels', 9)[1]['tolerances']['0.8']['regions'] == 5
+
+
+def test_pictures(simulated, evaluate, tmp_path):
+    output = tmp_path / 'out'
+    assert evaluate(simulated, '--output', output)[0] == 0
+    labels = cv2.imread(str(output / '000002_labels.png'), cv2.IMREAD_UNCHANGED)
+    assert labels.dtype == np.uint16 and set(np.unique(labels)) == {0, 1, 2}
+    picture = cv2.cvtColor(cv2.imread(str(output / '000002_classes.png')), cv2.COLOR_BGR2RGB)
+    assert picture.shape == (72, 2 * 96 + 4, 3)
+    assert tuple(picture[3, 10]) == NO_DATA
+    assert tuple(picture[40, 10]) == CORRECT and tuple(picture[40, 120]) == CORRECT
+
+
+def test_picture_colours(simulated):
+    sample = find_cases(simulated)[0].load()
+    labels = np.zeros(sample.image.shape, np.uint16)
+    # Region 1 in two halves: over-segmented; region 2 missed, but for a speck of noise.
+    labels[sample.truth.labels == 1] = 1
+    labels[36:][labels[36:] == 1] = 2
+    labels[50:54, 80:84] = 3
+    overlap = sample.truth.compare(labels)
+    picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
+    assert tuple(picture[60, 10]) == OVER and tuple(picture[60, 80]) == MISSED
+    assert tuple(picture[60, 110]) == OVER and tuple(picture[52, 100 + 82]) == NOISE
+
+
+def test_annotated_folders(tmp_path, evaluate):
+    depth, truth = depth_and_truth()
+    truth[:, 90:] = 65535
+    for name in ('a', 'b'):
+        (tmp_path / 'set' / name).mkdir(parents=True)
+        assert cv2.imwrite(str(tmp_path / 'set' / name / 'depth.png'), depth)
+        assert cv2.imwrite(str(tmp_path / 'set' / name / 'truth.png'), truth)
+        (tmp_path / 'set' / name / 'camera.txt').write_text('90 90 47.5 35.5\n')
+    code, figures, _, _ = evaluate(tmp_path / 'set')
+    assert code == 0 and list(figures['per_image']) == ['a', 'b']
+    assert figures['tolerances']['0.8']['correct'] == 4
+
+
+def segcomp_set(folder):
+    """One ABW test image of the corner, 1.1 times nearer, with its truth and its angle."""
+    folder.mkdir()
+    calibration = abw_calibration(1)
+    rays = calibration.camera.rays.astype(float)
+    depth, truth = corner(rays)
+    values = np.rint(calibration.values(depth * 0.5)).clip(1, 255).astype(np.uint8)
+    segcomp.write_raster(folder / 'abw.test.1.range', values)
+    segcomp.write_segmentation(folder / 'abw.test.1.gt-seg', segcomp.to_segcomp(truth))
+    segcomp.write_angles(folder / 'abw.test.1.gt-ang', [segcomp.RegionAngle(10, 11, 90.0)])
+    return folder
+
+
+def test_segcomp_set(tmp_path, evaluate):
+    folder = segcomp_set(tmp_path / 'abw')
+    code, figures, _, _ = evaluate(folder, '--tolerance', '0.8')
+    assert code == 0 and list(figures['per_image']) == ['abw.test.1']
+    row = figures['tolerances']['0.8']
+    assert (row['regions'], row['correct']) == (2, 2)
+    assert row['angle_mean'] < 1.0 and row['angle_std'] == 0.0
+
+
+def test_splits(tmp_path, evaluate):
+    folder = segcomp_set(tmp_path / 'abw')
+    code, _, _, err = evaluate(folder, '--split', 'train')
+    assert code == 2 and 'no train images' in err
+
+
+def test_calibration_follows_split_and_number(tmp_path):
+    folder = segcomp_set(tmp_path / 'abw')
+    sample = find_cases(folder)[0].load()
+    other = SegcompCase('x', folder / 'abw.test.1.range', folder / 'abw.test.1.gt-seg', number=0)
+    assert sample.image.camera == abw_calibration(1).camera
+    assert other.load().image.camera == abw_calibration(0).camera
+
+
+def test_labelled_scan(tmp_path):
+    # As SynPEB: columns from right to left in azimuth, rows from above; x forward, z up.
+    azimuth = np.radians(np.linspace(-30, 30, 80))
+    elevation = np.radians(np.linspace(20, -20, 60))[:, None]
+    direction = np.stack(
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation) * np.ones(80),
+        ],
+        axis=2,
+    )
+    optical = np.stack([-direction[..., 1], -direction[..., 2], direction[..., 0]], axis=2)
+    reach, label = corner(optical)
+    points = (reach[..., None] * direction).astype(np.float32)
+    intensity = (label + 9).astype(np.float32)
+    intensity[:4] = 3
+    raw = b''.join(a.astype('<f4').tobytes() for a in (*np.moveaxis(points, 2, 0), intensity))
+    packed = literal_lzf(raw)
+    header = (
+        'VERSION .7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n'
+        'WIDTH 80\nHEIGHT 60\nPOINTS 4800\nDATA binary_compressed\n'
+    )
+    path = tmp_path / 'scan.pcd'
+    sizes = np.array([len(packed), len(raw)], '<u4')
+    path.write_bytes(header.encode() + sizes.tobytes() + packed)
+    (case,) = find_cases(tmp_path)
+    assert isinstance(case, ScanCase)
+    sample = case.load()
+    # Column 0 is on the left, x right, y down: the left wall is region 10.
+    assert sample.image.points[0, 0, 0] < 0 and sample.image.points[0, 0, 1] < 0
+    assert sample.truth.labels[30, 0] == 10 and sample.truth.labels[30, -1] == 11
+    assert not sample.truth.labels[:4].any()
+    distance = sample.image.points[30, 0].astype(float) @ LEFT[:3] + LEFT[3]
+    assert distance == pytest.approx(0, abs=1e-5)
+
+
+def test_measurement_survives_json(simulated):
+    measurement = Task(find_cases(simulated)[0], Config(method='normals')).run()
+    copy = Measurement.from_json(measurement.to_json())
+    assert copy.to_json() == measurement.to_json()
+    assert copy.overlap.pairs.shape == measurement.overlap.pairs.shape
+
+
+def test_processes_agree_and_keep_the_order(simulated):
+    tasks = [Task(case, Config(method='normals')) for case in find_cases(simulated)]
+    alone, pooled = list(run_all(tasks, 1)), list(run_all(tasks, 2))
+    assert [m.name for m in pooled] == ['000002', '000010']
+    for a, b in zip(alone, pooled, strict=True):
+        assert a.found_planes == b.found_planes and a.energy == b.energy
+
+
+# --- refusals ------------------------------------------------------------------------------------
+
+
+def refuse(result, *parts):
+    code, figures, _, err = result
+    assert code == 2 and figures is None
+    assert err.count('\n') == 1
+    for part in parts:
+        assert str(part) in err
+
+
+def test_missing_truth(simulated, evaluate):
+    (simulated / 'truth' / '000010.png').unlink()
+    refuse(evaluate(simulated), '000010.png', 'no ground truth')
+
+
+def test_missing_segcomp_truth(tmp_path, evaluate):
+    folder = segcomp_set(tmp_path / 'abw')
+    (folder / 'abw.test.1.gt-seg').unlink()
+    refuse(evaluate(folder), 'abw.test.1.range', 'no ground truth')
+
+
+def test_truncated_segcomp_image(tmp_path, evaluate):
+    folder = segcomp_set(tmp_path / 'abw')
+    path = folder / 'abw.test.1.range'
+    path.write_bytes(path.read_bytes()[:-9])
+    refuse(evaluate(folder), path, 'truncated')
+
+
+def test_segcomp_image_of_another_size(tmp_path, evaluate):
+    folder = segcomp_set(tmp_path / 'abw')
+    segcomp.write_raster(folder / 'abw.test.1.range', np.ones((4, 4), np.uint8))
+    refuse(evaluate(folder), 'abw.test.1.range', '512x512')
+
+
+def test_truth_of_another_size(simulated, evaluate):
+    assert cv2.imwrite(str(simulated / 'truth/000002.png'), np.ones((4, 5), np.uint16))
+    refuse(evaluate(simulated), '000002.png', 'truth is 5x4', '96x72')
+
+
+@pytest.mark.parametrize('text', ['', '1 2 3', 'a b c d', '0 1 1 1', 'nan 1 1 1'])
+def test_malformed_camera(tmp_path, evaluate, text):
+    folder = tmp_path / 'set'
+    folder.mkdir()
+    depth, truth = depth_and_truth()
+    assert cv2.imwrite(str(folder / 'depth.png'), depth)
+    assert cv2.imwrite(str(folder / 'truth.png'), truth)
+    (folder / 'camera.txt').write_text(text)
+    refuse(evaluate(folder), 'camera.txt')
+
+
+def test_malformed_planes(simulated, evaluate):
+    (simulated / 'planes.csv').write_text('image,label\n000002,1\n')
+    refuse(evaluate(simulated), 'planes.csv', 'malformed')
+
+
+def test_scan_without_labels(tmp_path, evaluate):
+    folder = tmp_path / 'set'
+    folder.mkdir()
+    head = 'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n'
+    (folder / 'a.pcd').write_text(head + '1 2 3\n')
+    refuse(evaluate(folder), 'a.pcd', 'no field intensity')
+
+
+def test_unknown_layout(tmp_path, evaluate):
+    folder = tmp_path / 'set'
+    folder.mkdir()
+    refuse(evaluate(folder), folder, 'known layout')
+
+
+def test_failure_in_a_process_is_one_line(simulated, evaluate):
+    (simulated / 'depth' / '000002.png').write_bytes(b'no image')
+    refuse(evaluate(simulated, '--jobs', '2'), '000002.png', 'not a readable image')

@@ -1,0 +1,192 @@
+"""The experiments on a tiny set: tables, plots, choice of lambda, resuming."""
+
+import csv
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from test_evaluate import CAMERA, depth_and_truth, segcomp_set
+
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.evaluation import experiments
+from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.evaluation.measure import Measurement, Task
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.params import read_config
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Two depth images of a corner."""
+    depth, truth = depth_and_truth()
+    for name, shift in (('a', 0), ('b', 100)):
+        for kind, image in (('depth', depth + np.uint16(shift) * (depth > 0)), ('truth', truth)):
+            (tmp_path / 'set' / kind).mkdir(parents=True, exist_ok=True)
+            assert cv2.imwrite(
+                str(tmp_path / 'set' / kind / f'{name}.png'), image.astype(np.uint16)
+            )
+    write_camera(tmp_path / 'set' / 'camera.yaml', CAMERA)
+    return tmp_path / 'set'
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Names of the images that are really segmented."""
+    names = []
+    original = Task._measure
+
+    def measure(task):
+        names.append(task.case.name)
+        return original(task)
+
+    monkeypatch.setattr(Task, '_measure', measure)
+    return names
+
+
+def run(monkeypatch, *args):
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', 'experiment', *map(str, args), '--jobs', '1'])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code or 0
+
+
+def rows(path):
+    with path.open(newline='') as file:
+        return list(csv.DictReader(file))
+
+
+def picture(path):
+    image = cv2.imread(str(path))
+    assert image is not None and len(np.unique(image.reshape(-1, 3), axis=0)) > 10
+    return image
+
+
+def test_lambda(folder, tmp_path, monkeypatch, measured):
+    output, params = tmp_path / 'out', tmp_path / 'params.yaml'
+    args = ('lambda', folder, '--output', output, '--step', '65', '--train', params)
+    assert run(monkeypatch, *args) == 0
+    table = rows(output / 'lambda.csv')
+    assert [(r['series'], r['lambda']) for r in table] == [
+        (series, value)
+        for series in ('none', 'merged', 'identified')
+        for value in ('20', '85', '150')
+    ]
+    assert all(r['regions'] == '2' for r in table)
+    picture(output / 'lambda.png')
+    assert len(measured) == 2 * 9
+    config = read_config(params)
+    assert config.method == 'normals' and config.normal_baseline == 1
+    assert config.smoothness in (20.0, 85.0, 150.0)
+
+
+def test_resumes(folder, tmp_path, monkeypatch, measured):
+    output = tmp_path / 'out'
+    args = ('lambda', folder, '--output', output, '--step', '130')
+    assert run(monkeypatch, *args) == 0
+    first = (output / 'lambda.csv').read_text()
+    finished = sorted((output / 'cache').iterdir())
+    assert len(measured) == len(finished) == 12
+    finished[0].unlink()
+    finished[7].unlink()
+    assert run(monkeypatch, *args) == 0
+    assert len(measured) == 14
+    assert (output / 'lambda.csv').read_text() == first
+
+
+def test_an_interrupted_run_keeps_what_is_done(folder, tmp_path, monkeypatch):
+    original, calls = Task._measure, []
+
+    def interrupted(task):
+        calls.append(task)
+        if len(calls) == 5:
+            raise KeyboardInterrupt
+        return original(task)
+
+    monkeypatch.setattr(Task, '_measure', interrupted)
+    args = ('lambda', folder, '--output', tmp_path / 'out', '--step', '130')
+    assert run(monkeypatch, *args) == 130
+    assert len(list((tmp_path / 'out' / 'cache').iterdir())) == 4
+    assert run(monkeypatch, *args) == 0
+    assert len(calls) == 5 + 8
+
+
+def test_changed_files_are_measured_again(folder, tmp_path, monkeypatch, measured):
+    args = ('lambda', folder, '--output', tmp_path / 'out', '--step', '130')
+    assert run(monkeypatch, *args) == 0
+    truth = np.ones(CAMERA.shape, np.uint16)
+    assert cv2.imwrite(str(folder / 'truth' / 'a.png'), truth)
+    measured.clear()
+    assert run(monkeypatch, *args) == 0
+    assert measured == ['a'] * 6
+
+
+def test_directions(folder, tmp_path, monkeypatch):
+    args = ('directions', folder, '--output', tmp_path, '--limit', '25', '--images', '1')
+    assert run(monkeypatch, *args) == 0
+    table = rows(tmp_path / 'directions.csv')
+    assert {r['series'] for r in table} == {'17 platonic', '25 regular'}
+    assert [r['tolerance'] for r in table[:6]] == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
+    picture(tmp_path / 'directions.png')
+
+
+def test_postprocessing(folder, tmp_path, monkeypatch):
+    args = ('postprocessing', folder, '--output', tmp_path, '--step', '130', '--images', '1')
+    assert run(monkeypatch, *args) == 0
+    assert len(rows(tmp_path / 'postprocessing.csv')) == 3 * 6
+    picture(tmp_path / 'postprocessing.png')
+
+
+def test_comparison_names_its_sources(folder, tmp_path, monkeypatch):
+    args = ('comparison', folder, '--output', tmp_path, '--step', '130', '--images', '1')
+    assert run(monkeypatch, *args) == 0
+    sources = {r['series']: r['source'] for r in rows(tmp_path / 'comparison.csv')}
+    assert sources['normals as published, identified'] == 'simulated set set'
+    assert sources['UFPR/OSU'] == 'real Perceptron test set, published'
+    picture(tmp_path / 'comparison.png')
+    assert run(monkeypatch, *args, '--real') == 0
+    sources = {r['series']: r['source'] for r in rows(tmp_path / 'comparison.csv')}
+    assert sources['planes'] == 'real set set'
+
+
+def test_timing(folder, tmp_path, monkeypatch):
+    args = ('timing', folder, '--output', tmp_path, '--limit', '17', '--images', '1')
+    assert run(monkeypatch, *args) == 0
+    table = rows(tmp_path / 'timing.csv')
+    assert [r['moves'] for r in table] == ['expansion', 'swap', 'coarse to fine']
+    assert table[0]['energy_ratio'] == '1' and float(table[0]['mean_s']) > 0
+    assert table[0]['thesis_mean_s'] == '12'
+    picture(tmp_path / 'timing.png')
+
+
+def test_sets_without_the_split_are_refused(tmp_path, monkeypatch, capsys):
+    abw = segcomp_set(tmp_path / 'abw')
+    assert run(monkeypatch, 'lambda', abw, '--output', tmp_path / 'out') == 2
+    assert 'no train images' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def measurement(found):
+    """One region of ten pixels, of which `found` were found."""
+    truth = np.ones((1, 10), np.uint16)
+    labels = truth.copy()
+    labels[0, found:] = 0
+    return Measurement('x', Overlap.between(truth, labels), [], {}, {}, 0.0, {})
+
+
+def test_lambda_with_most_correct_regions_wins_the_lowest_of_equals():
+    good, bad = [measurement(9)], [measurement(5)]
+    assert experiments.best_lambda({100.0: good, 50.0: good, 20.0: bad}) == 50.0
+    assert experiments.best_lambda({100.0: good, 50.0: bad}) == 100.0
+
+
+def test_averages_are_over_images():
+    row = experiments.averages([measurement(9), measurement(5)], 0.8)
+    assert (row['regions'], row['correct'], row['missed']) == (1.0, 0.5, 0.5)
+
+
+def test_published_rows_are_those_of_the_thesis():
+    assert experiments.PUBLISHED['thesis, identified'] == (11.6, 11.5, 11.2, 10.3, 7.1, 3.6)
+    published = Config(method='normals', normal_baseline=1, jump_edges='sobel', min_pixels=1)
+    assert published == experiments.THESIS
