@@ -165,6 +165,8 @@ class Labelling:
         """Share out the sites of labels `alpha` and `beta` anew; True if the energy falls."""
         before = self.labels == alpha
         free = before | (self.labels == beta)
+        if not free.any():
+            return False
         excess = np.subtract(self.unary[alpha], self.unary[beta], dtype=np.float64)
         switched = self._best(free, excess, self.graph.weight, before)
         if switched is None:
