@@ -26,7 +26,7 @@ $(VENV)/installed: setup.py setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(SYSTEM_ROS) $(VENV)
 	$(BIN)/pip install --quiet --editable '.[test]'
 ifeq ($(SYSTEM_ROS),)
-	$(BIN)/pip install --quiet --only-binary :all: --editable '.[jazzy]' || \
+	$(BIN)/pip install --quiet --editable '.[jazzy]' || \
 	  echo 'No ROS 2 wheels for this platform: the tests of the node will be skipped.'
 endif
 	touch $@

@@ -31,6 +31,7 @@ setup(
     install_requires=[
         'click>=8.0',
         'lz4',
+        'matplotlib>=3.6',
         'mcap>=1.0',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',

@@ -8,23 +8,22 @@ from importlib.util import find_spec
 
 import click
 
-COMMANDS = (
-    'segment',
-    'pack',
-    'replay',
-    'simulate',
-    'evaluate',
-    'compare',
-    'experiment',
-    'bench',
-    'play',
-    'view',
-)
+# A subcommand's module is imported when it runs: help need not wait for all of them.
+COMMANDS = {
+    'segment': 'Segment depth images into planes.',
+    'pack': 'Pack depth images into a rosbag2.',
+    'replay': 'Segment the depth images of recordings.',
+    'simulate': 'Simulate range images with ground truth.',
+    'evaluate': 'Segment images and compare the results with their truth.',
+    'compare': 'Compare label images with ground truth.',
+    'experiment': 'Repeat the experiments of the thesis.',
+    'bench': 'Measure the time and memory of each stage.',
+    'play': 'Publish the messages of a recording in ROS 2.',
+    'view': 'Show planes in 3D.',
+}
 
 
 class _LazyGroup(click.Group):
-    """Imports a subcommand's module only when it is asked for: `--help` stays quick."""
-
     def list_commands(self, ctx: click.Context) -> list[str]:
         return [name for name in COMMANDS if find_spec(f'rangeseg_ros.cli.{name}')]
 
@@ -33,6 +32,10 @@ class _LazyGroup(click.Group):
             return None
         command: click.Command = import_module(f'rangeseg_ros.cli.{cmd_name}').command
         return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section('Commands'):
+            formatter.write_dl([(name, COMMANDS[name]) for name in self.list_commands(ctx)])
 
 
 @click.group(cls=_LazyGroup, context_settings={'help_option_names': ['-h', '--help']})
