@@ -17,7 +17,7 @@ from rangeseg_ros.simulation.kinect import (
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.solids import box, half_space
 
-SENSORS = range(6)
+SENSORS = range(4)
 
 
 def in_camera_frame(*solids):
