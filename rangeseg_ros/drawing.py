@@ -81,7 +81,7 @@ def overlay(
 def contact_sheet(
     pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), columns: int = 3
 ) -> NDArray[np.uint8]:
-    """Tile pictures (H, W, 3), left to right and top to bottom, with titles in their corners.
+    """Tile pictures (H, W, 3), left to right and top to bottom, with titles in the corners.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def contact_sheet(
         raise ValueError('a contact sheet needs pictures of one shape')
     tiles = [picture.copy() for picture in pictures]
     for tile, title in zip(tiles, titles, strict=False):
-        _write(tile, title, (6, tile.shape[0] - 8), 0.5)
+        _write(tile, title, (0, tile.shape[0]), 0.5)
     tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
     return np.vstack(rows)
@@ -115,12 +115,22 @@ def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) 
     if radius < 8:
         return
     scale = min(0.8, radius / 30 + 0.2)
-    (wide, high), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    _write(picture, text, (x + column - 1 - wide // 2, y + row - 1 + high // 2), scale)
+    _write(picture, text, (x + column - 1, y + row - 1), scale)
 
 
-def _write(picture: NDArray[np.uint8], text: str, at: tuple[int, int], scale: float) -> None:
-    for colour, thickness in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        cv2.putText(
-            picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, scale, colour, thickness, cv2.LINE_AA
-        )
+def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale: float) -> None:
+    """Write white text with a black outline, moved where needed so that it lies inside."""
+    # The outline grows from the text itself: bold letters are wider in some versions of OpenCV.
+    font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
+    (wide, high), below = cv2.getTextSize(text, font, scale, 1)
+    letters = np.zeros((high + below + 2 * margin, wide + 2 * margin), np.uint8)
+    cv2.putText(letters, text, (margin, margin + high), font, scale, 255, 1, cv2.LINE_AA)
+    outline = cv2.dilate(letters, np.ones((3, 3), np.uint8))
+    top, left = (
+        max(0, min(middle - size // 2, full - size))
+        for middle, size, full in zip(centre[::-1], letters.shape, picture.shape, strict=False)
+    )
+    part = picture[top : top + letters.shape[0], left : left + letters.shape[1]]
+    rows, columns = part.shape[:2]
+    part[:] = part * (1 - outline[:rows, :columns, None] / 255)
+    np.maximum(part, letters[:rows, :columns, None], out=part)
