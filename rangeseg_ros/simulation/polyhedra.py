@@ -66,7 +66,7 @@ class _Table:
             # The outline upright, its first edge on the floor.
             rotation = rotation * Rotation.from_euler('x', 90, degrees=True)
         elif pose == 'leaning':
-            rotation = Rotation.random(random_state=self.random)
+            rotation = Rotation.from_quat(self.random.standard_normal(4))
         base = np.column_stack([outline, np.full(len(outline), height / 2)])
         corners = rotation.apply(np.vstack([base, base * (1, 1, -1)]))
         reach, bottom = np.hypot(*corners[:, :2].T).max(), corners[:, 2].min()

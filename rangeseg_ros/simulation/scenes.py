@@ -165,7 +165,7 @@ class _Room:
             angle = yaw + self.random.uniform(-20, 20)
             self.solids.append(box(size, _about_z(angle), (*place, top + size[2] / 2)))
         elif kind == 'tilted':
-            rotation = Rotation.random(random_state=self.random).as_matrix()
+            rotation = Rotation.from_quat(self.random.standard_normal(4)).as_matrix()
             reach = np.abs(rotation) @ size / 2
             lift = max(self.random.uniform(-0.4, 0.5), 0)
             place = self._free_place(np.hypot(*reach[:2]), self.nearest, self.depth)
