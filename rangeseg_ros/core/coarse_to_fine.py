@@ -1,16 +1,18 @@
-"""Fast minimiser: few labels, blocks of pixels, then a band around the label boundaries."""
+"""Fast minimiser: few labels, blocks of pixels, then bands around the label boundaries."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.energy import angular_cost
-from rangeseg_ros.core.moves import Graph, Labelling
+from rangeseg_ros.core.energy import AngularCost
+from rangeseg_ros.core.moves import Cost, Labelling
 
-BLOCK = 8
-MIN_VOTES = 3
+# Width of the blocks of each level, pixels; each divides the one before.
+LEVELS = (8, 4, 1)
 
 
 def minimise(
@@ -20,14 +22,14 @@ def minimise(
     vertical: NDArray[np.floating],
     smoothness: float,
     cycles: int,
-    moves: str = 'expansion',
 ) -> NDArray[np.intp]:
-    """Labelling of low energy, eq. 5.3 with the data cost of `angular_cost`.
+    """Labelling of low energy, eq. 5.3 with the data cost `AngularCost`, by alpha-expansion.
 
-    Blocks of 8 x 8 pixels vote for the directions worth trying. The energy of labellings that
-    are constant on blocks (data costs summed over the block, weights over its borders) is
-    minimised with these; then the pixels of blocks beside a label boundary are freed and the
-    energy at full resolution minimised with the labels in use, the other pixels held.
+    Blocks vote for the directions worth trying. On the coarsest level the energy of labellings
+    that are constant on blocks is minimised (data costs summed over the block, weights over its
+    borders). Finer levels start from the labelling above, and a label is tried only where it may
+    gain: around the boundaries of its regions, and where it suits a block far better than the
+    block's label does.
 
     Parameters
     ----------
@@ -39,108 +41,102 @@ def minimise(
     smoothness : float
         Lambda.
     cycles : int
-        At most so many rounds of moves on either level.
-    moves : {'expansion', 'swap'}
+        At most so many rounds of moves on the coarsest level.
 
     Returns
     -------
     (H, W) intp
         Index into `directions`.
     """
+    height, width = normals.shape[:2]
+    # Whole blocks only: beyond the image nothing is measured and nothing connected.
+    rows, columns = -height % LEVELS[0], -width % LEVELS[0]
+    normals = np.pad(normals, ((0, rows), (0, columns), (0, 0)), constant_values=np.nan)
+    horizontal = np.pad(horizontal, ((0, rows), (0, columns)))
+    vertical = np.pad(vertical, ((0, rows), (0, columns)))
+
     candidates = _voted(normals, directions)
-    unary = angular_cost(normals, directions[candidates])
-    coarse = _coarse_labels(unary, horizontal, vertical, smoothness, cycles, moves)
-    used, coarse = np.unique(coarse, return_inverse=True)
-    labels = _fine_labels(
-        unary[used],
-        coarse.reshape(-(-unary.shape[1] // BLOCK), -1),
-        horizontal,
-        vertical,
-        smoothness,
-        cycles,
-        moves,
-    )
-    return candidates[used[labels]]
+    cost = AngularCost(normals, directions[candidates])
+    tables = _block_costs(cost, normals.shape[:2])
+    labels = tables[LEVELS[0]].argmin(axis=0)
+    above = None
+    for size in LEVELS:
+        table = tables.get(size)
+        labelling = Labelling(
+            labels if above is None else _enlarged(labels, above // size),
+            cost if table is None else _lookup(table),
+            *_block_weights(horizontal, vertical, size),
+            smoothness,
+        )
+        if above is None:
+            labelling.minimise(len(candidates), cycles)
+        else:
+            for label, blocks in _windows(labels, tables[above], smoothness):
+                labelling.expand(label, np.flatnonzero(_enlarged(blocks, above // size)))
+        labels, above = labelling.image, size
+    return candidates[labels[:height, :width]]
 
 
 def _voted(normals: NDArray[np.float32], directions: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Directions nearest to the mean normal of some block."""
-    total = _block_sum(np.nan_to_num(np.moveaxis(normals, 2, 0)))
-    nearest = np.argmax(directions.astype(np.float32) @ total.reshape(3, -1), axis=0)
-    nearest = nearest[np.abs(total).reshape(3, -1).sum(axis=0) > 0]
-    votes = np.bincount(nearest, minlength=len(directions))
-    return np.flatnonzero(votes >= min(MIN_VOTES, votes.max()))
+    """Directions nearest to the mean normal of some block, at least one."""
+    total = _block_sum(np.nan_to_num(normals), LEVELS[0]).reshape(-1, 3)
+    nearest = np.argmax(total @ directions.astype(np.float32).T, axis=1)
+    voted = np.unique(nearest[total.any(axis=1)])
+    return voted if voted.size else np.zeros(1, np.intp)
 
 
-def _coarse_labels(
-    unary: NDArray[np.float32],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
-    smoothness: float,
-    cycles: int,
-    moves: str,
-) -> NDArray[np.intp]:
-    """Label per block, (h, w)."""
-    costs = _block_sum(unary)
-    across = _block_sum(horizontal[None, :, BLOCK - 1 :: BLOCK], (BLOCK, 1))[0]
-    down = _block_sum(vertical[None, BLOCK - 1 :: BLOCK], (1, BLOCK))[0]
-    shape = costs.shape[1:]
-    graph = Graph.of_grid(across, down, smoothness)
-    costs = costs.reshape(len(costs), -1)
-    labelling = Labelling(graph, costs, costs.argmin(axis=0))
-    labelling.minimise(cycles, moves)
-    return labelling.labels.reshape(shape)
+def _block_costs(cost: AngularCost, shape: tuple[int, int]) -> dict[int, NDArray[np.float32]]:
+    """Data costs of all labels summed over the blocks, (K, h, w), for every level but the last."""
+    tables = {
+        size: np.empty((cost.count, shape[0] // size, shape[1] // size), np.float32)
+        for size in LEVELS[:-1]
+    }
+    for label in range(cost.count):
+        image, width = cost(label).reshape(shape), 1
+        for size in reversed(LEVELS[:-1]):
+            image, width = _block_sum(image, size // width), size
+            tables[size][label] = image
+    return tables
 
 
-def _fine_labels(
-    unary: NDArray[np.float32],
-    coarse: NDArray[np.intp],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
-    smoothness: float,
-    cycles: int,
-    moves: str,
-) -> NDArray[np.intp]:
-    """Label per pixel, (H, W): those of blocks beside a label boundary are found anew."""
-    shape = unary.shape[1:]
-    block = coarse.astype(np.float32)
+def _lookup(table: NDArray[np.float32]) -> Cost:
+    """Data cost of blocks from their table (K, h, w)."""
+    return lambda label, blocks: table[label].ravel().take(blocks)
+
+
+def _block_sum(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Sums over blocks of size x size pixels of an image (H, W) or (H, W, C)."""
+    shape = image.shape[1] // size, image.shape[0] // size
+    return cv2.resize(image, shape, interpolation=cv2.INTER_AREA) * np.float32(size * size)
+
+
+def _block_weights(
+    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], size: int
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Weights between neighbouring blocks: sums over the edges that cross their border."""
+    height, width = len(horizontal), vertical.shape[1]
+    across = np.add.reduceat(horizontal[:, size - 1 :: size], np.arange(0, height, size), axis=0)
+    down = np.add.reduceat(vertical[size - 1 :: size], np.arange(0, width, size), axis=1)
+    return across, down
+
+
+def _enlarged(blocks: NDArray, ratio: int) -> NDArray:
+    """Image of which every pixel becomes ratio x ratio pixels."""
+    return blocks.repeat(ratio, axis=0).repeat(ratio, axis=1)
+
+
+def _windows(
+    labels: NDArray[np.integer], table: NDArray[np.float32], smoothness: float
+) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """Labels with the blocks (h, w) where they may lower the energy on the next finer level."""
     kernel = np.ones((3, 3), np.uint8)
-    beside = cv2.dilate(block, kernel) != cv2.erode(block, kernel)
-    labels, band = (
-        np.repeat(np.repeat(a, BLOCK, 0), BLOCK, 1)[: shape[0], : shape[1]]
-        for a in (coarse, beside)
-    )
-    costs = unary[:, band]
-    index = np.cumsum(band.ravel()).reshape(shape) - 1
-    for edge, inside, outside in _both_ways(horizontal, vertical):
-        # A neighbour that is held costs every label but its own.
-        rim = (edge > 0) & band[inside] & ~band[outside]
-        site, weight = index[inside][rim], smoothness * edge[rim]
-        np.add.at(costs, (slice(None), site), weight)
-        np.add.at(costs, (labels[outside][rim], site), -weight)
-    graph = Graph.of_grid(horizontal, vertical, smoothness, band)
-    labelling = Labelling(graph, costs, labels[band])
-    labelling.minimise(cycles, moves)
-    labels = labels.copy()
-    labels[band] = labelling.labels
-    return labels
-
-
-def _block_sum(stack: NDArray, size: tuple[int, int] = (BLOCK, BLOCK)) -> NDArray:
-    """Sums over the blocks of each image of a stack (K, H, W); the last blocks may be smaller."""
-    rows = np.add.reduceat(stack, np.arange(0, stack.shape[1], size[0]), axis=1)
-    return np.add.reduceat(rows, np.arange(0, stack.shape[2], size[1]), axis=2)
-
-
-def _both_ways(
-    horizontal: NDArray[np.floating], vertical: NDArray[np.floating]
-) -> list[tuple[NDArray[np.floating], tuple[slice, slice], tuple[slice, slice]]]:
-    """Edge weights with the slices of the pixels at their two ends, in both orders."""
-    every, head, tail = slice(None), slice(None, -1), slice(1, None)
-    left, right, upper, lower = (every, head), (every, tail), (head, every), (tail, every)
-    return [
-        (horizontal, left, right),
-        (horizontal, right, left),
-        (vertical, upper, lower),
-        (vertical, lower, upper),
-    ]
+    drawn = labels.astype(np.float32)
+    boundary = cv2.dilate(drawn, kernel) != cv2.erode(drawn, kernel)
+    best = table.argmin(axis=0)
+    gain = np.take_along_axis(table, labels[None], 0)[0] - table.min(axis=0)
+    # A region of one pixel, its four edges cut, costs 4 lambda.
+    best = np.where(gain > 4 * smoothness, best, -1)
+    for label in np.unique(np.append(labels, best[best >= 0])):
+        around = cv2.dilate((labels == label).astype(np.uint8), kernel) > 0
+        suited = cv2.dilate((best == label).astype(np.uint8), kernel) > 0
+        yield int(label), (around & boundary) | suited

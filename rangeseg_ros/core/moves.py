@@ -1,33 +1,219 @@
-"""Move spaces of thesis 4.8: alpha-expansion and alpha-beta-swap for a Potts energy.
+"""Move spaces of thesis 4.8: alpha-expansion and alpha-beta-swap for a Potts energy on a grid.
 
-The labelling problem lives on a graph of sites joined by weighted edges, so that a whole image,
-its blocks or a band of pixels are minimised by the same code.
-
-Both moves are binary problems, site p switching (x_p = 1) or staying (x_p = 0). In an expansion
-an edge of weight w between sites of unlike labels, neither of them alpha, costs w unless both
-ends switch, and
+Both moves are binary problems: a free pixel p switches to alpha (x_p = 1) or stays (x_p = 0),
+and the best set of pixels to switch is a minimum cut. In an expansion, an edge of weight w
+between pixels of unlike labels, neither of them alpha, costs w unless both ends switch, and
 
     w (1 - x_p x_q) = w/2 (1 - x_p) + w/2 (1 - x_q) + w/2 |x_p - x_q|,
 
-so that it is cut as an n-link of w/2 and a cost w/2 of staying at each end: no auxiliary vertex
-(thesis 4.7.2) is needed. An edge between like labels is an n-link of w. The same holds where one
-end has the label alpha already and its site is fixed at x = 1: staying costs the other end
-w/2 + w/2.
+so that it becomes an n-link of w/2 and a cost w/2 of staying at each end: no auxiliary vertex
+(thesis 4.7.2) is needed. An edge between like labels is an n-link of w. With a neighbour q that
+is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the n-link becomes a
+cost of staying or of switching.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import partial
 from itertools import combinations
 
 import maxflow
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.energy import angular_cost
+from rangeseg_ros.core.energy import AngularCost
+
+# Data cost (n,) of a label at pixels (n,) given by their index in raster order.
+Cost = Callable[[int, NDArray[np.intp]], NDArray[np.floating]]
 
 # A move must lower the energy by more than the rounding of its sums.
-ROUNDING = 1e-6
+ROUNDING = 1e-3
+
+
+class Labelling:
+    """A labelling of the 4-connected grid while its energy (thesis eq. 5.3) is minimised.
+
+    Parameters
+    ----------
+    labels : (H, W) int
+        Labelling to start from.
+    cost : Cost
+    horizontal, vertical : (H, W-1), (H-1, W) float
+        Weights u of eq. 5.1 between a pixel and its right and lower neighbour.
+    smoothness : float
+        Lambda.
+
+    Attributes
+    ----------
+    labels : (H * W,) int32
+        In raster order.
+    """
+
+    def __init__(
+        self,
+        labels: NDArray[np.integer],
+        cost: Cost,
+        horizontal: NDArray[np.floating],
+        vertical: NDArray[np.floating],
+        smoothness: float,
+    ) -> None:
+        self._shape = height, width = labels.shape
+        self.labels = labels.astype(np.int32).ravel()
+        self._cost = cost
+        # Neighbours to the right, below, to the left, above; no weight beyond the image.
+        self._offsets = np.array([[1], [width], [-1], [-width]])
+        weight = np.zeros((4, height, width), np.float32)
+        weight[0, :, :-1] = weight[2, :, 1:] = smoothness * horizontal
+        weight[1, :-1] = weight[3, 1:] = smoothness * vertical
+        self._weight = weight.reshape(4, -1)
+        self._data = np.empty(labels.size, np.float32)
+        self._position = np.full(labels.size, -1, np.int32)
+        for label in np.unique(self.labels):
+            pixels = np.flatnonzero(self.labels == label)
+            self._data[pixels] = cost(int(label), pixels)
+
+    @property
+    def image(self) -> NDArray[np.int32]:
+        """The labelling, (H, W)."""
+        return self.labels.reshape(self._shape)
+
+    def minimise(self, count: int, cycles: int, moves: str = 'expansion') -> None:
+        """Try the moves of all labels (listing 4.1) until none helps.
+
+        Parameters
+        ----------
+        count : int
+            Number of labels.
+        cycles : int
+            At most so many rounds of all moves.
+        moves : {'expansion', 'swap'}
+        """
+        if moves == 'expansion':
+            tries = [partial(self.expand, alpha) for alpha in range(count)]
+        else:
+            tries = [partial(self.swap, *pair) for pair in combinations(range(count), 2)]
+        idle = 0
+        for _ in range(cycles):
+            for move in tries:
+                idle = 0 if move() else idle + 1
+                if idle == len(tries):
+                    return
+
+    def expand(self, alpha: int, pixels: NDArray[np.intp] | None = None) -> bool:
+        """Give label `alpha` to the best set of pixels; True if that lowers the energy.
+
+        Parameters
+        ----------
+        alpha : int
+        pixels : (n,) int, optional
+            Pixels that may switch, all by default.
+        """
+        if pixels is None:
+            pixels = np.flatnonzero(self.labels != alpha)
+        else:
+            pixels = pixels[self.labels[pixels] != alpha]
+        neighbours, weight, free = self._surroundings(pixels)
+        theirs = self.labels[neighbours]
+        unlike = theirs != self.labels[pixels]
+        half = unlike * weight / 2
+        link = weight - half
+        cost = self._cost(alpha, pixels)
+        known = np.where(theirs == alpha, -link, link)
+        excess = (
+            cost - self._data[pixels] - half.sum(axis=0) + np.where(free, 0, known).sum(axis=0)
+        )
+        if not (excess < 0).any():
+            return False
+        chosen = self._best(pixels, excess, neighbours, free, link, np.zeros(len(pixels), bool))
+        if chosen is None:
+            return False
+        self.labels[pixels[chosen]] = alpha
+        self._data[pixels[chosen]] = cost[chosen]
+        return True
+
+    def swap(self, alpha: int, beta: int) -> bool:
+        """Share out the pixels of labels `alpha` and `beta` anew; True if the energy falls."""
+        pixels = np.flatnonzero((self.labels == alpha) | (self.labels == beta))
+        if not pixels.size:
+            return False
+        neighbours, weight, free = self._surroundings(pixels)
+        costs = self._cost(alpha, pixels), self._cost(beta, pixels)
+        before = self.labels[pixels] == alpha
+        # Edges to other labels cost the same either way.
+        chosen = self._best(pixels, costs[0] - costs[1], neighbours, free, weight, before)
+        if chosen is None:
+            return False
+        self.labels[pixels] = np.where(chosen, alpha, beta)
+        self._data[pixels] = np.where(chosen, *costs)
+        return True
+
+    def _surroundings(
+        self, pixels: NDArray[np.intp]
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32], NDArray[np.bool_]]:
+        """Neighbours (4, n) of some pixels, the weights, and whether they are of the pixels."""
+        neighbours = pixels + self._offsets
+        weight = self._weight[:, pixels]
+        # Beyond the first and last row there is no pixel and the weight is 0.
+        np.clip(neighbours, 0, len(self.labels) - 1, out=neighbours)
+        self._position[pixels] = np.arange(len(pixels))
+        free = self._position[neighbours] >= 0
+        self._position[pixels] = -1
+        return neighbours, weight, free
+
+    def _best(
+        self,
+        pixels: NDArray[np.intp],
+        excess: NDArray[np.floating],
+        neighbours: NDArray[np.intp],
+        free: NDArray[np.bool_],
+        link: NDArray[np.float32],
+        before: NDArray[np.bool_],
+    ) -> NDArray[np.bool_] | None:
+        """Best choice of pixels for alpha, None where it is no better than the choice `before`.
+
+        `excess` is what alpha costs a pixel more than the other label, `link` what an edge costs
+        whose ends choose differently.
+        """
+        self._position[pixels] = np.arange(len(pixels))
+        # Each edge once: to the right and down.
+        once = free[:2] & (link[:2] > 0)
+        i = np.broadcast_to(np.arange(len(pixels)), once.shape)[once]
+        j = self._position[neighbours[:2][once]]
+        self._position[pixels] = -1
+        capacity = link[:2][once].astype(np.float64)
+        excess = excess.astype(np.float64)
+
+        def value(chosen: NDArray[np.bool_]) -> float:
+            return excess[chosen].sum() + capacity[chosen[i] != chosen[j]].sum()
+
+        chosen = minimum_cut(excess, i, j, capacity)
+        return chosen if value(chosen) < value(before) - ROUNDING else None
+
+
+def minimum_cut(
+    excess: NDArray[np.float64],
+    i: NDArray[np.integer],
+    j: NDArray[np.integer],
+    capacity: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Choice x (n,) bool that minimises sum excess x + sum capacity |x_i - x_j|.
+
+    Parameters
+    ----------
+    excess : (n,) float64
+        Cost of choosing a node, of either sign.
+    i, j : (m,) int
+        Ends of the edges.
+    capacity : (m,) float64
+        Cost of an edge whose ends are not chosen alike, not negative.
+    """
+    graph = maxflow.GraphFloat(len(excess), len(i))
+    nodes = graph.add_nodes(len(excess))
+    graph.add_grid_tedges(nodes, np.maximum(excess, 0), np.maximum(-excess, 0))
+    graph.add_edges(i, j, capacity, capacity)
+    graph.maxflow()
+    return graph.get_grid_segments(nodes)
 
 
 def minimise(
@@ -43,189 +229,8 @@ def minimise(
 
     Parameters and result as in `coarse_to_fine.minimise`.
     """
-    unary = angular_cost(normals, directions).reshape(len(directions), -1)
-    labelling = Labelling(
-        Graph.of_grid(horizontal, vertical, smoothness), unary, unary.argmin(axis=0)
-    )
-    labelling.minimise(cycles, moves)
-    return labelling.labels.reshape(normals.shape[:2])
-
-
-@dataclass(frozen=True, eq=False)
-class Graph:
-    """Sites joined by edges.
-
-    Attributes
-    ----------
-    size : int
-        Number of sites.
-    first, second : (M,) int32
-        Ends of the edges.
-    weight : (M,) float64
-        Cost of unlike labels at the ends, lambda u of eq. 5.1 and 5.3.
-    """
-
-    size: int
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    weight: NDArray[np.float64]
-
-    @classmethod
-    def of_grid(
-        cls,
-        horizontal: NDArray[np.floating],
-        vertical: NDArray[np.floating],
-        smoothness: float,
-        sites: NDArray[np.bool_] | None = None,
-    ) -> Graph:
-        """Graph of the pixels of an image, or of those where `sites` is True, in raster order.
-
-        Parameters
-        ----------
-        horizontal, vertical : (H, W-1), (H-1, W) float
-            Neighbourhood weights; edges of weight 0 are left out.
-        smoothness : float
-            Lambda.
-        sites : (H, W) bool, optional
-            Pixels to keep.
-        """
-        shape = len(horizontal), vertical.shape[1]
-        if sites is None:
-            sites = np.ones(shape, bool)
-        index = np.full(shape, -1, np.int32)
-        size = np.count_nonzero(sites)
-        index[sites] = np.arange(size, dtype=np.int32)
-        right = (horizontal > 0) & sites[:, :-1] & sites[:, 1:]
-        below = (vertical > 0) & sites[:-1] & sites[1:]
-        return cls(
-            size,
-            np.concatenate([index[:, :-1][right], index[:-1][below]]),
-            np.concatenate([index[:, 1:][right], index[1:][below]]),
-            smoothness * np.concatenate([horizontal[right], vertical[below]]).astype(np.float64),
-        )
-
-
-class Labelling:
-    """A labelling of a graph's sites under minimisation.
-
-    Parameters
-    ----------
-    graph : Graph
-    unary : (K, N) float
-        Data cost of every label at every site.
-    labels : (N,) int
-        Labelling to start from.
-
-    Attributes
-    ----------
-    labels : (N,) int
-    """
-
-    def __init__(
-        self, graph: Graph, unary: NDArray[np.floating], labels: NDArray[np.integer]
-    ) -> None:
-        self.graph = graph
-        self.unary = unary
-        self._adopt(labels.astype(np.intp))
-
-    def minimise(self, cycles: int, moves: str = 'expansion') -> None:
-        """Try the moves of all labels (listing 4.1) until none helps, at most `cycles` times.
-
-        Parameters
-        ----------
-        cycles : int
-            At most so many rounds of all moves.
-        moves : {'expansion', 'swap'}
-        """
-        count = len(self.unary)
-        for _ in range(cycles):
-            if moves == 'expansion':
-                helped = [self.expand(alpha) for alpha in range(count)]
-            else:
-                helped = [self.swap(*pair) for pair in combinations(range(count), 2)]
-            if not any(helped):
-                return
-
-    def expand(self, alpha: int) -> bool:
-        """Give label `alpha` to the best set of sites; True if that lowers the energy."""
-        graph, free = self.graph, self.labels != alpha
-        excess = self.unary[alpha] - self._staying
-        for inner, outer in ((graph.first, graph.second), (graph.second, graph.first)):
-            pulled = np.flatnonzero(free[inner] & ~free[outer])
-            excess -= np.bincount(inner[pulled], self._link[pulled], graph.size)
-        if not (excess[free] < 0).any():
-            return False
-        switched = self._best(free, excess, self._link, np.zeros(graph.size, bool))
-        if switched is None:
-            return False
-        self._adopt(np.where(switched, alpha, self.labels))
-        return True
-
-    def swap(self, alpha: int, beta: int) -> bool:
-        """Share out the sites of labels `alpha` and `beta` anew; True if the energy falls."""
-        before = self.labels == alpha
-        free = before | (self.labels == beta)
-        if not free.any():
-            return False
-        excess = np.subtract(self.unary[alpha], self.unary[beta], dtype=np.float64)
-        switched = self._best(free, excess, self.graph.weight, before)
-        if switched is None:
-            return False
-        self._adopt(np.where(switched, alpha, np.where(free, beta, self.labels)))
-        return True
-
-    def _best(
-        self,
-        free: NDArray[np.bool_],
-        excess: NDArray[np.float64],
-        link: NDArray[np.float64],
-        before: NDArray[np.bool_],
-    ) -> NDArray[np.bool_] | None:
-        """Best set of free sites to give alpha to; None where it is no better than `before`.
-
-        `excess` is what alpha costs a site more than the other choice, `link` what an edge costs
-        when its ends choose differently.
-        """
-        first, second = self.graph.first, self.graph.second
-        inner = np.flatnonzero(free[first] & free[second])
-        sites = np.flatnonzero(free)
-        index = np.empty(self.graph.size, np.intp)
-        index[sites] = np.arange(len(sites))
-        i, j = index[first[inner]], index[second[inner]]
-        excess, link, before = excess[sites], link[inner], before[sites]
-
-        def value(chosen: NDArray[np.bool_]) -> float:
-            return excess[chosen].sum() + link[chosen[i] != chosen[j]].sum()
-
-        chosen = _minimum_cut(excess, i, j, link)
-        if value(chosen) >= value(before) - ROUNDING:
-            return None
-        switched = np.zeros(self.graph.size, bool)
-        switched[sites] = chosen
-        return switched
-
-    def _adopt(self, labels: NDArray[np.intp]) -> None:
-        """Take over a labelling and what staying with it costs."""
-        graph = self.graph
-        self.labels = labels
-        unlike = labels[graph.first] != labels[graph.second]
-        self._link = np.where(unlike, graph.weight / 2, graph.weight)
-        half = self._link[unlike]
-        self._staying = self.unary[labels, np.arange(graph.size)].astype(np.float64)
-        for end in (graph.first, graph.second):
-            self._staying += np.bincount(end[unlike], half, graph.size)
-
-
-def _minimum_cut(
-    excess: NDArray[np.float64],
-    i: NDArray[np.intp],
-    j: NDArray[np.intp],
-    link: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """Set of sites x that minimises sum excess[x] + sum link[x_i != x_j], (N,) bool."""
-    graph = maxflow.GraphFloat(len(excess), len(i))
-    nodes = graph.add_nodes(len(excess))
-    graph.add_grid_tedges(nodes, np.maximum(excess, 0), np.maximum(-excess, 0))
-    graph.add_edges(i, j, link, link)
-    graph.maxflow()
-    return graph.get_grid_segments(nodes)
+    cost = AngularCost(normals, directions)
+    nearest = cost.nearest().reshape(normals.shape[:2])
+    labelling = Labelling(nearest, cost, horizontal, vertical, smoothness)
+    labelling.minimise(len(directions), cycles, moves)
+    return labelling.image

@@ -68,17 +68,12 @@ class Segmenter:
         watch.lap('normals')
         horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
         watch.lap('edges')
-        minimise = moves.minimise if config.exact else coarse_to_fine.minimise
-        labels = minimise(
-            normals,
-            self._directions,
-            horizontal,
-            vertical,
-            config.smoothness,
-            config.cycles,
-            config.moves,
-        )
-        data = angle(normals, self._directions.astype(np.float32)[labels])
+        problem = normals, self._directions, horizontal, vertical, config.smoothness
+        if config.exact:
+            labels = moves.minimise(*problem, config.cycles, config.moves)
+        else:
+            labels = coarse_to_fine.minimise(*problem, config.cycles)
+        data = angle(np.moveaxis(normals, 2, 0), self._directions.T.astype(np.float32)[:, labels])
         value = energy(data, labels, horizontal, vertical, config.smoothness)
         watch.lap('labels')
         regions = plane_regions(labels, image.valid, horizontal, vertical, config)
