@@ -131,7 +131,8 @@ def test_rooms_are_varied_and_in_range():
         frame = simulate_kinect(room, kinect_camera(160, 120), noise='none')
         depth = frame.depth[frame.depth > 0]
         assert depth.min() > 0.7 and depth.max() < 6
-        # 1000 pixels at 640x480.
+        # Floor and both walls are the first three faces; 1000 pixels at 640x480.
+        assert {0, 1, 2} <= {plane.face for plane in frame.planes if plane.count * 16 >= 1000}
         large.append(sum(plane.count * 16 >= 1000 for plane in frame.planes))
     assert min(large) >= 5 and 9 <= np.mean(large) <= 15
 

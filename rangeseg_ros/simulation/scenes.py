@@ -112,16 +112,16 @@ def curved_scene(seed: int, frames: int = 1) -> Scene:
 def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
     """Hand-held motion about a pose, smooth and seeded, at 30 frames per second.
 
-    Each of the six coordinates swings sinusoidally with its own period of 5 to 11 s, by up to
-    0.15 m and 8 degrees: at most about 0.2 m/s and 10 degrees/s per axis. The first pose is
-    `start`.
+    Each of the six coordinates swings sinusoidally with its own period of 3 to 6 s, by up to
+    0.3 m and 16 degrees from end to end: about 0.3 m/s and 15 degrees/s at the fastest. The first
+    pose is `start`.
     """
     random = np.random.default_rng([seed, 3])
-    period, phase = random.uniform(5, 11, 6), random.uniform(0, 2 * np.pi, 6)
-    amplitude = np.array([0.15, 0.15, 0.08, 4.0, 8.0, 2.0]) * random.uniform(0.6, 1, 6)
+    period, phase = random.uniform(3, 6, 6), random.uniform(0, 2 * np.pi, 6)
+    amplitude = np.array([0.15, 0.15, 0.08, 4.0, 8.0, 3.0]) * random.uniform(0.6, 1, 6)
     time = np.arange(frames)[:, None] / 30
     swing = np.sin(2 * np.pi * time / period + phase) - np.sin(phase)
-    shift, turn = np.split(amplitude * swing / 2, 2, axis=1)
+    shift, turn = np.split(amplitude * swing, 2, axis=1)
     turned = Rotation.from_euler('xyz', turn, degrees=True).as_matrix()
     return tuple(
         Pose(start.rotation @ rotation, start.position + offset)
@@ -140,15 +140,15 @@ class _Room:
         pitch = random.uniform(8, 20) + 12 * (self.height - 0.8)
         self.pose = Pose.looking((0, 0, self.height), 0, pitch, random.uniform(-4, 4))
         self.depth = random.uniform(3.0, 4.4)
+        # The corner to the left (1) or right (-1), the side wall not running away from the view.
         side = random.choice([-1, 1])
-        turn = np.radians(random.uniform(-25, 25))
-        corner = np.radians(random.uniform(80, 105))
+        turn = -side * np.radians(random.uniform(0, 25))
+        corner = np.radians(random.uniform(80, 100))
         back = np.array([-np.cos(turn), -np.sin(turn), 0])
         beside = np.array([-np.cos(turn + side * corner), -np.sin(turn + side * corner), 0])
-        # Through a point on the viewing axis, and through one beside it.
         self.walls = [
             half_space(back, (self.depth, 0, 0)),
-            half_space(beside, (2.2, side * random.uniform(0.9, 1.5), 0)),
+            half_space(beside, -random.uniform(0.9, 1.6) * beside),
         ]
         self.solids = [half_space((0, 0, 1), (0, 0, 0)), *self.walls]
         self.occupied: list[tuple[NDArray[np.float64], float]] = []
