@@ -4,8 +4,10 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from array import array
+from contextlib import contextmanager
 
 import numpy as np
 import rclpy
@@ -21,6 +23,7 @@ from rangeseg_ros.simulation.kinect import kinect_camera
 TYPES = {'labels': Image, 'planes': PointCloud2, 'markers': MarkerArray, 'overlay': Image}
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
 FRAME = 'camera_depth_optical_frame'
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -40,11 +43,12 @@ class Bench:
         self.camera = camera or kinect_camera(160, 120)
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
         command = command or [sys.executable, '-m', 'rangeseg_ros.ros.node']
+        self.inputs = set()
+        self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115
         self.process = subprocess.Popen(
             [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *arguments],
             start_new_session=True,
-            stderr=subprocess.PIPE,
-            text=True,
+            stderr=self.errors,
         )
         self.context = rclpy.Context()
         rclpy.init(context=self.context)
@@ -52,7 +56,9 @@ class Bench:
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
         self.name = f'{namespace}/segment_planes'.lstrip('/')
-        self.listen('diagnostics', '/diagnostics', DiagnosticArray)
+        self.node.create_subscription(
+            DiagnosticArray, '/diagnostics', self.received['diagnostics'].append, RELIABLE
+        )
         self.clients = {
             kind: self.node.create_client(kind, f'/{self.name}/{service}')
             for kind, service in (
@@ -60,19 +66,85 @@ class Bench:
                 (SetParametersAtomically, 'set_parameters_atomically'),
             )
         }
-        self.stamps = 0
 
-    def listen(self, name, topic=None, kind=None):
-        """Subscribe to an output of the node."""
-        return self.node.create_subscription(
-            kind or TYPES[name],
-            topic or f'/{self.name}/{name}',
-            self.received[name].append,
-            RELIABLE,
+    @contextmanager
+    def listening(self, *names):
+        """Subscribe to outputs of the node; afterwards it has let go of its inputs."""
+        subscriptions = [
+            self.node.create_subscription(
+                TYPES[name], f'/{self.name}/{name}', self.received[name].append, RELIABLE
+            )
+            for name in names
+        ]
+        try:
+            self.until(lambda: all(s.get_publisher_count() for s in subscriptions))
+            yield
+        finally:
+            for subscription in subscriptions:
+                self.node.destroy_subscription(subscription)
+        if not any(s.topic_name.startswith(f'/{self.name}/') for s in self.node.subscriptions):
+            for topic in self.inputs:
+                self.ignored(topic)
+
+    @contextmanager
+    def advertised(self, kind, topic, qos=RELIABLE):
+        """Advertise a topic; its publisher."""
+        publisher = self.node.create_publisher(kind, topic, qos)
+        try:
+            yield publisher
+        finally:
+            self.node.destroy_publisher(publisher)
+
+    @contextmanager
+    def camera_on(self, image_topic=DEPTH, info_topic=INFO, kind=Image, qos=RELIABLE):
+        """Advertise depth and camera_info, and wait for the subscriptions of the node."""
+        with (
+            self.advertised(kind, image_topic, qos) as self.depth,
+            self.advertised(CameraInfo, info_topic, qos) as self.camera_info,
+        ):
+            self.settled(image_topic, qos.reliability)
+            if kind is not PointCloud2:
+                self.settled(info_topic, qos.reliability)
+            yield
+
+    def settled(self, topic, reliability):
+        """Wait until the node subscribes with that reliability."""
+
+        def subscribed():
+            endpoints = self.node.get_subscriptions_info_by_topic(topic)
+            return [end.qos_profile.reliability for end in endpoints] == [reliability]
+
+        self.inputs.add(topic)
+        self.until(subscribed)
+        publishers = [p for p in self.node.publishers if p.topic_name == topic]
+        self.until(lambda: all(p.get_subscription_count() for p in publishers))
+
+    def ignored(self, topic):
+        """Wait until the node does not subscribe; one that has ended does not."""
+        self.until(
+            lambda: self.process.poll() is not None
+            or not self.node.get_subscriptions_info_by_topic(topic)
         )
 
-    def advertise(self, kind, topic, qos=RELIABLE):
-        return self.node.create_publisher(kind, topic, qos)
+    def segment(self, image=None, info=None):
+        """Publish an image with its camera_info; the labels (H, W) that come back."""
+        image = image or self.image()
+        self.camera_info.publish(info or self.info())
+        self.depth.publish(image)
+        return self.labels_of(image)
+
+    def stream(self):
+        """Publish images until one comes back, as best effort has no promise for the first."""
+
+        def answer():
+            sent.append(self.image())
+            self.camera_info.publish(self.info())
+            self.depth.publish(sent[-1])
+            self.spin(0.1)
+            return next((image for image in sent if self.find('labels', image)), None)
+
+        sent = []
+        return self.labels_of(self.until(answer))
 
     def spin(self, seconds):
         self.until(lambda: False, seconds, required=False)
@@ -112,12 +184,14 @@ class Bench:
         return message
 
     def labels_of(self, image):
-        """The label image of an image that was published."""
-        return self.until(
-            lambda: next(
-                (m for m in self.received['labels'] if m.header.stamp == image.header.stamp), None
-            )
-        )
+        """Labels (H, W) of an image that was published."""
+        message = self.until(lambda: self.find('labels', image))
+        return np.frombuffer(message.data, np.uint16).reshape(message.height, message.width)
+
+    def find(self, name, image):
+        """The message of an output with the stamp of an image; None when it is not there."""
+        stamp = image.header.stamp
+        return next((m for m in self.received[name] if m.header.stamp == stamp), None)
 
     def status(self, condition):
         """The first diagnostic status from now on that satisfies the condition."""
@@ -143,19 +217,35 @@ class Bench:
         return future.result().result if atomically else future.result().results
 
     def complaints(self):
-        return f'node has ended with {self.process.poll()}' if self.process.poll() else ''
+        """What there is to know when the node does not do what it should."""
+        report = self.received['diagnostics'][-1:]
+        return f'exit code {self.process.poll()}, {report}\n{self.log()}'
+
+    def log(self):
+        """What the node has written to stderr."""
+        self.errors.seek(0)
+        return self.errors.read()
+
+    def interrupt(self):
+        """Press Ctrl-C."""
+        os.killpg(self.process.pid, signal.SIGINT)
 
     def close(self):
-        """Stop the node; its exit code and what it wrote to stderr."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, signal.SIGINT)
+        """Stop the node, which must end well."""
         try:
-            _, errors = self.process.communicate(timeout=20)
-        except subprocess.TimeoutExpired:
-            os.killpg(self.process.pid, signal.SIGKILL)
-            raise
+            if self.process.poll() is None:
+                self.interrupt()
+            code = self.process.wait(timeout=20)
         finally:
+            if self.process.poll() is None:
+                os.killpg(self.process.pid, signal.SIGKILL)
             self.executor.shutdown()
             self.node.destroy_node()
             rclpy.try_shutdown(context=self.context)
-        return self.process.returncode, errors
+        assert code == 0 and 'Traceback' not in self.log(), f'exit code {code}: {self.log()}'
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *exception):
+        self.close()

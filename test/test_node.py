@@ -1,34 +1,248 @@
 """The node over real DDS: what it publishes, when, and by which quality of service."""
 
+import struct
+from array import array
+from contextlib import contextmanager
+
+import cv2
 import numpy as np
 import pytest
 
 pytest.importorskip('rclpy')
 
-from ros_bench import Bench
-from sensor_msgs.msg import CameraInfo, Image
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.qos import ReliabilityPolicy
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
+
+from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
+from rangeseg_ros.drawing import overlay
 
 
 @pytest.fixture(scope='module')
-def bench():
-    bench = Bench()
-    bench.depth = bench.advertise(Image, '/depth/image_rect')
-    bench.camera_info = bench.advertise(CameraInfo, '/depth/camera_info')
-    yield bench
-    code, errors = bench.close()
-    assert code == 0 and 'Traceback' not in errors, errors
+def node():
+    with Bench() as bench:
+        yield bench
 
 
-def test_labels_have_the_header_and_the_size_of_the_depth_image(bench):
-    bench.listen('labels')
-    bench.until(lambda: bench.depth.get_subscription_count())
-    bench.until(lambda: bench.camera_info.get_subscription_count())
-    bench.camera_info.publish(bench.info())
+@pytest.fixture
+def bench(node):
+    """The node with a listener for its labels and a reliable camera."""
+    with node.listening('labels'), node.camera_on():
+        yield node
+
+
+@pytest.fixture(scope='module')
+def expected(node):
+    """Labels of the core for the image that the bench publishes by default."""
+    image = RangeImage.from_depth(corner_depth(node.camera), node.camera)
+    labels = Segmenter(Config()).segment(image).labels
+    # Two walls: were the core to find none, the tests below would say little.
+    assert len(set(labels.ravel()) - {0}) == 2
+    return labels
+
+
+def test_labels_are_those_of_the_core_under_the_header_of_the_image(bench, expected):
     image = bench.image()
-    bench.depth.publish(image)
-    labels = bench.labels_of(image)
-    assert labels.header == image.header
-    assert (labels.height, labels.width, labels.step) == (120, 160, 320)
-    assert labels.encoding == 'mono16' and labels.is_bigendian == 0
-    values = np.frombuffer(labels.data, np.uint16)
-    assert values.shape == (160 * 120,)
+    np.testing.assert_array_equal(bench.segment(image), expected)
+    message = bench.find('labels', image)
+    assert message.header == image.header
+    assert (message.encoding, message.is_bigendian, message.step) == ('mono16', 0, 320)
+
+
+def test_planes_are_the_walls(bench):
+    image = bench.image()
+    with bench.listening('planes'):
+        labels = bench.segment(image)
+        message = bench.until(lambda: bench.find('planes', image))
+    assert message.header == image.header
+    planes = np.sort(planes_from_message(message), order='normal_x')
+    # The walls are z = 2 - |x| metres, seen from the origin; depth is rounded to millimetres.
+    half = np.sqrt(0.5)
+    normals = np.column_stack([planes[f'normal_{axis}'] for axis in 'xyz'])
+    np.testing.assert_allclose(normals, [(-half, 0, -half), (half, 0, -half)], atol=2e-3)
+    np.testing.assert_allclose(planes['distance'], 2 * half, atol=2e-3)
+    for plane in planes:
+        assert plane['count'] == np.count_nonzero(labels == plane['label'])
+
+
+def test_markers_and_overlay(bench):
+    image = bench.image()
+    with bench.listening('markers', 'overlay'):
+        bench.segment(image)
+        picture = bench.until(lambda: bench.find('overlay', image))
+        markers = bench.until(lambda: bench.received['markers'])[-1].markers
+    depth = RangeImage.from_depth(corner_depth(bench.camera), bench.camera)
+    result = Segmenter(Config()).segment(depth)
+    np.testing.assert_array_equal(
+        np.frombuffer(picture.data, np.uint8).reshape(120, 160, 3),
+        overlay(depth.inverse, result.labels, result.planes),
+    )
+    assert markers[0].action == markers[0].DELETEALL
+    assert sum(marker.ns == 'normals' for marker in markers) == 2
+    assert {marker.header.frame_id for marker in markers} == {image.header.frame_id}
+
+
+def test_nothing_is_subscribed_while_nobody_listens(node):
+    node.ignored(DEPTH)
+    node.ignored(INFO)
+    status = node.status(lambda status: 'idle' in status.message)
+    assert status.level == DiagnosticStatus.OK
+    with node.listening('overlay'):
+        node.until(lambda: node.node.count_subscribers(DEPTH))
+    node.ignored(DEPTH)
+
+
+def test_reliability_follows_the_publishers(node, expected):
+    with node.listening('labels'):
+        with node.camera_on(qos=BEST_EFFORT):
+            np.testing.assert_array_equal(node.stream(), expected)
+        with node.camera_on():
+            np.testing.assert_array_equal(node.segment(), expected)
+            with node.advertised(Image, DEPTH, BEST_EFFORT):
+                node.settled(DEPTH, ReliabilityPolicy.BEST_EFFORT)
+                np.testing.assert_array_equal(node.stream(), expected)
+            node.settled(DEPTH, ReliabilityPolicy.RELIABLE)
+            np.testing.assert_array_equal(node.segment(), expected)
+
+
+@pytest.mark.parametrize('order', '<>')
+@pytest.mark.parametrize('padding', [0, 6])
+@pytest.mark.parametrize('encoding', ['16UC1', 'mono16', '32FC1'])
+def test_encodings_byte_orders_and_padding(bench, expected, encoding, padding, order):
+    depth = corner_depth(bench.camera)
+    if encoding == '32FC1':
+        depth = (depth * np.float64(0.001)).astype(np.float32)
+    stored = depth.astype(depth.dtype.newbyteorder(order))
+    rows = np.pad(stored.view(np.uint8), ((0, 0), (0, padding)), constant_values=255)
+    labels = bench.segment(
+        bench.image(
+            depth,
+            encoding,
+            data=array('B', rows.tobytes()),
+            step=rows.shape[1],
+            is_bigendian=int(order == '>'),
+        )
+    )
+    # Metres as floats differ from millimetres in the last bit.
+    different = 0 if depth.dtype == np.uint16 else 10
+    assert np.count_nonzero(labels != expected) <= different
+
+
+@contextmanager
+def input_of(node, source):
+    """Read another kind of input for a while."""
+    assert node.set_parameters(input=source)[0].successful
+    yield
+    assert node.set_parameters(input='image')[0].successful
+
+
+def test_compressed_depth(node, expected):
+    png = cv2.imencode('.png', corner_depth(node.camera))[1].tobytes()
+    message = CompressedImage(header=node.header(), format='16UC1; compressedDepth png')
+    message.data = array('B', struct.pack('<iff', 0, 0.0, 0.0) + png)
+    with (
+        node.listening('labels'),
+        input_of(node, 'compressed_depth'),
+        node.camera_on(f'{DEPTH}/compressedDepth', kind=CompressedImage),
+    ):
+        np.testing.assert_array_equal(node.segment(message), expected)
+
+
+def test_organised_cloud(node, expected):
+    points = RangeImage.from_depth(corner_depth(node.camera), node.camera).points
+    message = PointCloud2(header=node.header(), height=120, width=160, point_step=12)
+    message.row_step = 160 * 12
+    message.fields = [
+        PointField(name=name, offset=4 * index, datatype=PointField.FLOAT32, count=1)
+        for index, name in enumerate('xyz')
+    ]
+    message.data = array('B', points.tobytes())
+    with (
+        node.listening('labels'),
+        input_of(node, 'points'),
+        node.camera_on('/depth/points', kind=PointCloud2),
+    ):
+        found = node.segment(message)
+    assert len(set(found.ravel()) - {0}) == 2
+    # By range along unit rays instead of depth, thresholds are met by other pixels at the crease.
+    assert np.mean((found > 0) == (expected > 0)) > 0.95
+
+
+def test_diagnostics_tell_where_the_time_goes(bench):
+    image = bench.image()
+    bench.segment(image)
+    status = bench.status(lambda status: status.message.startswith('2 planes'))
+    assert status.level == DiagnosticStatus.OK
+    assert status.name == 'segment_planes: segmentation' and status.hardware_id == DEPTH
+    values = {value.key: value.value for value in status.values}
+    parts = ('transport', 'waiting', 'conversion', 'compute', 'publication')
+    times = [float(values[f'{part} (ms)']) for part in parts]
+    assert min(times) >= 0 and sum(times) == pytest.approx(float(values['latency (ms)']), abs=0.05)
+    stages = [float(values[key]) for key in values if key.startswith('compute: ')]
+    assert stages and sum(stages) <= times[3] + 0.05
+    counts = [int(values[f'frames {what}']) for what in ('received', 'published')]
+    assert counts[0] >= counts[1] > 0
+
+
+def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
+    """Of frames that come during a long computation only the newest is segmented."""
+    dropped = 'frames dropped for newer ones'
+    assert bench.set_parameters(exact=True)[0].successful
+    images = [bench.image() for _ in range(5)]
+    bench.camera_info.publish(bench.info())
+    bench.depth.publish(images[0])
+    bench.spin(0.5)
+    for image in images[1:]:
+        bench.depth.publish(image)
+    # The answer comes while the first frame is being computed.
+    assert bench.set_parameters(exact=False)[0].successful
+    assert not bench.find('labels', images[0])
+    np.testing.assert_array_equal(bench.labels_of(images[4]), expected)
+    assert bench.find('labels', images[0])
+    assert not any(bench.find('labels', image) for image in images[1:4])
+    bench.status(lambda status: {v.key: v.value for v in status.values}[dropped] == '3')
+
+
+def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
+    assert bench.set_parameters(min_pixels=160 * 120)[0].successful
+    assert not bench.segment().any()
+    status = bench.status(lambda status: status.message.startswith('no planes'))
+    assert status.level == DiagnosticStatus.WARN and len(status.message) > len('no planes: ')
+    assert bench.set_parameters(min_pixels=250)[0].successful
+    np.testing.assert_array_equal(bench.segment(), expected)
+
+
+def test_bad_parameters_are_refused_with_the_reason(bench, expected):
+    (result,) = bench.set_parameters(method='magic')
+    assert not result.successful and 'method' in result.reason and 'planes' in result.reason
+    (result,) = bench.set_parameters(smoothness=-1.0)
+    assert not result.successful and 'smoothness' in result.reason
+    result = bench.set_parameters(atomically=True, min_pixels=160 * 120, method='magic')
+    assert not result.successful and 'method' in result.reason
+    np.testing.assert_array_equal(bench.segment(), expected)
+
+
+def test_namespace_and_remapping_take_the_camera_info_along(expected):
+    topics = '/robot/camera/depth/image_raw', '/robot/camera/depth/camera_info'
+    with (
+        Bench('-r', 'depth/image_rect:=camera/depth/image_raw', namespace='robot') as bench,
+        bench.listening('labels'),
+        bench.camera_on(*topics),
+    ):
+        np.testing.assert_array_equal(bench.segment(), expected)
+
+
+def test_camera_info_may_be_remapped_and_reliability_overridden(expected):
+    depth_topic, info_topic = f'/robot{DEPTH}', '/calibration/camera_info'
+    override = f'qos_overrides.{depth_topic}.subscription.reliability:=best_effort'
+    remapping = f'depth/camera_info:={info_topic}'
+    with (
+        Bench('-r', remapping, '-p', override, namespace='robot') as bench,
+        bench.listening('labels'),
+        bench.advertised(Image, depth_topic) as bench.depth,
+        bench.advertised(CameraInfo, info_topic) as bench.camera_info,
+    ):
+        bench.settled(info_topic, ReliabilityPolicy.RELIABLE)
+        np.testing.assert_array_equal(bench.stream(), expected)
+        bench.settled(depth_topic, ReliabilityPolicy.BEST_EFFORT)

@@ -14,7 +14,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -101,7 +100,7 @@ class SegmentPlanes(Node):
             # Whatever one frame does to the segmenter, the next one gets its chance.
             except Exception as error:
                 if not self.context.ok():
-                    return
+                    return  # publishing has ended
                 self._refuse(f'{type(error).__name__}: {error}')
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
 
@@ -159,15 +158,17 @@ def main() -> None:
         sys.exit(2)
     try:
         rclpy.spin(node)
-    except ExternalShutdownException:
-        pass
+    except Exception:
+        # The signal ends the context between any two steps of rclpy.
+        if rclpy.ok():
+            raise
     finally:
         finished = node.stop(patience=2.0)
-    if not finished:
-        # No thread may outlive the interpreter inside a solver that takes minutes.
-        os._exit(0)
     node.destroy_node()
     rclpy.try_shutdown()
+    if not finished:
+        # A thread inside a solver that takes minutes may not outlive the interpreter.
+        os._exit(0)
 
 
 if __name__ == '__main__':

@@ -67,8 +67,11 @@ class MatchedSubscription:
 
     def _create(self) -> Subscription:
         kind, topic, callback = self._arguments
-        resolved = self._node.resolve_topic_name(topic)
-        self._offered = self._best_offered(resolved)
+        # While nobody publishes, what fits any publisher.
+        self._offered = self._best_offered(self._node.resolve_topic_name(topic)) or (
+            ReliabilityPolicy.BEST_EFFORT,
+            DurabilityPolicy.VOLATILE,
+        )
         self._overridden = True
 
         def choose(qos: QoSProfile) -> SetParametersResult:
@@ -86,18 +89,21 @@ class MatchedSubscription:
             qos_overriding_options=QoSOverridingOptions.with_default_policies(callback=choose),
         )
 
-    def _best_offered(self, topic: str) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
-        """The strictest policies that fit every publisher, of none those that fit any."""
+    def _best_offered(self, topic: str) -> tuple[ReliabilityPolicy, DurabilityPolicy] | None:
+        """The strictest policies that fit every publisher; None when there is none."""
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-        return (
-            ReliabilityPolicy.RELIABLE if offers and reliable else ReliabilityPolicy.BEST_EFFORT,
-            DurabilityPolicy.TRANSIENT_LOCAL if offers and latched else DurabilityPolicy.VOLATILE,
+        best = (
+            ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
+        return best if offers else None
 
     def _follow_publishers(self, event: Any) -> None:
-        if not self._overridden and self._best_offered(self.topic) != self._offered:
+        # A topic that has lost its last publisher keeps its policies for when that comes back.
+        best = self._best_offered(self.topic)
+        if best and best != self._offered and not self._overridden:
             self.destroy()
             self._subscription = self._create()
 

@@ -1,0 +1,115 @@
+"""`rangeseg play`: recordings to live topics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+from rosbags.interfaces import Connection
+from rosbags.rosbag2 import Reader
+
+from rangeseg_ros.cli import options
+
+
+@click.command()
+@click.argument('bag', type=click.Path(exists=True, path_type=Path))
+@click.option(
+    '--rate',
+    type=click.FloatRange(min=0, min_open=True),
+    default=1.0,
+    show_default=True,
+    help='Speed: 2 plays twice as fast as recorded.',
+)
+@click.option('--loop', is_flag=True, help='Start again at the end, until interrupted.')
+@click.option(
+    '--delay',
+    type=click.FloatRange(min=0),
+    default=1.0,
+    show_default=True,
+    help='Seconds before the first message, for subscribers to find the topics.',
+)
+def command(bag: Path, rate: float, loop: bool, delay: float) -> None:
+    """Publish the messages of a rosbag2 on their topics, timed as they were recorded.
+
+    Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort.
+    """
+    try:
+        import rclpy
+        from rclpy.duration import Duration
+        from rclpy.signals import SignalHandlerOptions
+    except ImportError:
+        raise click.ClickException(
+            'play needs rclpy: source a ROS 2 installation, or install the extra jazzy'
+        ) from None
+    try:
+        reader = Reader(bag)
+        reader.open()
+    # Readers meet damaged bytes with exceptions of every kind.
+    except Exception as error:
+        raise click.ClickException(f'{bag}: not a readable rosbag2: {error}') from None
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node('rangeseg_play')
+    try:
+        publishers = _publishers(node, reader.connections)
+        if not publishers:
+            raise click.ClickException(f'{bag}: no message of a known type')
+        time.sleep(delay)
+        while True:
+            for publish, data in options.progress(
+                _timed(reader, publishers, rate), reader.message_count, 'message'
+            ):
+                publish(data)
+            if not loop:
+                break
+        for publisher in node.publishers:
+            publisher.wait_for_all_acked(Duration(seconds=2))
+    finally:
+        reader.close()
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _publishers(node: Any, connections: list[Connection]) -> dict[str, Callable[[bytes], None]]:
+    """Publishing functions of the topics whose message classes are installed."""
+    from rangeseg_ros.ros.messages import message_class
+
+    publishers = {}
+    for connection in connections:
+        try:
+            kind = message_class(connection.msgtype)
+        except (ImportError, AttributeError):
+            click.echo(f'{connection.topic}: {connection.msgtype} is not installed, left out')
+            continue
+        if connection.topic not in publishers:
+            publisher = node.create_publisher(kind, connection.topic, _qos(connection))
+            publishers[connection.topic] = publisher.publish
+    return publishers
+
+
+def _qos(connection: Connection) -> Any:
+    """Quality of service that the recorded publishers offered."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    offers: Any = getattr(connection.ext, 'offered_qos_profiles', [])
+    best_effort = any(offer.reliability.name == 'BEST_EFFORT' for offer in offers)
+    latched = any(offer.durability.name == 'TRANSIENT_LOCAL' for offer in offers)
+    return QoSProfile(
+        depth=10,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _timed(
+    reader: Reader, publishers: dict[str, Callable[[bytes], None]], rate: float
+) -> Iterator[tuple[Callable[[bytes], None], bytes]]:
+    """Publishing functions and contents of the messages, each when it is due."""
+    start = time.monotonic()
+    wanted = [c for c in reader.connections if c.topic in publishers]
+    for connection, stamp, data in reader.messages(wanted):
+        due = start + (stamp - reader.start_time) / 1e9 / rate
+        time.sleep(max(0.0, due - time.monotonic()))
+        yield publishers[connection.topic], bytes(data)

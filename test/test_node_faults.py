@@ -1,0 +1,217 @@
+"""Faults the node must survive, over real DDS: the next good frame is segmented."""
+
+import time
+from array import array
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth
+from sensor_msgs.msg import CameraInfo, Image
+
+from rangeseg_ros.simulation.kinect import kinect_camera
+
+
+@pytest.fixture(scope='module')
+def node():
+    with Bench('-p', 'stall_timeout:=3.0') as bench:
+        yield bench
+
+
+@pytest.fixture
+def bench(node):
+    """The node with a listener for its labels and a reliable camera."""
+    with node.listening('labels'), node.camera_on():
+        yield node
+
+
+def assert_segments(bench):
+    """The next good frame shows the two walls."""
+    assert len(set(bench.segment().ravel()) - {0}) == 2
+
+
+def error_about(bench, words):
+    """Wait for an error of the diagnostics that says so."""
+    bench.status(lambda status: status.level == DiagnosticStatus.ERROR and words in status.message)
+
+
+def test_camera_info_that_comes_late_or_never(bench):
+    for _ in range(20):
+        bench.depth.publish(bench.image())
+        bench.spin(0.02)
+    waiting = bench.image()
+    bench.depth.publish(waiting)
+    error_about(bench, f'no camera_info on {INFO}')
+    assert bench.log().count('no camera_info') == 1, 'the warning is not throttled'
+    assert not bench.received['labels']
+    bench.camera_info.publish(bench.info())
+    assert bench.labels_of(waiting).any()
+    assert_segments(bench)
+
+
+@pytest.mark.parametrize('focal', [0.0, float('nan'), -500.0, float('inf')])
+def test_impossible_focal_length(bench, focal):
+    bench.camera_info.publish(bench.info(k=[focal, 0.0, 80.0, 0.0, focal, 60.0, 0.0, 0.0, 1.0]))
+    bench.spin(0.1)
+    bench.depth.publish(bench.image())
+    error_about(bench, 'unusable camera_info')
+    assert_segments(bench)
+
+
+def test_camera_info_of_another_size(bench):
+    assert_segments(bench)
+    bench.camera_info.publish(bench.info(kinect_camera(320, 240)))
+    bench.spin(0.1)
+    bench.depth.publish(bench.image())
+    error_about(bench, '320x240')
+    assert_segments(bench)
+
+
+@pytest.mark.parametrize(
+    'fields, words',
+    [
+        ({'encoding': 'rgb8'}, 'rgb8'),
+        ({'encoding': ''}, "encoding ''"),
+        ({'data': array('B', bytes(1000))}, '1000 bytes'),
+        ({'data': array('B')}, '0 bytes'),
+        ({'step': 100}, 'step'),
+        ({'step': 2**32 - 1}, '4294967295'),
+        ({'width': 161}, '161x120'),
+        ({'width': 0, 'height': 0}, '0x0'),
+        ({'height': 2**32 - 1}, '4294967295'),
+    ],
+)
+def test_malformed_image(bench, fields, words):
+    bench.camera_info.publish(bench.info())
+    bench.spin(0.1)
+    bench.depth.publish(bench.image(**fields))
+    error_about(bench, words)
+    assert_segments(bench)
+
+
+@pytest.mark.parametrize(
+    'depth',
+    [
+        np.zeros((120, 160), np.uint16),
+        np.full((120, 160), np.nan, np.float32),
+        np.full((120, 160), np.inf, np.float32),
+        np.full((120, 160), -1, np.float32),
+    ],
+)
+def test_frame_without_valid_depth(bench, depth):
+    encoding = '16UC1' if depth.dtype == np.uint16 else '32FC1'
+    assert not bench.segment(bench.image(depth, encoding)).any()
+    bench.status(lambda status: status.message == 'no planes: no valid depth')
+    assert_segments(bench)
+
+
+def test_some_values_are_not_finite(bench):
+    depth = (corner_depth(bench.camera) / 1000).astype(np.float32)
+    depth[20:30, 20:30] = np.nan
+    depth[60:70, 20:30] = np.inf
+    depth[20:30, 100:110] = -np.inf
+    depth[60:70, 100:110] = -1
+    labels = bench.segment(bench.image(depth, '32FC1'))
+    assert not labels[~(np.isfinite(depth) & (depth > 0))].any()
+    assert len(set(labels.ravel()) - {0}) == 2
+
+
+def test_size_and_encoding_change_in_midstream(bench):
+    for width, height, encoding in [
+        (160, 120, '16UC1'),
+        (212, 121, '32FC1'),
+        (1, 1, '16UC1'),
+        (106, 60, 'mono16'),
+        (160, 120, '32FC1'),
+    ]:
+        camera = kinect_camera(width, height)
+        depth = corner_depth(camera)
+        if encoding == '32FC1':
+            depth = (depth / 1000).astype(np.float32)
+        labels = bench.segment(bench.image(depth, encoding), bench.info(camera))
+        assert labels.shape == (height, width)
+        assert len(set(labels.ravel()) - {0}) == (0 if width == 1 else 2)
+
+
+def test_publisher_goes_and_comes_back(node):
+    with node.listening('labels'):
+        with node.camera_on():
+            assert_segments(node)
+        error_about(node, 'no depth message')
+        with node.camera_on(qos=BEST_EFFORT):
+            assert node.stream().any()
+        with node.camera_on():
+            assert_segments(node)
+
+
+def test_subscriber_joins_late(node):
+    with (
+        node.advertised(Image, DEPTH) as node.depth,
+        node.advertised(CameraInfo, INFO) as node.camera_info,
+    ):
+        for _ in range(10):
+            node.camera_info.publish(node.info())
+            node.depth.publish(node.image())
+            node.spin(0.05)
+        with node.listening('labels'):
+            node.settled(DEPTH, node.depth.qos_profile.reliability)
+            node.settled(INFO, node.depth.qos_profile.reliability)
+            assert_segments(node)
+
+
+def test_parameters_change_at_10_hz(bench):
+    before = len(bench.received['labels'])
+    for index in range(30):
+        bench.camera_info.publish(bench.info())
+        bench.depth.publish(bench.image())
+        values = {'smoothness': 20.0 + index, 'cycles': 1 + index % 3, 'exact': False}
+        assert bench.set_parameters(atomically=True, **values).successful
+        bench.spin(0.1)
+    assert len(bench.received['labels']) > before + 10
+    assert_segments(bench)
+
+
+def test_lost_images_are_noticed(node):
+    """Best-effort images over the default shared-memory segment of Fast DDS get lost."""
+    camera = kinect_camera(640, 480)
+    image = node.image(corner_depth(camera))
+    with node.listening('labels'), node.camera_on(qos=BEST_EFFORT):
+        info = node.info(camera)
+
+        def lossy():
+            node.camera_info.publish(info)
+            node.depth.publish(image)
+            node.spin(0.03)
+            report = node.received['diagnostics'][-1].status[0]
+            return report.level == DiagnosticStatus.WARN and 'lost on' in report.message
+
+        node.until(lossy)
+        assert 'fastdds_large_images.xml' in node.received['diagnostics'][-1].status[0].message
+    with node.listening('labels'), node.camera_on():
+        assert_segments(node)
+
+
+@pytest.mark.parametrize('presses', [1, 2])
+def test_interrupted_during_a_computation(presses):
+    with Bench('-p', 'exact:=true', camera=kinect_camera(320, 240), namespace='busy') as bench:
+        topics = f'/busy{DEPTH}', f'/busy{INFO}'
+        with bench.listening('labels'), bench.camera_on(*topics):
+            bench.camera_info.publish(bench.info())
+            bench.depth.publish(bench.image())
+            bench.spin(1.0)
+            assert not bench.received['labels'], 'the computation is over'
+            for _ in range(presses):
+                bench.interrupt()
+                time.sleep(0.05)
+            assert bench.process.wait(timeout=20) == 0
+
+
+def test_bad_parameter_at_the_start_ends_with_one_line():
+    bench = Bench('-p', 'method:=magic', namespace='wrong')
+    assert bench.process.wait(timeout=20) == 2
+    assert bench.log().strip().count('\n') == 0 and 'method' in bench.log()
+    with pytest.raises(AssertionError, match='exit code 2'):
+        bench.close()
