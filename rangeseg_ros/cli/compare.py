@@ -7,9 +7,15 @@ from pathlib import Path
 import click
 
 from rangeseg_ros.cli import measures, options
-from rangeseg_ros.evaluation.figures import compared, table
+from rangeseg_ros.evaluation.figures import Compared, compared, table
 from rangeseg_ros.evaluation.hoover import ComparisonError
-from rangeseg_ros.evaluation.label_files import as_truth, pair_files, read_label_image
+from rangeseg_ros.evaluation.label_files import (
+    as_truth,
+    pair_files,
+    read_angles_beside,
+    read_label_image,
+    read_normals_beside,
+)
 
 
 @click.command(cls=measures.ToleranceCommand)
@@ -37,18 +43,23 @@ def command(
     regions from 10) or PNGs (0 = none). A ground truth with the label 65535, judged not to be
     planar, is compared over its judged pixels only: there 0 means not judged.
 
+    Angles are compared where a .gt-ang lies beside the truth and a .ms-nor beside the
+    segmentation.
+
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`
     (mean_iou and pixel_accuracy over all regions and pixels), and each image in `per_image`.
     """
-    overlaps = {}
+    images = {}
     pairs = pair_files(truth, labels)
     for name, (truth_file, labels_file) in options.progress(pairs.items(), len(pairs), 'image'):
         known = as_truth(read_label_image(truth_file), min_pixels)
         try:
-            overlaps[name] = known.compare(read_label_image(labels_file))
+            overlap = known.compare(read_label_image(labels_file))
         except ComparisonError as error:
             raise ComparisonError(f'{labels_file}: {error}') from None
-    figures = compared(overlaps, tolerances)
+        angles, normals = read_angles_beside(truth_file), read_normals_beside(labels_file)
+        images[name] = Compared(overlap, angles, normals)
+    figures = compared(images, tolerances)
     click.echo(table(figures))
     if json_file:
         measures.write_json(json_file, figures)

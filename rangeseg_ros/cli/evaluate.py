@@ -70,7 +70,7 @@ def command(
     ]
     if not cases:
         raise click.ClickException(f'{folder}: no {split} images')
-    tasks = [Task(case, config, pictures=output) for case in cases]
+    tasks = [Task(case, config, output=output) for case in cases]
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
     figures = evaluated(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')

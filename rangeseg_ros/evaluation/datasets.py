@@ -19,13 +19,13 @@ from rangeseg_ros.evaluation.label_files import (
     EvaluationError,
     Truth,
     as_truth,
+    read_angles_beside,
     read_label_image,
 )
 from rangeseg_ros.evaluation.segcomp import (
     FIRST_REGION,
     RegionAngle,
     SegcompError,
-    read_angles,
     read_perceptron,
     read_raster,
 )
@@ -120,13 +120,7 @@ class SegcompCase(Case):
         else:
             image = perceptron_range_image(read_perceptron(self.image))
         truth = Truth(read_label_image(self.truth), None)
-        angle_file = self.truth.with_suffix('.gt-ang')
-        shift = FIRST_REGION - 1
-        angles = [
-            RegionAngle(a - shift, b - shift, degrees)
-            for a, b, degrees in (read_angles(angle_file) if angle_file.exists() else [])
-        ]
-        return Sample(image, truth, angles, {})
+        return Sample(image, truth, read_angles_beside(self.truth), {})
 
 
 @dataclass(frozen=True)

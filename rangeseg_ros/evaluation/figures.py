@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rangeseg_ros.evaluation.hoover import (
+    Classification,
     Overlap,
     angle_errors,
     classify,
@@ -21,58 +23,79 @@ TOLERANCES = (0.51, 0.6, 0.7, 0.8, 0.9, 0.95)
 COUNTS = ('regions', 'correct', 'over', 'under', 'missed', 'noise')
 
 
-def compared(overlaps: Mapping[str, Overlap], tolerances: Sequence[float]) -> dict[str, Any]:
+class Compared(NamedTuple):
+    """An image to make figures of.
+
+    Attributes
+    ----------
+    overlap : Overlap
+        Of truth and segmentation.
+    angles : sequence of (label, label, degrees)
+        Angles between regions of the truth, where known.
+    normals : mapping of label to (3,)
+        Normals of the segmentation's regions, where known.
+    """
+
+    overlap: Overlap
+    angles: Sequence[tuple[int, int, float]] = ()
+    normals: Mapping[int, Any] = MappingProxyType({})
+
+
+def compared(images: Mapping[str, Compared], tolerances: Sequence[float]) -> dict[str, Any]:
     """Figures of one or more images.
 
     Returns
     -------
     dict
         `images`, their number; `tolerances`, for each tolerance the sums of the counts over the
-        images, with `mean_iou` and `pixel_accuracy` over all their regions and pixels (which do
-        not depend on the tolerance); `precision` and `recall` at intersection over union 0.8;
-        `per_image`, the same for each image.
+        images, `mean_iou` and `pixel_accuracy` over all their regions and pixels (which do not
+        depend on the tolerance), and where angles are known `angle_mean` and `angle_std`,
+        degrees, of an image's errors, averaged over the images; `precision` and `recall` at
+        intersection over union 0.8; `per_image`, the same for each image.
     """
-    figures = _figures(list(overlaps.values()), tolerances)
-    single = {name: _figures([overlap], tolerances) for name, overlap in overlaps.items()}
-    return {'images': len(overlaps), **figures, 'per_image': single}
+    figures = _figures(list(images.values()), tolerances)
+    single = {name: _figures([image], tolerances) for name, image in images.items()}
+    return {'images': len(images), **figures, 'per_image': single}
 
 
 def evaluated(measurements: Sequence[Measurement], tolerances: Sequence[float]) -> dict[str, Any]:
-    """Figures of `compared`, and the errors of angles and planes where the truth knows them.
+    """Figures of `compared`, and the errors of the planes where the truth knows them.
 
     Returns
     -------
     dict
-        As `compared`, and for each tolerance `angle_mean` and `angle_std`, degrees, mean and
-        standard deviation of an image's angle errors averaged over the images, and of the planes
-        of all correct regions `normal_median`, `normal_worst`, degrees, and `offset_median`,
-        `offset_worst`, metres; NaN where there is nothing to measure. `milliseconds`: median
-        time of a segmentation.
+        As `compared`, and for each tolerance, of the planes of all correct regions,
+        `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`, metres.
+        `milliseconds`: median time of a segmentation.
     """
-    figures = compared({item.name: item.overlap for item in measurements}, tolerances)
+    images = {
+        item.name: Compared(
+            item.overlap,
+            item.angles,
+            {label: plane[:3] for label, plane in item.found_planes.items()},
+        )
+        for item in measurements
+    }
+    figures = compared(images, tolerances)
     for tolerance in tolerances:
-        figures['tolerances'][f'{tolerance:g}'].update(_geometry(measurements, tolerance))
+        figures['tolerances'][f'{tolerance:g}'].update(_plane_figures(measurements, tolerance))
     figures['milliseconds'] = float(np.median([sum(m.timings.values()) for m in measurements]))
     return figures
 
 
-def _geometry(measurements: Sequence[Measurement], tolerance: float) -> dict[str, float]:
-    angles, planes = [], [np.zeros((0, 2))]
-    for item in measurements:
-        matches = classify(item.overlap, tolerance).matches
-        normals = {label: plane[:3] for label, plane in item.found_planes.items()}
-        errors = angle_errors(item.angles, normals, matches)
-        if errors.size:
-            angles.append((errors.mean(), errors.std()))
-        planes.append(plane_errors(item.true_planes, item.found_planes, matches))
-    mean, std = np.mean(angles, axis=0) if angles else (math.nan, math.nan)
-    pooled = np.vstack(planes)
-    if not len(pooled):
-        pooled = np.full((1, 2), math.nan)
-    median, worst = np.median(pooled, axis=0), pooled.max(axis=0)
+def _plane_figures(measurements: Sequence[Measurement], tolerance: float) -> dict[str, float]:
+    errors = np.vstack(
+        [
+            plane_errors(
+                item.true_planes, item.found_planes, classify(item.overlap, tolerance).matches
+            )
+            for item in measurements
+        ]
+    )
+    if not len(errors):
+        return {}
+    median, worst = np.median(errors, axis=0), errors.max(axis=0)
     return {
-        'angle_mean': float(mean),
-        'angle_std': float(std),
         'normal_median': float(median[0]),
         'normal_worst': float(worst[0]),
         'offset_median': float(median[1]),
@@ -80,15 +103,32 @@ def _geometry(measurements: Sequence[Measurement], tolerance: float) -> dict[str
     }
 
 
-def _figures(overlaps: Sequence[Overlap], tolerances: Sequence[float]) -> dict[str, Any]:
-    shared = overlap_figures(overlaps)
+def _angle_figures(
+    images: Sequence[Compared], classes: Sequence[Classification]
+) -> dict[str, float]:
+    errors = [
+        angle_errors(image.angles, image.normals, of_image.matches)
+        for image, of_image in zip(images, classes, strict=True)
+        if image.angles and image.normals
+    ]
+    moments = [(each.mean(), each.std()) for each in errors if each.size]
+    if not moments:
+        return {}
+    mean, std = np.mean(moments, axis=0)
+    return {'angle_mean': float(mean), 'angle_std': float(std)}
+
+
+def _figures(images: Sequence[Compared], tolerances: Sequence[float]) -> dict[str, Any]:
+    shared = overlap_figures([image.overlap for image in images])
     table: dict[str, dict[str, float]] = {}
     for tolerance in tolerances:
-        counts = [classify(overlap, tolerance).counts() for overlap in overlaps]
+        classes = [classify(image.overlap, tolerance) for image in images]
+        counts = [of_image.counts() for of_image in classes]
         table[f'{tolerance:g}'] = {
             **{key: sum(count[key] for count in counts) for key in COUNTS},
             'mean_iou': shared['mean_iou'],
             'pixel_accuracy': shared['pixel_accuracy'],
+            **_angle_figures(images, classes),
         }
     return {'tolerances': table, 'precision': shared['precision'], 'recall': shared['recall']}
 

@@ -10,11 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.evaluation.hoover import Overlap
-from rangeseg_ros.evaluation.segcomp import from_segcomp, read_segmentation
+from rangeseg_ros.evaluation.segcomp import (
+    FIRST_REGION,
+    RegionAngle,
+    from_segcomp,
+    read_angles,
+    read_normals,
+    read_segmentation,
+)
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_labels
 
 NOT_PLANAR = 65535
+_SHIFT = FIRST_REGION - 1
 SEGCOMP_SUFFIXES = ('.gt-seg', '.ms-seg')
 
 
@@ -54,6 +62,20 @@ def read_label_image(path: Path) -> NDArray[np.uint16]:
     if path.suffix in SEGCOMP_SUFFIXES:
         return from_segcomp(read_segmentation(path))
     return read_labels(path)
+
+
+def read_angles_beside(path: Path) -> list[RegionAngle]:
+    """Angles of the `.gt-ang` file beside a `.gt-seg`, in the labels of `read_label_image`."""
+    path = path.with_suffix('.gt-ang')
+    angles = read_angles(path) if path.exists() else []
+    return [RegionAngle(a - _SHIFT, b - _SHIFT, degrees) for a, b, degrees in angles]
+
+
+def read_normals_beside(path: Path) -> dict[int, NDArray[np.float64]]:
+    """Normals of the `.ms-nor` file beside a `.ms-seg`, in the labels of `read_label_image`."""
+    path = path.with_suffix('.ms-nor')
+    normals = read_normals(path) if path.exists() else {}
+    return {label - _SHIFT: normal for label, normal in normals.items()}
 
 
 def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:

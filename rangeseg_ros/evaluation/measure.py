@@ -6,6 +6,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import signal
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
@@ -18,10 +19,16 @@ import numpy as np
 
 import rangeseg_ros.core
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.evaluation.datasets import Case, Sample
+from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import Overlap, classify
 from rangeseg_ros.evaluation.pictures import class_picture
+from rangeseg_ros.evaluation.segcomp import (
+    MAX_REGIONS,
+    to_segcomp,
+    write_normals,
+    write_segmentation,
+)
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 
@@ -86,14 +93,15 @@ class Task:
         Parameters of the segmenter.
     cache : Path or None
         Folder of finished measurements: what is there is not computed again.
-    pictures : Path or None
-        Folder for <name>_labels.png and <name>_classes.png.
+    output : Path or None
+        Folder for <name>_labels.png, <name>_classes.png, and of images of segcomp sets
+        <name>.ms-seg and <name>.ms-nor, unless there are too many regions for these.
     """
 
     case: Case
     config: Config
     cache: Path | None = None
-    pictures: Path | None = None
+    output: Path | None = None
 
     def run(self) -> Measurement:
         """Segment the image and measure it, or take the measurement from the cache."""
@@ -111,8 +119,8 @@ class Task:
         sample = self.case.load()
         result = Segmenter(self.config).segment(sample.image)
         overlap = sample.truth.compare(result.labels)
-        if self.pictures:
-            self._draw(sample, result.labels, overlap)
+        if self.output:
+            self._save(self.output, sample, result, overlap)
         return Measurement(
             self.case.name,
             overlap,
@@ -123,11 +131,16 @@ class Task:
             result.timings,
         )
 
-    def _draw(self, sample: Sample, labels: np.ndarray, overlap: Overlap) -> None:
-        assert self.pictures
+    def _save(self, folder: Path, sample: Sample, result: Segmentation, overlap: Overlap) -> None:
+        name, labels = self.case.name, result.labels
         picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
-        write_image(self.pictures / f'{self.case.name}_labels.png', labels)
-        write_image(self.pictures / f'{self.case.name}_classes.png', picture)
+        write_image(folder / f'{name}_labels.png', labels)
+        write_image(folder / f'{name}_classes.png', picture)
+        if isinstance(self.case, SegcompCase) and len(result.planes) <= MAX_REGIONS:
+            image = to_segcomp(labels, ~sample.image.valid)
+            normals = {int(image[labels == p.label][0]): p.normal for p in result.planes}
+            write_segmentation(folder / f'{name}.ms-seg', image)
+            write_normals(folder / f'{name}.ms-nor', normals)
 
     def _key(self) -> str:
         """Digest of all that the measurement depends on: code, parameters, files."""
@@ -161,9 +174,15 @@ def run_all(tasks: Sequence[Task], jobs: int | None = None) -> Iterator[Measurem
     # Spawned, not forked: OpenCV's threads do not survive a fork.
     context = multiprocessing.get_context('spawn')
     with ExitStack() as stack:
-        pool = ProcessPoolExecutor(jobs, context, initializer=cv2.setNumThreads, initargs=(1,))
+        pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
         stack.callback(pool.shutdown, cancel_futures=True)
         yield from pool.map(_run, tasks)
+
+
+def _begin() -> None:
+    """Make a process one of many: a thread of its own, interrupted by its parent only."""
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _run(task: Task) -> Measurement:
