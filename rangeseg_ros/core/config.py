@@ -117,6 +117,38 @@ class Config:
     min_pixels: int = option(
         250, 'smallest region that makes a plane, pixels', low=1, high=100000000
     )
+    noise: float = option(
+        0.0013,
+        'random error of the inverse range, 1/m; the default is 0.45 steps of the disparity of a '
+        'Kinect, more is taken where the image shows more',
+        low=0.0,
+        high=10.0,
+    )
+    range_noise: float = option(
+        0.0, 'random error of the range, metres, for sensors like lasers', low=0.0, high=10.0
+    )
+    noise_correlation: float = option(
+        2.0,
+        'width of the Gaussian the noise looks smoothed with, pixels; 0 is white noise',
+        low=0.0,
+        high=100.0,
+    )
+    distortion: float = option(
+        0.00145,
+        'smooth systematic error of the inverse range, 1/m; the default is half a step of the '
+        'disparity of a Kinect',
+        low=0.0,
+        high=10.0,
+    )
+    range_distortion: float = option(
+        0.0, 'smooth systematic error of the range, metres', low=0.0, high=10.0
+    )
+    distortion_length: float = option(
+        35.0,
+        'width of the Gaussian the distortion looks smoothed with, pixels',
+        low=0.0,
+        high=10000.0,
+    )
     dithering: float = option(
         0.0,
         'standard deviation of Gaussian noise added to the range, metres; breaks up the steps '

@@ -1,0 +1,247 @@
+"""First planes: blocks grow to patches, patches join to surfaces.
+
+Agglomerative clustering on the adjacency of blocks, as in Feng, Taguchi and Kamat (ICRA 2014),
+with tests that count the sensor's variances. Real sensors bend planes smoothly, so how far two
+parts may leave their common plane cannot be one number: the plane a patch of a wall suggests is
+off by the distortion where the wall ends, yet the patch beside it agrees. Hence two steps. Blocks
+merge to patches small enough for the distortion to be nearly constant; patches join where they
+agree with their neighbours, averaged along the common border, and the surface as a whole stays
+within the distortion.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, fit, fit_all
+
+DISTORTION_PIXELS = 2000.0
+"""Regions of this size meet half the variance of the distortion, large ones all of it."""
+# Quantile 0.999 of chi-squared with the three degrees of freedom of a plane, for pixels of
+# whose noise four agree.
+_NOISE = 16.0 * 4.0
+# Systematic variances granted between blocks of a patch, between neighbouring patches, and
+# within a surface (4 standard deviations).
+_WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 1.0, 6.4, 16.0
+# Pixels of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels.
+_PATCH_MINIMUM, _PATCH_LARGEST = 80, 1500
+# Residuals of a block, in variances, beyond which it is no part of a plane.
+_ROUGH = 10.0
+
+# (rows, columns-1) and (rows-1, columns): whether a block touches its right, its lower neighbour.
+Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+
+def surfaces(moments: NDArray[np.float64], links: Links) -> tuple[NDArray[np.intp], NDArray]:
+    """Group blocks into planar surfaces.
+
+    Parameters
+    ----------
+    moments : (rows, columns, 12) float64
+        Of blocks, weighted; zeros for blocks to leave out.
+    links : Links
+        Which neighbouring blocks are connected.
+
+    Returns
+    -------
+    labels : (rows, columns) int
+        0 where no surface is, otherwise 1...K.
+    moments : (K + 1, 12) float64
+        Of the surfaces; zeros for 0.
+    """
+    shape = moments.shape[:2]
+    blocks = moments.reshape(-1, SIZE)
+    _, residual = fit_all(blocks)
+    smooth = (blocks[:, COUNT] > 0) & (residual < _ROUGH * blocks[:, COUNT])
+    index = np.arange(len(blocks)).reshape(shape)
+    pairs = np.concatenate(
+        [
+            np.stack([index[:, :-1][links[0]], index[:, 1:][links[0]]], axis=1),
+            np.stack([index[:-1][links[1]], index[1:][links[1]]], axis=1),
+        ]
+    )
+    pairs = pairs[smooth[pairs].all(axis=1)]
+    patch, moments = _renumbered(_grow(blocks, smooth, pairs), blocks, _PATCH_MINIMUM)
+    border = _borders(patch[pairs], len(moments))
+    surface, moments = _renumbered(_join(moments, border), moments, 1)
+    return surface[patch].reshape(shape), moments
+
+
+def _renumbered(
+    root: NDArray[np.intp], moments: NDArray[np.float64], least: int
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
+    count = np.bincount(root, moments[:, COUNT])
+    chosen = np.flatnonzero(count >= least)
+    table = np.zeros(len(count), np.intp)
+    table[chosen] = np.arange(1, len(chosen) + 1)
+    labels = table[root]
+    total = np.stack([np.bincount(labels, m, len(chosen) + 1) for m in moments.T], axis=1)
+    total[0] = 0
+    return labels, total
+
+
+def _borders(pairs: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+    """Length of the border between every two patches, in blocks: (count, count), symmetric."""
+    pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs > 0).all(axis=1)]
+    border = np.bincount(pairs[:, 0] * count + pairs[:, 1], minlength=count * count)
+    border = border.reshape(count, count).astype(np.float64)
+    return border + border.T
+
+
+@njit(cache=True)
+def _misfit(
+    extra: float, first: float, second: float, total: NDArray[np.float64], granted: float
+) -> float:
+    """Extra residual of a common plane, in what noise and distortion are granted; 1 is too far."""
+    return extra / (_NOISE + granted * total[RATIO] / total[COUNT] * first * second / total[COUNT])
+
+
+@njit(cache=True)
+def _grow(
+    moments: NDArray[np.float64], nodes: NDArray[np.bool_], pairs: NDArray[np.intp]
+) -> NDArray[np.intp]:
+    """Merge blocks to patches, the flattest first, each with the neighbour it fits best.
+
+    Returns the root of each block's patch, itself for a block that is no node.
+    """
+    count = len(moments)
+    moments = moments.copy()
+    theta, total = np.zeros(3), np.zeros(SIZE)
+    # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
+    head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+    link = np.full(2 * len(pairs), -1, np.int32)
+    target = np.empty(2 * len(pairs), np.int32)
+    for e in range(2 * len(pairs)):
+        a, b = pairs[e // 2, e % 2], pairs[e // 2, 1 - e % 2]
+        target[e], link[e] = b, head[a]
+        head[a] = e
+        if tail[a] < 0:
+            tail[a] = e
+    parent = np.arange(count)
+    residual = np.zeros(count)
+    version = np.zeros(count, np.int64)
+    heap = [(0.0, 0, 0)]
+    heap.pop()
+    for a in range(count):
+        if nodes[a]:
+            residual[a] = fit(moments[a], theta)
+            heappush(heap, (residual[a] / moments[a, COUNT], a, 0))
+    seen = np.full(count, -1, np.int32)
+    turn = 0
+    while len(heap) > 0:
+        _, a, age = heappop(heap)
+        if parent[a] != a or version[a] != age:
+            continue
+        turn += 1
+        best, partner = 1.0, -1
+        before, e = -1, head[a]
+        while e >= 0:
+            b = target[e]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            target[e] = b
+            following = link[e]
+            if b == a or seen[b] == turn:
+                # An inner edge, or one more to the same patch.
+                if before < 0:
+                    head[a] = following
+                else:
+                    link[before] = following
+                if following < 0:
+                    tail[a] = before
+            else:
+                seen[b] = turn
+                before = e
+                total[:] = moments[a]
+                total += moments[b]
+                if total[COUNT] <= _PATCH_LARGEST:
+                    extra = fit(total, theta) - residual[a] - residual[b]
+                    misfit = _misfit(
+                        extra, moments[a, COUNT], moments[b, COUNT], total, _WITHIN_PATCH
+                    )
+                    if misfit < best:
+                        best, partner = misfit, b
+            e = following
+        if partner >= 0:
+            moments[a] += moments[partner]
+            residual[a] = fit(moments[a], theta)
+            parent[partner] = a
+            if head[partner] >= 0:
+                link[tail[a]] = head[partner]
+                tail[a] = tail[partner]
+            version[a] += 1
+            heappush(heap, (residual[a] / moments[a, COUNT], a, version[a]))
+    return _roots(parent)
+
+
+@njit(cache=True)
+def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Join patches 1...P to surfaces, those that agree best first; returns the roots.
+
+    The strain between two surfaces is the mean misfit of the patches on either side of their
+    border.
+    """
+    count = len(moments)
+    moments, border = moments.copy(), border.copy()
+    theta, total = np.zeros(3), np.zeros(SIZE)
+    residual = np.zeros(count)
+    for a in range(count):
+        residual[a] = fit(moments[a], theta)
+    strain = np.zeros((count, count))
+    heap = [(0.0, 0, 0)]
+    heap.pop()
+    for a in range(count):
+        for b in range(a + 1, count):
+            if border[a, b] > 0:
+                total[:] = moments[a]
+                total += moments[b]
+                extra = fit(total, theta) - residual[a] - residual[b]
+                misfit = _misfit(
+                    extra, moments[a, COUNT], moments[b, COUNT], total, _BETWEEN_PATCHES
+                )
+                strain[a, b] = strain[b, a] = misfit * border[a, b]
+                heappush(heap, (strain[a, b] / border[a, b], a, b))
+    parent = np.arange(count)
+    while len(heap) > 0:
+        mean, a, b = heappop(heap)
+        if mean >= 1:
+            break
+        if parent[a] != a or parent[b] != b or strain[a, b] / border[a, b] != mean:
+            continue
+        total[:] = moments[a]
+        total += moments[b]
+        chi2 = fit(total, theta)
+        extra = chi2 - residual[a] - residual[b]
+        granted = _WITHIN_SURFACE * total[COUNT] / (total[COUNT] + DISTORTION_PIXELS)
+        if _misfit(extra, moments[a, COUNT], moments[b, COUNT], total, granted) >= 1:
+            continue
+        parent[b] = a
+        moments[a] = total
+        residual[a] = chi2
+        for c in range(count):
+            if border[b, c] > 0 and c != a:
+                border[a, c] += border[b, c]
+                strain[a, c] += strain[b, c]
+                border[c, a], strain[c, a] = border[a, c], strain[a, c]
+            border[b, c] = border[c, b] = 0
+            if border[a, c] > 0:
+                heappush(heap, (strain[a, c] / border[a, c], min(a, c), max(a, c)))
+    return _roots(parent)
+
+
+@njit(cache=True)
+def _roots(parent: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Root of every node of a forest given by parents."""
+    root = np.empty(len(parent), np.intp)
+    for a in range(len(parent)):
+        b = a
+        while parent[b] != b:
+            b = parent[b]
+        root[a] = b
+    return root

@@ -1,0 +1,120 @@
+"""Moments that add up over pixels, blocks and regions, and the planes they determine.
+
+A plane is linear in inverse range, theta . ray = inverse with theta = -normal / distance, so its
+weighted least-squares fit needs only sums over the pixels. A moment vector holds twelve of them:
+w r r^T (upper triangle, 6), w r y (3), w y^2, the number of pixels, and the sum of the ratio of
+systematic to random variance, for rays r, inverse range y and weights w = 1 / random variance,
+so that residual sums of squares count random variances.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+SIZE = 12
+CHI2, COUNT, RATIO = 9, 10, 11
+"""Entries of a moment vector: w y^2, number of pixels, sum of the variance ratio."""
+
+
+@njit(cache=True)
+def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """Least-squares plane of a moment vector.
+
+    Parameters
+    ----------
+    moments : (12,) float64
+    theta : (3,) float64
+        Receives the plane; zeros where the pixels do not determine one.
+
+    Returns
+    -------
+    float
+        Weighted sum of the squared residuals.
+    """
+    a, b, c, d, e, f = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
+    p, q, r = moments[6], moments[7], moments[8]
+    # Cofactors of the symmetric 3x3 matrix.
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    determinant = a * aa + b * bb + c * cc
+    if determinant <= 1e-13 * a * d * f:
+        theta[:] = 0
+        return moments[CHI2]
+    theta[0] = (aa * p + bb * q + cc * r) / determinant
+    theta[1] = (bb * p + dd * q + ee * r) / determinant
+    theta[2] = (cc * p + ee * q + ff * r) / determinant
+    return max(moments[CHI2] - theta[0] * p - theta[1] * q - theta[2] * r, 0.0)
+
+
+@njit(cache=True)
+def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Planes (N, 3) and residual sums (N,) of moment vectors (N, 12)."""
+    theta = np.zeros((len(moments), 3))
+    residual = np.zeros(len(moments))
+    for i in range(len(moments)):
+        residual[i] = fit(moments[i], theta[i])
+    return theta, residual
+
+
+@njit(cache=True)
+def add_pixel(moments: NDArray[np.float64], ray: NDArray[np.float32], y: float, w: float) -> None:
+    """Add a pixel of weight `w` to all entries of a moment vector but the variance ratio."""
+    x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
+    moments[0] += w * x0 * x0
+    moments[1] += w * x0 * x1
+    moments[2] += w * x0 * x2
+    moments[3] += w * x1 * x1
+    moments[4] += w * x1 * x2
+    moments[5] += w * x2 * x2
+    moments[6] += w * x0 * y
+    moments[7] += w * x1 * y
+    moments[8] += w * x2 * y
+    moments[9] += w * y * y
+    moments[10] += 1
+
+
+@njit(cache=True)
+def block_moments(
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    horizontal: NDArray[np.float32],
+    vertical: NDArray[np.float32],
+    size: int,
+) -> NDArray[np.float64]:
+    """Moments, with unit weights, of the square blocks that nothing disturbs.
+
+    Parameters
+    ----------
+    inverse, rays : (H, W), (H, W, 3) float32
+        Range image; inverse is 0 where nothing was measured.
+    horizontal, vertical : (H, W-1), (H-1, W) float32
+        Neighbourhood weights, 0 across jumps.
+    size : int
+        Rows and columns of a block.
+
+    Returns
+    -------
+    (ceil(H / size), ceil(W / size), 12) float64
+        Zeros for blocks that a jump edge crosses or that lack measurements in over 30 %.
+    """
+    height, width = inverse.shape
+    rows, columns = -(-height // size), -(-width // size)
+    moments = np.zeros((rows, columns, SIZE))
+    for bi in range(rows):
+        for bj in range(columns):
+            block = moments[bi, bj]
+            whole = True
+            for i in range(bi * size, min((bi + 1) * size, height)):
+                for j in range(bj * size, min((bj + 1) * size, width)):
+                    if inverse[i, j] == 0:
+                        continue
+                    add_pixel(block, rays[i, j], inverse[i, j], 1.0)
+                    if j + 1 < min((bj + 1) * size, width) and inverse[i, j + 1] > 0:
+                        whole &= horizontal[i, j] > 0
+                    if i + 1 < min((bi + 1) * size, height) and inverse[i + 1, j] > 0:
+                        whole &= vertical[i, j] > 0
+            if not whole or block[COUNT] < 0.7 * size * size:
+                block[:] = 0
+    return moments

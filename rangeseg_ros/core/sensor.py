@@ -1,0 +1,102 @@
+"""How a sensor errs: the standard deviation of the inverse range, part by part."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
+
+from rangeseg_ros.core.config import Config
+
+_BINS = 8
+_PER_BIN = 20
+# Most blocks lie on planes, but edges and curvature only ever add to the residuals.
+_QUANTILE = 0.4
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Error of the inverse range of a pixel, 1/m.
+
+    A structured-light sensor's error is about constant in disparity, hence in inverse range; a
+    laser's is constant in range. Each part is the root of the squares of both kinds.
+
+    Attributes
+    ----------
+    noise : float
+        Random error of the inverse range, standard deviation, 1/m.
+    range_noise : float
+        Random error of the range, metres.
+    correlation : float
+        Width of the Gaussian kernel the noise looks smoothed with, pixels; 0 for white noise.
+    distortion : float
+        Smooth systematic error of the inverse range, standard deviation, 1/m.
+    range_distortion : float
+        Smooth systematic error of the range, metres.
+    distortion_length : float
+        Width of the Gaussian kernel the distortion looks smoothed with, pixels.
+    """
+
+    noise: float
+    range_noise: float
+    correlation: float
+    distortion: float
+    range_distortion: float
+    distortion_length: float
+
+    @classmethod
+    def from_config(cls, config: Config) -> SensorModel:
+        """The sensor that `config` describes."""
+        return cls(
+            config.noise,
+            config.range_noise,
+            config.noise_correlation,
+            config.distortion,
+            config.range_distortion,
+            config.distortion_length,
+        )
+
+    def variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
+        """Variance of the random error at an inverse range, (1/m)^2."""
+        return _variance(self.noise, self.range_noise, inverse)
+
+    def systematic_variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
+        """Variance of the systematic error at an inverse range, (1/m)^2."""
+        return _variance(self.distortion, self.range_distortion, inverse)
+
+    def measured(self, inverse: NDArray[np.float64], residual: NDArray[np.float64]) -> SensorModel:
+        """The model with the random error an image shows, never less than its own.
+
+        Parameters
+        ----------
+        inverse : (N,) float64
+            Mean inverse range of small blocks, 1/m.
+        residual : (N,) float64
+            Mean square residual of a plane fitted to each block, unbiased, (1/m)^2.
+        """
+        bins = min(_BINS, len(inverse) // _PER_BIN)
+        if bins == 0:
+            return self
+        order = np.argsort(inverse, kind='stable')
+        at = np.array([np.median(inverse[part]) for part in np.array_split(order, bins)])
+        variance = np.array(
+            [np.quantile(residual[part], _QUANTILE) for part in np.array_split(order, bins)]
+        )
+        variance = np.maximum(variance, self.variance(at))
+        if not (variance > 0).all():
+            return self
+        # Relative errors count the same at every range.
+        terms = np.stack([np.ones(bins), at**4], axis=1) / variance[:, None]
+        (constant, quartic), _ = nnls(terms, np.ones(bins))
+        return replace(
+            self,
+            noise=max(float(np.sqrt(constant)), self.noise),
+            range_noise=max(float(np.sqrt(quartic)), self.range_noise),
+        )
+
+
+def _variance(constant: float, in_range: float, inverse: ArrayLike) -> NDArray[np.float64]:
+    # d(1/s) = ds / s^2
+    return constant**2 + (in_range * np.asarray(inverse, np.float64) ** 2) ** 2
