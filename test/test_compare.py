@@ -113,6 +113,19 @@ def test_not_judged_pixels_do_not_count(tmp_path, compare):
     assert compare(truth, labels)[1]['tolerances']['0.6']['mean_iou'] == pytest.approx(1 / 2)
 
 
+def test_the_rim_of_something_not_judged_is_no_part(tmp_path, compare):
+    # Found 8 has 2 of its 6 pixels on truth 1, the rest is not judged; 7 has the other 8.
+    truth = write(tmp_path / 'truth.png', [[1] * 10 + [0] * 4 + [65535]])
+    labels = write(tmp_path / 'labels.png', [[7] * 8 + [8] * 6 + [0]])
+    row = compare(truth, labels)[1]['tolerances']['0.8']
+    assert (row['correct'], row['over'], row['noise']) == (0, 1, 0)
+    row = compare(truth, labels, '--min-pixels', 3)[1]['tolerances']['0.8']
+    assert (row['correct'], row['over'], row['noise']) == (1, 0, 0)
+    # Half of 8 judged: it counts, whatever its size.
+    labels = write(tmp_path / 'labels.png', [[7] * 8 + [8] * 4 + [0] * 3])
+    assert compare(truth, labels, '--min-pixels', 3)[1]['tolerances']['0.8']['over'] == 1
+
+
 def test_a_truth_agrees_with_itself(tmp_path, compare):
     truth = write(tmp_path / 'truth.png', [[1, 2, 0, 65535]])
     row = compare(truth, truth)[1]['tolerances']['0.95']

@@ -39,15 +39,27 @@ class Truth(NamedTuple):
         0 = no region.
     judged : (H, W) bool or None
         Pixels that count; None for all.
+    min_pixels : int
+        Size from which regions count.
     """
 
     labels: NDArray[np.uint16]
     judged: NDArray[np.bool_] | None
+    min_pixels: int = 1
 
     def compare(self, labels: NDArray) -> Overlap:
-        """Overlap of a segmentation with this truth; the label 65535 is no region there either."""
+        """Overlap of a segmentation with this truth.
+
+        Where only some pixels are judged, the label 65535 is no region in the segmentation
+        either, and a found region does not count of which less than half of the pixels, and
+        fewer than `min_pixels`, are judged: the rim of something unjudged is no evidence.
+        """
         if self.judged is not None:
-            labels = np.where(labels == NOT_PLANAR, 0, labels)
+            sizes = np.bincount(labels.ravel(), minlength=NOT_PLANAR + 1)
+            seen = np.bincount(labels[self.judged], minlength=NOT_PLANAR + 1)
+            ignored = (2 * seen < sizes) & (seen < self.min_pixels)
+            ignored[NOT_PLANAR] = True
+            labels = np.where(ignored[labels], 0, labels)
         return Overlap.between(self.labels, labels, self.judged)
 
 
@@ -97,7 +109,8 @@ def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:
     judged = labels > 0 if curved.any() else None
     sizes = np.bincount(labels.ravel(), minlength=1)
     keep = sizes >= min_pixels
-    return Truth(np.where(keep[labels] & ~curved, labels, 0).astype(np.uint16), judged)
+    regions = np.where(keep[labels] & ~curved, labels, 0).astype(np.uint16)
+    return Truth(regions, judged, min_pixels)
 
 
 def pair_files(truth: Path, labels: Path) -> dict[str, tuple[Path, Path]]:
