@@ -188,13 +188,16 @@ def _lambdas(step: int) -> list[float]:
 
 
 def _write_params(path: Path, setting: Setting, rows: list[experiments.Row]) -> None:
-    """Parameter file with the best lambda and whatever else differs from the defaults."""
+    """Parameter file with the best lambda and whatever else differs from the defaults.
+
+    The method stays out of it: lambda is there for whoever chooses `normals`.
+    """
     best = max((r for r in rows if r['series'] == 'identified'), key=lambda row: row['correct'])
     defaults = Config()
     chosen = {
         name: getattr(setting.base, name)
         for name in Config.__dataclass_fields__
-        if getattr(setting.base, name) != getattr(defaults, name)
+        if name != 'method' and getattr(setting.base, name) != getattr(defaults, name)
     }
     params = {**chosen, 'smoothness': best['lambda']}
     text = (
