@@ -122,8 +122,10 @@ class Bench:
     def ignored(self, topic):
         """Wait until the node does not subscribe; one that has ended does not."""
         self.until(
-            lambda: self.process.poll() is not None
-            or not self.node.get_subscriptions_info_by_topic(topic)
+            lambda: (
+                self.process.poll() is not None
+                or not self.node.get_subscriptions_info_by_topic(topic)
+            )
         )
 
     def segment(self, image=None, info=None):

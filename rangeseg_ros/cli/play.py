@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from rangeseg_ros.cli import options
     help='Speed: 2 plays twice as fast as recorded.',
 )
 @click.option('--loop', is_flag=True, help='Start again at the end, until interrupted.')
+@click.option('--wait', is_flag=True, help='Start only when every topic has a subscriber.')
 @click.option(
     '--delay',
     type=click.FloatRange(min=0),
@@ -31,7 +32,7 @@ from rangeseg_ros.cli import options
     show_default=True,
     help='Seconds before the first message, for subscribers to find the topics.',
 )
-def command(bag: Path, rate: float, loop: bool, delay: float) -> None:
+def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float) -> None:
     """Publish the messages of a rosbag2 on their topics, timed as they were recorded.
 
     Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort.
@@ -56,15 +57,17 @@ def command(bag: Path, rate: float, loop: bool, delay: float) -> None:
         publishers = _publishers(node, reader.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
+        while wait and not all(p.get_subscription_count() for p in publishers.values()):
+            time.sleep(0.05)
         time.sleep(delay)
         while True:
-            for publish, data in options.progress(
+            for topic, data in options.progress(
                 _timed(reader, publishers, rate), reader.message_count, 'message'
             ):
-                publish(data)
+                publishers[topic].publish(data)
             if not loop:
                 break
-        for publisher in node.publishers:
+        for publisher in publishers.values():
             publisher.wait_for_all_acked(Duration(seconds=2))
     finally:
         reader.close()
@@ -72,8 +75,8 @@ def command(bag: Path, rate: float, loop: bool, delay: float) -> None:
         rclpy.try_shutdown()
 
 
-def _publishers(node: Any, connections: list[Connection]) -> dict[str, Callable[[bytes], None]]:
-    """Publishing functions of the topics whose message classes are installed."""
+def _publishers(node: Any, connections: list[Connection]) -> dict[str, Any]:
+    """Publishers of the topics whose message classes are installed."""
     from rangeseg_ros.ros.messages import message_class
 
     publishers = {}
@@ -84,8 +87,9 @@ def _publishers(node: Any, connections: list[Connection]) -> dict[str, Callable[
             click.echo(f'{connection.topic}: {connection.msgtype} is not installed, left out')
             continue
         if connection.topic not in publishers:
-            publisher = node.create_publisher(kind, connection.topic, _qos(connection))
-            publishers[connection.topic] = publisher.publish
+            publishers[connection.topic] = node.create_publisher(
+                kind, connection.topic, _qos(connection)
+            )
     return publishers
 
 
@@ -103,13 +107,11 @@ def _qos(connection: Connection) -> Any:
     )
 
 
-def _timed(
-    reader: Reader, publishers: dict[str, Callable[[bytes], None]], rate: float
-) -> Iterator[tuple[Callable[[bytes], None], bytes]]:
-    """Publishing functions and contents of the messages, each when it is due."""
+def _timed(reader: Reader, topics: Collection[str], rate: float) -> Iterator[tuple[str, bytes]]:
+    """Topics and contents of the messages, each when it is due."""
     start = time.monotonic()
-    wanted = [c for c in reader.connections if c.topic in publishers]
+    wanted = [connection for connection in reader.connections if connection.topic in topics]
     for connection, stamp, data in reader.messages(wanted):
         due = start + (stamp - reader.start_time) / 1e9 / rate
         time.sleep(max(0.0, due - time.monotonic()))
-        yield publishers[connection.topic], bytes(data)
+        yield connection.topic, bytes(data)

@@ -1,0 +1,117 @@
+"""`rangeseg play` and the node: what is published of a recording, and when."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+import cv2
+from ros_bench import DEPTH, INFO, Bench, corner_depth
+
+from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.simulation.kinect import kinect_camera
+
+PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
+RANGESEG = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
+
+
+def record(path, camera, count, period):
+    """Write a bag of two walls that come nearer from image to image."""
+    with DepthBagWriter(path, camera) as bag:
+        for index in range(count):
+            depth = corner_depth(camera) - np.uint16(10 * index)
+            bag.write(depth, 10**9 + round(index * period * 1e9))
+
+
+def test_node_on_a_played_bag_gives_the_labels_of_replay(tmp_path):
+    bag, count = tmp_path / 'bag', 8
+    record(bag, kinect_camera(160, 120), count, 0.2)
+    subprocess.run([*RANGESEG, 'replay', bag, '--output', tmp_path / 'out'], check=True)
+    with Bench() as bench, bench.listening('labels'):
+        player = subprocess.Popen([*RANGESEG, 'play', bag, '--wait'])
+        bench.until(lambda: player.poll() is not None, 60)
+        assert player.returncode == 0
+        bench.until(lambda: len(bench.received['labels']) >= count)
+    messages = bench.received['labels']
+    pictures = sorted((tmp_path / 'out').glob('*_labels.png'))
+    assert len(messages) == len(pictures) == count
+    for message, picture in zip(messages, pictures, strict=True):
+        assert f'{message.header.stamp.sec}.{message.header.stamp.nanosec:09d}' in picture.name
+        replayed = cv2.imread(os.fspath(picture), cv2.IMREAD_UNCHANGED)
+        live = np.frombuffer(message.data, np.uint16).reshape(message.height, message.width)
+        assert live.any()
+        np.testing.assert_array_equal(live, replayed)
+
+
+def test_rate_and_loop(tmp_path):
+    """Ten images a second apart, twenty times as fast, again and again."""
+    bag = tmp_path / 'bag'
+    record(bag, kinect_camera(16, 12), 10, 1.0)
+    received = []
+    with Bench() as bench:
+        from sensor_msgs.msg import CameraInfo, Image
+
+        kept = bench.node.create_subscription(Image, DEPTH, received.append, 10)
+        infos = []
+        bench.node.create_subscription(CameraInfo, INFO, infos.append, 10)
+        player = subprocess.Popen([*RANGESEG, 'play', bag, '--rate', '20', '--loop'])
+        try:
+            bench.until(lambda: len(received) >= 25)
+        finally:
+            player.terminate()
+            player.wait()
+        assert kept.get_publisher_count() >= 0
+    stamps = [message.header.stamp.sec for message in received[:25]]
+    first = stamps[0]
+    assert stamps == [(first - 1 + index) % 10 + 1 for index in range(25)]
+    assert len(infos) >= 24
+
+
+@pytest.mark.parametrize(
+    'name, content, words',
+    [('missing', None, 'missing'), ('empty', b'', 'not a readable'), ('x.mcap', b'abc', 'x.mcap')],
+)
+def test_bad_bag_ends_with_one_line(tmp_path, name, content, words):
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+    run = subprocess.run([*RANGESEG, 'play', path], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert words in run.stderr and run.stderr.strip().count('\n') == 0
+
+
+def test_no_large_image_is_lost_with_the_profile(tmp_path, monkeypatch):
+    """The counterpart of the test of the node in which, without the profile, images are lost."""
+    publisher = """
+import array, time, rclpy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import Image
+rclpy.init()
+node = rclpy.create_node('camera')
+qos = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+images = node.create_publisher(Image, '/depth/image_rect', qos)
+while not images.get_subscription_count():
+    time.sleep(0.05)
+time.sleep(0.5)
+image = Image(height=480, width=640, encoding='16UC1', step=1280)
+image.data = array.array('B', bytes(1280 * 480))
+for _ in range(60):
+    images.publish(image)
+    time.sleep(1 / 30)
+time.sleep(0.5)
+"""
+    monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', os.fspath(PROFILE))
+    camera = subprocess.Popen([sys.executable, '-c', publisher])
+    with Bench() as bench, bench.listening('labels'):
+        monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE')
+        bench.until(lambda: camera.poll() is not None)
+        # Images without camera_info are received and go no further.
+        status = bench.status(lambda status: 'no camera_info' in status.message)
+    assert camera.returncode == 0
+    values = {value.key: value.value for value in status.values}
+    assert values['messages lost by the middleware'] == '0'
