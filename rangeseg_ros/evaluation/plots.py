@@ -14,6 +14,12 @@ from matplotlib.figure import Figure
 from rangeseg_ros.evaluation.experiments import Row
 from rangeseg_ros.io.files import replacing
 
+# Lines that coincide stay visible.
+_LAPPING: tuple[dict[str, Any], ...] = (
+    {'marker': '.'},
+    {'marker': 's', 'linewidth': 4, 'alpha': 0.4},
+    {'marker': 'o', 'linestyle': '--', 'markersize': 3},
+)
 METRICS = ('correct', 'over', 'under', 'missed', 'noise')
 
 
@@ -54,9 +60,9 @@ def plot_lambdas(path: Path, rows: Sequence[Row], title: str) -> None:
     figure = Figure(figsize=(13, 7), layout='constrained')
     panels = figure.subplots(2, 3).ravel()
     for axes, metric in zip(panels, METRICS, strict=False):
-        for name, part in _series(rows).items():
+        for (name, part), style in zip(_series(rows).items(), _LAPPING, strict=False):
             x = [row['lambda'] for row in part]
-            axes.plot(x, [row[metric] for row in part], marker='.', label=name)
+            axes.plot(x, [row[metric] for row in part], label=name, **style)
         if metric in ('noise', 'over'):
             axes.set_yscale('symlog', linthresh=1)
         _finish(axes, 'λ', f'{metric} regions per image')
