@@ -32,7 +32,7 @@ setup(
         'click>=8.0',
         'lz4',
         'matplotlib>=3.6',
-        'mcap>=1.0',
+        'mcap>=1.2.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'PyMaxflow>=1.3',

@@ -2,6 +2,7 @@
 
 import csv
 from dataclasses import fields
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -14,7 +15,7 @@ from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.files import natural_order, replacing
 from rangeseg_ros.io.images import ImageFileError, read_depth, read_labels, write_image
-from rangeseg_ros.io.params import read_config, read_params
+from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.planes import PlaneTable, columns
 
 
@@ -85,8 +86,6 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
 
 @given(st.text(min_size=1), st.text(min_size=1))
 def test_natural_order_compares_any_names(one, other):
-    from pathlib import Path
-
     sorted([Path(one), Path(other)], key=natural_order)
 
 
@@ -167,6 +166,32 @@ def test_flat_and_ros_parameter_files_say_the_same(tmp_path):
     path.write_text('')
     assert read_config(path) == read_config(None) == Config()
     assert read_config(path, smoothness=3.0) == Config(smoothness=3.0)
+
+
+def test_parameters_of_the_node_alone_do_no_harm(tmp_path):
+    path = tmp_path / 'params.yaml'
+    path.write_text(
+        'segment_planes:\n'
+        '  ros__parameters:\n'
+        '    smoothness: 12.5\n'
+        '    use_sim_time: true\n'
+        '    stall_timeout: 3.0\n'
+        '    qos_overrides./depth/image_rect.subscription.depth: 1\n'
+        '    qos_overrides: {/depth/image_rect: {subscription: {reliability: best_effort}}}\n'
+    )
+    assert read_config(path) == Config(smoothness=12.5)
+    pytest.importorskip('rclpy')
+    from rangeseg_ros.ros.parameters import NodeConfig
+
+    names = {field.name for field in fields(NodeConfig)} - {f.name for f in fields(Config)}
+    assert names <= NODE_ONLY
+
+
+def test_the_parameter_files_of_the_package_are_valid():
+    files = sorted(Path(__file__).parents[1].glob('params/*.yaml'))
+    assert files
+    for path in files:
+        read_config(path)
 
 
 @pytest.mark.parametrize(

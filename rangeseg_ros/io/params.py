@@ -10,6 +10,8 @@ import yaml
 from rangeseg_ros.core.config import Config, ConfigError
 
 NODE = 'segment_planes'
+# Parameters that the node has beyond those of the segmenter; nested ones by their first part.
+NODE_ONLY = frozenset({'input', 'stall_timeout', 'qos_overrides', 'use_sim_time'})
 
 
 def read_params(path: Path) -> dict[str, Any]:
@@ -19,7 +21,7 @@ def read_params(path: Path) -> dict[str, Any]:
     ----------
     path : Path
         Names and values, or a ROS parameter file: of that, the sections of the node
-        `segment_planes` in any namespace and of the wildcard `/**`.
+        `segment_planes` in any namespace and of the wildcard `/**`, without `NODE_ONLY`.
 
     Raises
     ------
@@ -45,7 +47,11 @@ def read_params(path: Path) -> dict[str, Any]:
             merged.update(section.get('ros__parameters') or {})
     if not merged:
         raise ConfigError(f'{path}: no ros__parameters of {NODE}')
-    return merged
+    return {
+        name: value
+        for name, value in merged.items()
+        if str(name).partition('.')[0] not in NODE_ONLY
+    }
 
 
 def read_config(path: Path | None, **overrides: Any) -> Config:
