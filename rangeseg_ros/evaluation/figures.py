@@ -22,6 +22,13 @@ from rangeseg_ros.evaluation.measure import Measurement
 TOLERANCES = (0.51, 0.6, 0.7, 0.8, 0.9, 0.95)
 COUNTS = ('regions', 'correct', 'over', 'under', 'missed', 'noise')
 
+_ERRORS = {
+    'angle_mean': ('angle deg', 1.0),
+    'angle_std': ('+- deg', 1.0),
+    'normal_median': ('normal deg', 1.0),
+    'offset_median': ('offset mm', 1000.0),
+}
+
 
 class Compared(NamedTuple):
     """An image to make figures of.
@@ -143,12 +150,16 @@ def as_json(value: Any) -> Any:
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """Text table of `compared`: averages per image of the counts, one row per tolerance."""
-    head = ['tolerance', *COUNTS, 'mean IoU', 'pixels']
-    rows = [head]
-    for tolerance, row in figures['tolerances'].items():
+    """Text table of `compared` or `evaluated`, one row per tolerance.
+
+    Counts are averages per image; of the errors of angles and planes, those that are known.
+    """
+    tolerances = figures['tolerances']
+    known = [key for key in _ERRORS if any(key in row for row in tolerances.values())]
+    rows = [['tolerance', *COUNTS, 'mean IoU', 'pixels', *(_ERRORS[key][0] for key in known)]]
+    for tolerance, row in tolerances.items():
         averages = [f'{row[key] / figures["images"]:.2f}' for key in COUNTS]
-        rows.append(
-            [tolerance, *averages, f'{row["mean_iou"]:.3f}', f'{row["pixel_accuracy"]:.3f}']
-        )
-    return '\n'.join(''.join(f'{cell:>10}' for cell in row) for row in rows)
+        shares = [f'{row[key]:.3f}' for key in ('mean_iou', 'pixel_accuracy')]
+        errors = [f'{row.get(key, math.nan) * _ERRORS[key][1]:.2f}' for key in known]
+        rows.append([tolerance, *averages, *shares, *errors])
+    return '\n'.join(''.join(f'{cell:>11}' for cell in row) for row in rows)
