@@ -78,9 +78,9 @@ class Config:
         choices=('plane', 'sobel', 'none'),
     )
     edge_step: float = option(
-        0.0044,
-        'jump_edges plane: smallest jump of the inverse range, 1/m; the default is 1.5 steps of '
-        'the disparity of a Kinect, 18 mm at 2 m',
+        0.0065,
+        'jump_edges plane: smallest jump of the inverse range, 1/m; the default is 2.2 steps of '
+        'the disparity of a Kinect, 26 mm at 2 m',
         low=0.0,
         high=10.0,
     )
@@ -115,7 +115,7 @@ class Config:
         choices=('leave', 'identify', 'merge'),
     )
     min_pixels: int = option(
-        250, 'smallest region that makes a plane, pixels', low=1, high=100000000
+        500, 'smallest region that makes a plane, pixels', low=1, high=100000000
     )
     noise: float = option(
         0.0013,

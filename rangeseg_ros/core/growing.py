@@ -26,7 +26,7 @@ DISTORTION_PIXELS = 2000.0
 _NOISE = 16.0 * 4.0
 # Systematic variances granted between blocks of a patch, between neighbouring patches, and
 # within a surface (4 standard deviations).
-_WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 1.0, 6.4, 16.0
+_WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 2.0, 10.0, 30.0
 # Pixels of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels.
 _PATCH_MINIMUM, _PATCH_LARGEST = 80, 1500
 # Residuals of a block, in variances, beyond which it is no part of a plane.
@@ -36,7 +36,9 @@ _ROUGH = 10.0
 Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
-def surfaces(moments: NDArray[np.float64], links: Links) -> tuple[NDArray[np.intp], NDArray]:
+def surfaces(
+    moments: NDArray[np.float64], links: Links
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
     Parameters
@@ -80,7 +82,8 @@ def _renumbered(
     table = np.zeros(len(count), np.intp)
     table[chosen] = np.arange(1, len(chosen) + 1)
     labels = table[root]
-    total = np.stack([np.bincount(labels, m, len(chosen) + 1) for m in moments.T], axis=1)
+    total = np.zeros((len(chosen) + 1, SIZE))
+    np.add.at(total, labels, moments)
     total[0] = 0
     return labels, total
 
@@ -89,8 +92,8 @@ def _borders(pairs: NDArray[np.intp], count: int) -> NDArray[np.float64]:
     """Length of the border between every two patches, in blocks: (count, count), symmetric."""
     pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs > 0).all(axis=1)]
     border = np.bincount(pairs[:, 0] * count + pairs[:, 1], minlength=count * count)
-    border = border.reshape(count, count).astype(np.float64)
-    return border + border.T
+    square: NDArray[np.float64] = border.reshape(count, count).astype(np.float64)
+    return square + square.T
 
 
 @njit(cache=True)

@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.sensor import SensorModel
+
 SIZE = 12
 CHI2, COUNT, RATIO = 9, 10, 11
 """Entries of a moment vector: w y^2, number of pixels, sum of the variance ratio."""
@@ -118,3 +120,63 @@ def block_moments(
             if not whole or block[COUNT] < 0.7 * size * size:
                 block[:] = 0
     return moments
+
+
+def block_links(
+    horizontal: NDArray[np.float32], vertical: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Whether a block touches its right, its lower neighbour: along half of their border at least.
+
+    Parameters
+    ----------
+    horizontal, vertical : (H, W-1), (H-1, W) float32
+        Neighbourhood weights.
+    size : int
+        Rows and columns of a block.
+
+    Returns
+    -------
+    right, below : (rows, columns-1), (rows-1, columns) bool
+    """
+    rows, columns = -(-len(horizontal) // size), -(-vertical.shape[1] // size)
+    right = (horizontal[:, size - 1 :: size] > 0)[:, : columns - 1]
+    below = (vertical[size - 1 :: size] > 0)[: rows - 1]
+    right_pixels = np.add.reduceat(right.view(np.uint8), np.arange(0, len(right), size), axis=0)
+    below_pixels = np.add.reduceat(
+        below.view(np.uint8), np.arange(0, below.shape[1], size), axis=1
+    )
+    return 2 * right_pixels >= size, 2 * below_pixels >= size
+
+
+def residual_noise(
+    blocks: NDArray[np.float64], size: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean inverse range and unbiased mean square residual of the complete blocks.
+
+    Parameters
+    ----------
+    blocks : (rows, columns, 12) float64
+        With unit weights.
+    size : int
+        Rows and columns of a block.
+    """
+    complete = blocks[blocks[..., COUNT] == size * size]
+    _, residual = fit_all(complete)
+    return np.sqrt(complete[:, CHI2]) / size, residual / (size * size - 3)
+
+
+def weighted(blocks: NDArray[np.float64], sensor: SensorModel) -> NDArray[np.float64]:
+    """Blocks with weights according to the sensor, and the ratio of its variances.
+
+    Parameters
+    ----------
+    blocks : (rows, columns, 12) float64
+        With unit weights.
+    sensor : SensorModel
+    """
+    result = blocks.copy()
+    inverse = np.sqrt(blocks[..., CHI2] / np.maximum(blocks[..., COUNT], 1))
+    weight = 1 / sensor.variance(inverse)
+    result[..., :COUNT] *= weight[..., None]
+    result[..., RATIO] = blocks[..., COUNT] * sensor.systematic_variance(inverse) * weight
+    return result

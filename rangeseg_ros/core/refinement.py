@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.growing import DISTORTION_PIXELS
 from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, add_pixel, fit_all
 from rangeseg_ros.core.moves import minimum_cut
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import FLOOR, SensorModel
 
 # Noise agrees over patches of about this many pixels, so that many count as one measurement.
 _PATCH = 3.0
@@ -29,6 +31,48 @@ _CAP = 8.0 / _PATCH
 _GRANTED = 2.0
 # Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
 _REACH, _BAND = 3, 4
+
+
+BLOCK = 4
+"""Rows and columns of the blocks that surfaces are grown from."""
+_SEED = 250
+"""Pixels of the smallest surface whose plane is tried."""
+_ROUNDS = 2
+
+
+def refine(
+    problem: Problem,
+    surfaces: NDArray[np.intp],
+    moments: NDArray[np.float64],
+    sensor: SensorModel,
+) -> tuple[NDArray[np.int32], float]:
+    """Label the pixels with the planes of surfaces, refit the planes, label again.
+
+    Parameters
+    ----------
+    problem : Problem
+    surfaces : (rows, columns) int
+        Surface of each block of `BLOCK` x `BLOCK` pixels, 0...K, 0 for none.
+    moments : (K + 1, 12) float64
+        Of the surfaces.
+    sensor : SensorModel
+
+    Returns
+    -------
+    labels : (H, W) int32
+        0 = no plane.
+    energy : float
+        Of that labelling with the planes it was found for.
+    """
+    kept = moments[:, COUNT] >= _SEED
+    kept[0] = True
+    surfaces = np.where(kept, np.cumsum(kept) - 1, 0)[surfaces]
+    moments = moments[kept]
+    for _ in range(_ROUNDS):
+        models = Models.of(moments)
+        labels, value = label_pixels(problem, surfaces, models)
+        moments = region_moments(problem, labels, len(moments), sensor)
+    return labels, value
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +94,31 @@ class Problem:
     weight: NDArray[np.float32]
     horizontal: NDArray[np.float32]
     vertical: NDArray[np.float32]
+
+    @classmethod
+    def of(
+        cls,
+        image: RangeImage,
+        sensor: SensorModel,
+        horizontal: NDArray[np.float32],
+        vertical: NDArray[np.float32],
+    ) -> Problem:
+        """Weigh the pixels of an image by the noise of its sensor."""
+        weight = _weights(image.inverse, sensor.noise, sensor.range_noise)
+        return cls(image.inverse, image.rays, weight, horizontal, vertical)
+
+
+@njit(cache=True)
+def _weights(
+    inverse: NDArray[np.float32], noise: float, range_noise: float
+) -> NDArray[np.float32]:
+    weight = np.zeros_like(inverse)
+    for i in range(inverse.shape[0]):
+        for j in range(inverse.shape[1]):
+            y = np.float64(inverse[i, j])
+            if y > 0:
+                weight[i, j] = 1 / (FLOOR + noise**2 + (range_noise * y * y) ** 2)
+    return weight
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +146,7 @@ class Models:
 
 
 def label_pixels(
-    problem: Problem, surfaces: NDArray[np.intp], models: Models, size: int
+    problem: Problem, surfaces: NDArray[np.intp], models: Models
 ) -> tuple[NDArray[np.int32], float]:
     """Labelling of low energy for given planes.
 
@@ -87,8 +156,6 @@ def label_pixels(
     surfaces : (rows, columns) int
         Label of each block, 0...K: planes compete for pixels near their own blocks only.
     models : Models
-    size : int
-        Rows and columns of a block.
 
     Returns
     -------
@@ -98,7 +165,6 @@ def label_pixels(
     """
     labels, cost = _nearest(
         surfaces.astype(np.int32),
-        size,
         problem.inverse,
         problem.rays,
         problem.weight,
@@ -148,7 +214,6 @@ def _data_cost(
 @njit(cache=True)
 def _nearest(
     surfaces: NDArray[np.int32],
-    size: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     weight: NDArray[np.float32],
@@ -174,8 +239,8 @@ def _nearest(
                     if not known:
                         candidates[count] = label
                         count += 1
-            for i in range(bi * size, min((bi + 1) * size, height)):
-                for j in range(bj * size, min((bj + 1) * size, width)):
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
                     if weight[i, j] == 0:
                         continue
                     best, least = 0, np.float32(_NO_PLANE)
@@ -366,24 +431,38 @@ def _expansion(
     return excess, new, first[:edges], second[:edges], link[:edges]
 
 
-@njit(cache=True)
 def region_moments(
-    labels: NDArray[np.int32],
+    problem: Problem, labels: NDArray[np.integer], count: int, sensor: SensorModel
+) -> NDArray[np.float64]:
+    """Moments (count, 12) of the pixels of each label."""
+    return _sum_moments(
+        labels,
+        count,
+        problem.inverse,
+        problem.rays,
+        problem.weight,
+        sensor.distortion,
+        sensor.range_distortion,
+    )
+
+
+@njit(cache=True)
+def _sum_moments(
+    labels: NDArray[np.integer],
     count: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     weight: NDArray[np.float32],
-    ratio: NDArray[np.float32],
-    cost: NDArray[np.float32],
+    distortion: float,
+    range_distortion: float,
 ) -> NDArray[np.float64]:
-    """Moments (count, 12) of the pixels of each label that its plane explains."""
     moments = np.zeros((count, SIZE))
     height, width = labels.shape
     for i in range(height):
         for j in range(width):
             label = labels[i, j]
-            if label > 0 and cost[i, j] < _CAP:
-                w = np.float64(weight[i, j])
-                add_pixel(moments[label], rays[i, j], inverse[i, j], w)
-                moments[label, RATIO] += ratio[i, j]
+            if label > 0:
+                y, w = np.float64(inverse[i, j]), np.float64(weight[i, j])
+                add_pixel(moments[label], rays[i, j], y, w)
+                moments[label, RATIO] += w * (distortion**2 + (range_distortion * y * y) ** 2)
     return moments

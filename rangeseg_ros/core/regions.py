@@ -133,7 +133,7 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
     return framed.reshape(height + 2, row)[1:-1, 1:-1].copy()
 
 
-def relabel(regions: NDArray[np.int32], keep: NDArray[np.bool_]) -> NDArray[np.uint16]:
+def relabel(regions: NDArray[np.integer], keep: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Number the regions to keep 1...M by falling size, the rest 0; at most 65535 are kept."""
     area = np.where(keep, np.bincount(regions.ravel(), minlength=len(keep)), 0)
     order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]

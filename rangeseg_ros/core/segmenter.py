@@ -10,14 +10,19 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core import coarse_to_fine, moves
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.curvature import curved
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle, energy
+from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
+from rangeseg_ros.core.moments import block_links, block_moments, residual_noise, weighted
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.regions import plane_regions
+from rangeseg_ros.core.refinement import BLOCK, Problem, refine
+from rangeseg_ros.core.regions import plane_regions, relabel
+from rangeseg_ros.core.sensor import SensorModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +69,49 @@ class Segmenter:
         config, watch = self.config, Stopwatch()
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        normals = observed_normals(image, config)
-        watch.lap('normals')
         horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
         watch.lap('edges')
+        method = self._by_planes if config.method == 'planes' else self._by_normals
+        regions, value = method(image, horizontal, vertical, watch)
+        planes = fit_planes(regions, image)
+        watch.lap('planes')
+        return Segmentation(regions, planes, value, watch.laps, _reason(image, planes))
+
+    def _by_planes(
+        self,
+        image: RangeImage,
+        horizontal: NDArray[np.float32],
+        vertical: NDArray[np.float32],
+        watch: Stopwatch,
+    ) -> tuple[NDArray[np.uint16], float]:
+        """Regions and energy with planes as labels."""
+        blocks = block_moments(image.inverse, image.rays, horizontal, vertical, BLOCK)
+        sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, BLOCK))
+        watch.lap('blocks')
+        links = block_links(horizontal, vertical, BLOCK)
+        surface, moments = surfaces(weighted(blocks, sensor), links)
+        watch.lap('surfaces')
+        problem = Problem.of(image, sensor, horizontal, vertical)
+        labels, value = refine(problem, surface, moments, sensor)
+        watch.lap('labels')
+        regions = plane_regions(
+            labels, image.valid & (labels > 0), horizontal, vertical, self.config
+        )
+        regions = relabel(regions, ~curved(problem, regions, sensor))
+        watch.lap('regions')
+        return regions, value
+
+    def _by_normals(
+        self,
+        image: RangeImage,
+        horizontal: NDArray[np.float32],
+        vertical: NDArray[np.float32],
+        watch: Stopwatch,
+    ) -> tuple[NDArray[np.uint16], float]:
+        """Regions and energy with discretised normals as labels (thesis 5.11)."""
+        config = self.config
+        normals = observed_normals(image, config)
+        watch.lap('normals')
         problem = normals, self._directions, horizontal, vertical, config.smoothness
         if config.exact:
             labels = moves.minimise(*problem, config.cycles, config.moves)
@@ -78,20 +122,16 @@ class Segmenter:
         watch.lap('labels')
         regions = plane_regions(labels, image.valid, horizontal, vertical, config)
         watch.lap('regions')
-        planes = fit_planes(regions, image)
-        watch.lap('planes')
-        return Segmentation(regions, planes, value, watch.laps, _reason(image, normals, planes))
+        return regions, value
 
 
-def _reason(image: RangeImage, normals: NDArray[np.float32], planes: list[Plane]) -> str:
+def _reason(image: RangeImage, planes: list[Plane]) -> str:
     """Why there is no plane; empty when there is one."""
     if planes:
         return ''
     if not image.valid.any():
         return 'no valid depth'
-    if np.isnan(normals).all():
-        return 'no surface normal: no pixel has valid neighbours far enough in all directions'
-    return 'no region large enough'
+    return 'no flat region large enough'
 
 
 class Stopwatch:

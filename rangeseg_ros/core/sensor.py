@@ -85,8 +85,6 @@ class SensorModel:
             [np.quantile(residual[part], _QUANTILE) for part in np.array_split(order, bins)]
         )
         variance = np.maximum(variance, self.variance(at))
-        if not (variance > 0).all():
-            return self
         # Relative errors count the same at every range.
         terms = np.stack([np.ones(bins), at**4], axis=1) / variance[:, None]
         (constant, quartic), _ = nnls(terms, np.ones(bins))
@@ -97,6 +95,10 @@ class SensorModel:
         )
 
 
+# No sensor is without error: an exact (simulated) image has that of its float32 numbers.
+FLOOR = 1e-12
+
+
 def _variance(constant: float, in_range: float, inverse: ArrayLike) -> NDArray[np.float64]:
     # d(1/s) = ds / s^2
-    return constant**2 + (in_range * np.asarray(inverse, np.float64) ** 2) ** 2
+    return FLOOR + constant**2 + (in_range * np.asarray(inverse, np.float64) ** 2) ** 2
