@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
 
-.PHONY: test demo lint clean
+.PHONY: test demo demo-ros lint clean
 
 test: $(VENV)/installed
 	$(BIN)/python -m pytest
@@ -15,6 +15,17 @@ demo: $(VENV)/installed
 	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 15 --seed 1 --output demo/simulated
 	$(BIN)/rangeseg replay demo/simulated/bag --output demo/planes
 	@echo 'Labels, overlays and planes.csv are in $(CURDIR)/demo/planes'
+
+# A simulated camera at 10 Hz, the node, and a node that prints its planes, for 20 s.
+demo-ros: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
+demo-ros: export FASTRTPS_DEFAULT_PROFILES_FILE = $(CURDIR)/params/fastdds_large_images.xml
+demo-ros: $(VENV)/installed
+	rm -rf demo/ros
+	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 60 --seed 1 --output demo/ros
+	timeout 20 $(BIN)/rangeseg play demo/ros/bag --rate 0.3333 --loop & \
+	timeout 20 $(BIN)/segment_planes & \
+	timeout 20 $(BIN)/python examples/print_planes.py; \
+	wait
 
 lint: $(VENV)/linters
 	$(BIN)/ruff check .

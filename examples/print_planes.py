@@ -1,7 +1,10 @@
 """Print the largest planes once a second: how to read ~/planes in a node of one's own."""
 
+from contextlib import suppress
+
 import numpy as np
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -29,4 +32,5 @@ class PrintPlanes(Node):
 
 if __name__ == '__main__':
     rclpy.init()
-    rclpy.spin(PrintPlanes())
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
+        rclpy.spin(PrintPlanes())

@@ -1,8 +1,11 @@
 """The node over real DDS: what it publishes, when, and by which quality of service."""
 
 import struct
+import subprocess
+import sys
 from array import array
 from contextlib import contextmanager
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +20,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, Poi
 
 from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
 from rangeseg_ros.drawing import overlay
+
+REPOSITORY = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope='module')
@@ -167,6 +172,21 @@ def test_organised_cloud(node, expected):
     assert len(set(found.ravel()) - {0}) == 2
     # By range along unit rays instead of depth, thresholds are met by other pixels at the crease.
     assert np.mean((found > 0) == (expected > 0)) > 0.95
+
+
+def test_the_example_of_the_readme_reads_the_planes(bench):
+    example = REPOSITORY / 'examples' / 'print_planes.py'
+    source = example.read_text()
+    shown = source[source.index('class ') : source.index('\n\n\nif __name__')]
+    assert shown in (REPOSITORY / 'README.md').read_text()
+    run = subprocess.Popen([sys.executable, example], stderr=subprocess.PIPE, text=True)
+    bench.until(lambda: bench.node.count_subscribers('/segment_planes/planes'))
+    bench.stream()
+    assert '2 planes in camera_depth_optical_frame' in run.stderr.readline()
+    # The walls are a square root of 2 away.
+    assert 'distance 1.41' in run.stderr.readline()
+    run.terminate()
+    assert run.wait(20) == 0 and 'Traceback' not in run.stderr.read()
 
 
 def test_diagnostics_tell_where_the_time_goes(bench):
