@@ -90,14 +90,15 @@ class Config:
         choices=('uniform', 'distance'),
     )
     smoothness: float = option(
-        55.0,
-        'method normals: lambda of eq. 5.3, weight of the Potts prior against degrees of angle',
+        100.0,
+        'method normals: lambda of eq. 5.3, weight of the Potts prior against degrees of angle; '
+        'the thesis uses 55, with normal_baseline 1',
         low=0.0,
         high=10000.0,
     )
     moves: str = option(
         'expansion',
-        'method normals: alpha-expansion or alpha-beta-swap',
+        'method normals: alpha-expansion or alpha-beta-swap; the latter only with exact',
         choices=('expansion', 'swap'),
     )
     cycles: int = option(

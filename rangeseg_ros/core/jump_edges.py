@@ -19,7 +19,82 @@ def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
     """Jump edges by the method that `config` names."""
     if config.jump_edges == 'plane':
         return plane_deviation(image, config.edge_step)
+    if config.jump_edges == 'sobel':
+        return beside(sobel(image))
     return None
+
+
+def sobel(image: RangeImage) -> NDArray[np.bool_]:
+    """Pixels on thresholded ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
+
+    Median filter, Sobel operators, the threshold of eq. 2.6, ridge thinning, morphological
+    bridging. Windows that hold a pixel without measurement respond with nothing (section 6.7).
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    valid = image.valid
+    with np.errstate(divide='ignore'):
+        depth = np.where(valid, 1 / image.inverse, 0).astype(np.float32)
+    depth = np.where(_complete(valid), cv2.medianBlur(depth, _WINDOW), depth)
+    complete = _complete(valid)
+    gx = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 1, 0), 0)
+    gy = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 0, 1), 0)
+    strength = gx * gx + gy * gy
+    strong = strength > 4 * strength[complete].mean() if complete.any() else complete
+    # A ridge is no lower than the pixel before and higher than the one after, across it.
+    framed = np.pad(strength, 1)
+    left, right = framed[1:-1, :-2], framed[1:-1, 2:]
+    upper, lower = framed[:-2, 1:-1], framed[2:, 1:-1]
+    steep = np.abs(gx) >= np.abs(gy)
+    ridge = np.where(
+        steep,
+        (strength >= left) & (strength > right),
+        (strength >= upper) & (strength > lower),
+    )
+    return _bridged(strong & ridge)
+
+
+def beside(pixels: NDArray[np.bool_]) -> GridEdges:
+    """All edges of the given pixels (H, W): edge pixels are disconnected from everything."""
+    return pixels[:, 1:] | pixels[:, :-1], pixels[1:] | pixels[:-1]
+
+
+def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels whose 3 x 3 window, as far as it lies in the image, was measured throughout."""
+    return cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+# The eight neighbours in a circle, as bits, and the offsets of each: (row, column).
+_RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
+
+
+def _bridged(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
+    kernel = np.zeros((3, 3), np.float32)
+    for bit, position in enumerate(_RING):
+        kernel[position] = 1 << bit
+    pattern = cv2.filter2D(
+        edges.astype(np.uint8), cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT
+    )
+    return edges | _JOINS[pattern]
+
+
+def _joins(pattern: int) -> bool:
+    """Whether the neighbours set in a pattern of eight bits fall apart without the centre."""
+    ring = np.zeros((3, 3), np.uint8)
+    for bit, position in enumerate(_RING):
+        ring[position] = pattern >> bit & 1
+    return cv2.connectedComponents(ring, connectivity=8)[0] > 2
+
+
+_JOINS = np.array([_joins(pattern) for pattern in range(256)])
 
 
 def plane_deviation(image: RangeImage, step: float) -> GridEdges:
@@ -54,9 +129,7 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
     return horizontal, vertical
 
 
-def _mean(
-    inverse: NDArray[np.float32], mask: NDArray[np.float32], window: int
-) -> NDArray[np.float32]:
+def _mean(inverse: NDArray[np.float32], mask: NDArray[np.float32], window: int) -> NDArray:
     """Mean of the measured pixels of a window; NaN where there is none."""
     size = (window, window)
     border = cv2.BORDER_CONSTANT

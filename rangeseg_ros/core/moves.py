@@ -182,12 +182,12 @@ class Labelling:
         j = self._position[neighbours[:2][once]]
         self._position[pixels] = -1
         capacity = link[:2][once].astype(np.float64)
-        excess = excess.astype(np.float64)
+        price = excess.astype(np.float64)
 
         def value(chosen: NDArray[np.bool_]) -> float:
-            return excess[chosen].sum() + capacity[chosen[i] != chosen[j]].sum()
+            return price[chosen].sum() + capacity[chosen[i] != chosen[j]].sum()
 
-        chosen = minimum_cut(excess, i, j, capacity)
+        chosen = minimum_cut(price, i, j, capacity)
         return chosen if value(chosen) < value(before) - ROUNDING else None
 
 
@@ -233,4 +233,4 @@ def minimise(
     nearest = cost.nearest().reshape(normals.shape[:2])
     labelling = Labelling(nearest, cost, horizontal, vertical, smoothness)
     labelling.minimise(len(directions), cycles, moves)
-    return labelling.image
+    return labelling.image.astype(np.intp)

@@ -74,7 +74,7 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     """
     window = 2 * radius + 1
 
-    def mean(product: NDArray[np.float64]) -> NDArray[np.float64]:
+    def mean(product: NDArray[np.float64]) -> NDArray:
         return cv2.boxFilter(product, cv2.CV_64F, (window, window), borderType=cv2.BORDER_CONSTANT)
 
     valid = image.valid
