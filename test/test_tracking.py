@@ -1,0 +1,279 @@
+"""Ids over time: motion, occlusion, splitting and merging, loops; figures of known tracks."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.planes import fit_planes
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.tracking import Tracker
+from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import Scene, kinect_room
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+FLOOR = (0.0, -1.0, 0.0, 1.0)
+WALL = (0.0, 0.0, -1.0, 3.0)
+SIDE = (-1.0, 0.0, 0.0, 1.2)
+BOX = (0.0, -0.6, -0.8, 1.4)
+
+
+def moved(plane, rotation, shift):
+    """Equation of a plane of the world seen by a camera at rotation, shift."""
+    normal = np.array(plane[:3])
+    return (*(normal @ rotation), plane[3] + normal @ shift)
+
+
+def frame(*regions):
+    """Label image and planes of (rows, columns, equation) painted one over the other."""
+    labels = np.zeros(CAMERA.shape, np.uint16)
+    inverse = np.zeros(CAMERA.shape, np.float32)
+    for label, (rows, columns, plane) in enumerate(regions, 1):
+        labels[rows, columns] = label
+        facing = -CAMERA.rays[rows, columns] @ np.array(plane[:3]) / plane[3]
+        inverse[rows, columns] = facing
+    return labels, fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA))
+
+
+def ids(tracker, found, stamp=0):
+    return [plane.id for plane in tracker.track(*found, stamp)]
+
+
+def stay():
+    """Three planes that fix the motion of the camera, in the corners of the image."""
+    return [
+        (slice(90, 120), slice(0, 160), FLOOR),
+        (slice(0, 40), slice(0, 100), WALL),
+        (slice(0, 40), slice(110, 160), SIDE),
+    ]
+
+
+MIDDLE = (slice(50, 80), slice(50, 100))
+
+
+def test_ids_follow_the_planes_not_the_labels():
+    tracker = Tracker()
+    assert ids(tracker, frame(*stay())) == [1, 2, 3]
+    assert ids(tracker, frame(*stay()[::-1])) == [3, 2, 1]
+
+
+def test_the_rest_of_a_plane_is_as_it_was():
+    labels, planes = frame(*stay())
+    before = labels.copy()
+    tracked = Tracker().track(labels, planes, 0)
+    assert [p.label for p in tracked] == [1, 2, 3]
+    assert all(a.normal is b.normal for a, b in zip(tracked, planes, strict=True))
+    assert np.array_equal(labels, before)
+
+
+@pytest.mark.parametrize(('hidden', 'same'), [(5, True), (6, False)])
+def test_memory_is_exact(hidden, same):
+    tracker = Tracker(memory=5)
+    whole = frame(*stay(), (*MIDDLE, BOX))
+    assert ids(tracker, whole) == [1, 2, 3, 4]
+    for _ in range(hidden):
+        assert ids(tracker, frame(*stay())) == [1, 2, 3]
+    assert ids(tracker, whole) == [1, 2, 3, 4 if same else 5]
+
+
+def test_a_hidden_plane_moves_along_with_the_camera():
+    # Over 20 frames the camera turns 20 degrees and comes 0.4 m nearer, so that the equation of
+    # the hidden box becomes another one altogether.
+    tracker = Tracker()
+    assert ids(tracker, frame(*stay(), (*MIDDLE, BOX))) == [1, 2, 3, 4]
+    for k in range(1, 21):
+        rotation = Rotation.from_euler('xy', [k / 2, k], degrees=True).as_matrix()
+        pose = rotation, np.array([0, 0, 0.02 * k])
+        view = [(rows, columns, moved(plane, *pose)) for rows, columns, plane in stay()]
+        if k < 20:
+            assert ids(tracker, frame(*view)) == [1, 2, 3]
+    box = moved(BOX, *pose)
+    assert np.degrees(np.arccos(np.dot(box[:3], BOX[:3]))) > 15
+    # Another plane, parallel to the box and 0.2 m behind it, is not the box.
+    decoy = (*box[:3], box[3] + 0.2)
+    right = slice(50, 80), slice(20, 48)
+    assert ids(tracker, frame(*view, (*right, decoy), (*MIDDLE, box))) == [1, 2, 3, 5, 4]
+
+
+def test_another_plane_in_the_same_pixels_is_new():
+    tracker = Tracker()
+    assert ids(tracker, frame(*stay(), (*MIDDLE, BOX))) == [1, 2, 3, 4]
+    nearer = (*BOX[:3], BOX[3] - 0.4)
+    assert ids(tracker, frame(*stay(), (*MIDDLE, nearer))) == [1, 2, 3, 5]
+
+
+def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
+    tracker = Tracker()
+    whole = frame((slice(0, 80), slice(0, 160), WALL), (slice(90, 120), slice(0, 160), FLOOR))
+    split = frame(
+        (slice(0, 80), slice(0, 50), WALL),
+        (slice(0, 80), slice(70, 160), WALL),
+        (slice(90, 120), slice(0, 160), FLOOR),
+    )
+    assert ids(tracker, whole) == [1, 2]
+    assert ids(tracker, split) == [3, 1, 2]
+    # The occluder moves on: the part with the first id becomes the smaller one, and keeps it.
+    for edge in range(50, 110, 6):
+        now = frame(
+            (slice(0, 80), slice(0, edge), WALL),
+            (slice(0, 80), slice(edge + 20, 160), WALL),
+            (slice(90, 120), slice(0, 160), FLOOR),
+        )
+        assert ids(tracker, now) == [3, 1, 2]
+    # Merged again, the surface has its first id; split again, both parts have theirs.
+    assert ids(tracker, whole) == [1, 2]
+    assert ids(tracker, now) == [3, 1, 2]
+
+
+def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
+    tracker = Tracker()
+    sliver = (slice(0, 80), slice(0, 10), WALL)
+    floor = (slice(90, 120), slice(0, 160), FLOOR)
+    assert ids(tracker, frame(sliver, floor)) == [1, 2]
+    assert ids(tracker, frame(sliver, floor, (slice(0, 80), slice(20, 160), WALL))) == [1, 2, 3]
+    assert ids(tracker, frame((slice(0, 80), slice(0, 160), WALL), floor)) == [3, 2]
+
+
+def test_a_jump_back_in_time_begins_anew_without_reusing_ids():
+    tracker = Tracker()
+    assert ids(tracker, frame(*stay()), 100) == [1, 2, 3]
+    assert ids(tracker, frame(*stay()), 100) == [1, 2, 3]
+    assert ids(tracker, frame(*stay()), 99) == [4, 5, 6]
+    assert ids(tracker, frame(*stay()), 150) == [4, 5, 6]
+
+
+def test_another_image_size_begins_anew():
+    tracker = Tracker()
+    labels, planes = frame(*stay())
+    assert ids(tracker, (labels, planes)) == [1, 2, 3]
+    assert ids(tracker, (labels[::2, ::2], planes)) == [4, 5, 6]
+
+
+def test_frames_without_planes():
+    tracker = Tracker()
+    nothing = np.zeros(CAMERA.shape, np.uint16), []
+    assert ids(tracker, nothing) == []
+    assert ids(tracker, frame(*stay())) == [1, 2, 3]
+    assert ids(tracker, nothing) == []
+    assert ids(tracker, frame(*stay())) == [1, 2, 3]
+
+
+REGION = st.tuples(
+    st.integers(0, 110),
+    st.integers(0, 150),
+    st.integers(5, 60),
+    st.integers(5, 80),
+    st.sampled_from([FLOOR, WALL, SIDE, BOX, (0.0, -0.1, -0.995, 1.0)]),
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 3), st.lists(REGION, max_size=6)), max_size=8))
+def test_whatever_comes_ids_are_unique_new_after_a_jump_and_the_same_again(sequence):
+    frames = [
+        (stamp, frame(*((slice(i, i + h), slice(j, j + w), p) for i, j, h, w, p in regions)))
+        for stamp, regions in sequence
+    ]
+    tracker, again = Tracker(memory=2), Tracker(memory=2)
+    used, last = set(), 0
+    for stamp, found in frames:
+        now = ids(tracker, found, stamp)
+        assert now == ids(again, found, stamp)
+        assert len(set(now)) == len(now)
+        if stamp < last:
+            assert not used & set(now)
+        used |= set(now)
+        last = stamp
+    assert used == set(range(1, len(used) + 1))
+
+
+@pytest.mark.parametrize('seed', [0, 5])
+def test_simulated_rooms_keep_their_ids(seed):
+    """True labels of a hand-held camera, two seconds: no face changes its id, none is mixed up."""
+    camera, tracker = kinect_camera(160, 120), Tracker()
+    scene = kinect_room(seed, frames=60)
+    frames = []
+    for k in range(0, 60, 2):  # every other frame, so twice the speed
+        view = simulate_kinect(scene, camera, frame=k, noise='measured')
+        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera))
+        tracked = tracker.track(view.labels, planes, k)
+        faces = {plane.label: plane.face for plane in view.planes}
+        frames.append(ids_of_faces(view.labels, tracked, view.labels, faces, 100))
+    figures = track_figures(frames)
+    assert figures['faces'] >= 5
+    assert figures['coverage'] == 1
+    assert figures['switches'] == figures['transfers'] == 0
+
+
+def test_a_room_seen_again_from_elsewhere():
+    """The truth of a scene is one frame, then far from it: nothing may be mistaken."""
+    scene, other = kinect_room(1), kinect_room(7)
+    tracker, found = Tracker(), []
+    for k, room in enumerate((scene, other)):
+        view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(160, 120))
+        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, view.camera))
+        found.append(tracker.track(view.labels, planes, k))
+    for b in found[1]:
+        for a in found[0]:
+            if a.id == b.id:
+                assert a.normal @ b.normal > 0.9
+                assert abs(a.normal @ b.centroid + a.distance) < 0.3
+
+
+class TestFigures:
+    """Figures of sequences written by hand: frames of {face: ids}."""
+
+    def test_perfect(self):
+        figures = track_figures([{7: [1], 8: [2]}] * 4)
+        assert figures == {
+            'frames': 4,
+            'faces': 2,
+            'switches': 0,
+            'switches_per_100_frames': 0,
+            'transfers': 0,
+            'fragmentations': 0,
+            'ids_per_face': 1,
+            'coverage': 1,
+            'track_length': 4,
+        }
+
+    def test_switch(self):
+        figures = track_figures([{7: [1]}, {7: [2]}, {7: [2]}, {7: [1]}])
+        assert (figures['switches'], figures['switches_per_100_frames']) == (2, 50)
+        assert (figures['ids_per_face'], figures['track_length']) == (2, 2)
+        assert figures['transfers'] == figures['fragmentations'] == 0
+
+    def test_a_face_stays_with_its_id_while_any_part_has_it(self):
+        assert track_figures([{7: [1]}, {7: [2, 1]}, {7: [1, 2]}])['switches'] == 0
+        assert track_figures([{7: [1]}, {7: [2, 1]}, {7: [2]}])['switches'] == 1
+
+    def test_fragmentation_is_a_gap_while_in_sight(self):
+        assert track_figures([{7: [1]}, {7: []}, {7: []}, {7: [1]}])['fragmentations'] == 1
+        assert track_figures([{7: [1]}, {}, {7: [1]}])['fragmentations'] == 0
+        assert track_figures([{7: []}, {7: [1]}])['fragmentations'] == 0
+        assert track_figures([{7: [1]}, {7: []}])['coverage'] == 0.5
+
+    def test_transfer(self):
+        figures = track_figures([{7: [1], 8: [2]}, {7: [2], 8: [1]}])
+        assert (figures['transfers'], figures['switches']) == (2, 2)
+
+    def test_nothing(self):
+        assert track_figures([])['coverage'] == 0
+        assert track_figures([{7: []}])['ids_per_face'] == 0
+
+    def test_ids_of_faces(self):
+        truth = np.repeat(np.uint16([1, 2, 3, 9, 0]), [40, 30, 20, 10, 10])[None]
+        labels = np.repeat(np.uint16([1, 2, 3, 0, 4]), [30, 35, 5, 20, 20])[None]
+        planes = [p for p in frame(*stay(), (*MIDDLE, BOX))[1]]
+        tracked = Tracker().track(labels, planes, 0)
+        tracked = [p for p in tracked if p.label != 3]
+        # Label 1: 30 of 30 on face 5. Label 2: 10 on region 1 and 25 on region 2, both face 5.
+        # Label 3 is no plane. Label 4: 10 of 20 on region 9, of no face.
+        found = ids_of_faces(labels, tracked, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)
+        assert found == {5: [2, 1], 6: []}
+        assert ids_of_faces(labels, tracked, truth, {1: 5, 2: 5, 3: 6}, min_pixels=21) == {
+            5: [2, 1]
+        }
