@@ -10,7 +10,7 @@ from test_evaluate import CAMERA, depth_and_truth, segcomp_set
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation import experiments
+from rangeseg_ros.evaluation import experiments, plots
 from rangeseg_ros.evaluation.hoover import Overlap
 from rangeseg_ros.evaluation.measure import Measurement, Task
 from rangeseg_ros.io.cameras import write_camera
@@ -138,16 +138,25 @@ def test_postprocessing(folder, tmp_path, monkeypatch):
     picture(tmp_path / 'postprocessing.png')
 
 
-def test_comparison_names_its_sources(folder, tmp_path, monkeypatch):
+def test_comparison(folder, tmp_path, monkeypatch):
     args = ('comparison', folder, '--output', tmp_path, '--step', '130', '--images', '1')
     assert run(monkeypatch, *args) == 0
-    sources = {r['series']: r['source'] for r in rows(tmp_path / 'comparison.csv')}
-    assert sources['normals as published, identified'] == 'simulated set set'
-    assert sources['UFPR/OSU'] == 'real Perceptron test set, published'
+    table = rows(tmp_path / 'comparison.csv')
+    assert {r['source'] for r in table} == {'simulated set set'}
+    assert len(table) == 6 * len(experiments.variants(''))
+    assert {r['lambda'] for r in table if r['series'] == 'planes'} == {''}
     picture(tmp_path / 'comparison.png')
     assert run(monkeypatch, *args, '--real') == 0
-    sources = {r['series']: r['source'] for r in rows(tmp_path / 'comparison.csv')}
-    assert sources['planes'] == 'real set set'
+    assert {r['source'] for r in rows(tmp_path / 'comparison.csv')} == {'real set set'}
+
+
+def test_published_rows_are_named_and_drawn(tmp_path):
+    ours = {'series': 'planes', 'source': 'simulated set x', 'tolerance': 0.8}
+    table = [ours | {'regions': 14.0, 'correct': 12.0}, *experiments.published_rows()]
+    assert {r['source'] for r in table[1:]} == {'real Perceptron test set, published'}
+    assert len(table) == 1 + 6 * len(experiments.PUBLISHED)
+    plots.plot_tolerances(tmp_path / 'x.png', table, 'x')
+    picture(tmp_path / 'x.png')
 
 
 def test_timing(folder, tmp_path, monkeypatch):
@@ -188,5 +197,7 @@ def test_averages_are_over_images():
 
 def test_published_rows_are_those_of_the_thesis():
     assert experiments.PUBLISHED['thesis, identified'] == (11.6, 11.5, 11.2, 10.3, 7.1, 3.6)
-    published = Config(method='normals', normal_baseline=1, jump_edges='sobel', min_pixels=1)
+    published = Config(
+        method='normals', normal_baseline=1, jump_edges='sobel', smoothness=55.0, min_pixels=1
+    )
     assert published == experiments.THESIS

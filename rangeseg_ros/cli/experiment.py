@@ -158,15 +158,20 @@ def postprocessing(setting: Setting, step: int) -> None:
 @experiment
 @step
 def comparison(setting: Setting, step: int) -> None:
-    """Ours on the test images beside the published results (figure 6.5, table B.1)."""
+    """Ours on the test images (figure 6.5, table B.1).
+
+    On a Perceptron set, beside the published results.
+    """
     test = setting.split('test')
+    sensor = getattr(test[0], 'sensor', '')
     rows = experiments.comparison(
         setting.bench,
         setting.split('train'),
         test,
-        experiments.variants(getattr(test[0], 'sensor', '')),
+        experiments.variants(sensor),
         setting.source,
         _lambdas(step),
+        published=sensor == 'perc',
     )
     setting.save('comparison', rows, plots.plot_tolerances)
 

@@ -186,6 +186,7 @@ def comparison(
     variants: Mapping[str, Config],
     source: str,
     values: Sequence[float] = LAMBDAS,
+    published: bool = False,
 ) -> list[Row]:
     """Table B.1 and figure 6.5: variants with lambda trained, run on the test images.
 
@@ -198,6 +199,8 @@ def comparison(
         What the rows are said to be measured on.
     values : sequence of float
         Values of lambda to choose from. Method `planes` has no lambda and is not trained.
+    published : bool
+        Whether to add the published rows, which are of the Perceptron.
     """
     normals = {name: c for name, c in variants.items() if c.method == 'normals'}
     trained = {
@@ -214,7 +217,12 @@ def comparison(
         for name, measurements in bench.run(final, test).items()
         for tolerance in TOLERANCES
     ]
-    return rows + [
+    return rows + (published_rows() if published else [])
+
+
+def published_rows() -> list[Row]:
+    """Table B.1."""
+    return [
         {'series': name, 'source': 'real Perceptron test set, published', 'tolerance': tolerance}
         | {'regions': 14.8, 'correct': correct}
         for name, row in PUBLISHED.items()

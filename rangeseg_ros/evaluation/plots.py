@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -39,20 +40,31 @@ def _text(value: Any) -> Any:
 
 def plot_tolerances(path: Path, rows: Sequence[Row], title: str) -> None:
     """Correct regions against the tolerance, a line for each series; published ones dotted."""
-    figure = Figure(figsize=(8, 5.5), layout='constrained')
+    figure = Figure(figsize=(9.5, 5.5), layout='constrained')
     axes = figure.subplots()
+    colours = iter(colormaps['tab20b'](range(20)))
     for name, part in _series(rows).items():
-        published = 'published' in part[0].get('source', '')
-        note = f' (λ = {part[0]["lambda"]:g})' if part[0].get('lambda') else ''
-        style = {'linestyle': ':', 'linewidth': 1} if published else {'marker': 'o'}
+        label = name
+        style: dict[str, Any] = {'marker': 'o'}
+        if _published(part[0]):
+            label += ', published'
+            style = {'linestyle': ':', 'marker': '', 'color': next(colours)}
+        elif part[0].get('lambda'):
+            label += f' (λ = {part[0]["lambda"]:g})'
         x = [100 * row['tolerance'] for row in part]
-        axes.plot(x, [row['correct'] for row in part], label=name + note, **style)
-    ours = [row['regions'] for row in rows if 'published' not in row.get('source', '')]
+        axes.plot(x, [row['correct'] for row in part], label=label, **style)
+    ours = [row['regions'] for row in rows if not _published(row)]
     axes.axhline(ours[0], color='grey', linestyle='--', linewidth=0.8, label='regions in the set')
     _finish(axes, 'tolerance T, %', 'correct regions per image')
-    axes.legend(fontsize=7)
+    figure.legend(fontsize=8, loc='outside right upper')
+    if any(_published(row) for row in rows):
+        title += '; published: real Perceptron set'
     figure.suptitle(title)
     _save(path, figure)
+
+
+def _published(row: Row) -> bool:
+    return 'published' in row.get('source', '')
 
 
 def plot_lambdas(path: Path, rows: Sequence[Row], title: str) -> None:
