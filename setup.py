@@ -33,6 +33,7 @@ setup(
         'lz4',
         'matplotlib>=3.6',
         'mcap>=1.2.1',
+        'numba>=0.59',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'PyMaxflow>=1.3',

@@ -63,6 +63,19 @@ def test_segment_writes_labels_overlay_and_planes(folder, run):
     assert cv2.imread('out/here/2_overlay.png').shape == (48, 64, 3)
 
 
+@pytest.mark.parametrize('method', ['planes', 'normals'])
+def test_what_was_not_measured_has_no_label(folder, run, method):
+    wall = np.full((48, 64), 1500, np.uint16)
+    wall[10:30, 20:50] = 0
+    write_image(folder / 'wall.png', wall)
+    (folder / 'params.yaml').write_text(f'{{method: {method}, min_pixels: 100}}')
+    options = ('--camera', 'camera.yaml', '--output', 'out', '--params', 'params.yaml')
+    assert run('segment', 'wall.png', *options)[0] == 0
+    labels = read_labels(folder / 'out/wall_labels.png')
+    assert set(np.unique(labels[wall == 0])) == {0}
+    assert np.mean(labels[wall > 0] == 1) > 0.8
+
+
 def test_segment_reads_floats_and_scales(folder, run):
     cv2.imwrite('metres.tiff', np.full((48, 64), 1.5, np.float32))
     write_image(folder / 'fifths.png', np.full((48, 64), 7500, np.uint16))

@@ -112,7 +112,7 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
     noise : (N + 1,) bool
     """
     height, width = regions.shape
-    framed = cv2.copyMakeBorder(regions, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0).ravel()
+    framed = np.pad(regions, 1).ravel()
     kept = ~noise
     kept[0] = False
     row = width + 2
@@ -136,6 +136,7 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
 def relabel(regions: NDArray[np.integer], keep: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Number the regions to keep 1...M by falling size, the rest 0; at most 65535 are kept."""
     area = np.where(keep, np.bincount(regions.ravel(), minlength=len(keep)), 0)
+    area[0] = 0
     order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]
     table = np.zeros(len(keep), np.uint16)
     table[order] = np.arange(1, len(order) + 1)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-import shutil
-import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -23,6 +22,7 @@ from rangeseg_ros.io.depth_encodings import (
     decode_compressed,
     decode_image,
 )
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
 
 IMAGE = 'sensor_msgs/msg/Image'
@@ -281,12 +281,12 @@ class DepthBagWriter:
     def __enter__(self) -> DepthBagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = Path(tempfile.mkdtemp(prefix=f'.{self.path.name}.', dir=self.path.parent))
-        self._writer = rosbag2.Writer(
-            self._partial / self.path.name, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP
-        )
-        self._writer.open()
+        with ExitStack() as stack:
+            partial = stack.enter_context(replacing(self.path))
+            self._writer = stack.enter_context(
+                rosbag2.Writer(partial, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+            )
+            self._files = stack.pop_all()
         self._image = self._writer.add_connection(self.depth_topic, IMAGE, typestore=self._store)
         self._info = self._writer.add_connection(
             self.camera_topic, CAMERA_INFO, typestore=self._store
@@ -299,12 +299,7 @@ class DepthBagWriter:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        try:
-            self._writer.__exit__(kind, error, trace)
-            if kind is None:
-                (self._partial / self.path.name).rename(self.path)
-        finally:
-            shutil.rmtree(self._partial)
+        self._files.__exit__(kind, error, trace)
 
     def write(self, depth: NDArray[np.uint16] | NDArray[np.float32], stamp: int) -> None:
         """Append an image, (H, W) uint16 millimetres or float32 metres, at `stamp` nanoseconds."""

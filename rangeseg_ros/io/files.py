@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +12,17 @@ from pathlib import Path
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary name beside `path`; on success it is renamed to `path`, else removed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=f'.{path.name}.', dir=path.parent) as folder:
-        partial = Path(folder) / path.name
-        yield partial
-        os.replace(partial, path)
+    """Give a temporary place for a file or folder of the name of `path`.
+
+    On success it is moved to `path`; after an exception or an interruption nothing is left.
+    """
+    folder = path.with_name(f'.{os.getpid()}.{path.name}')
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        yield folder / path.name
+        os.replace(folder / path.name, path)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def natural_order(path: Path) -> list[str | int]:

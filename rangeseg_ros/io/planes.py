@@ -3,24 +3,44 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import fields
+from itertools import combinations_with_replacement
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rangeseg_ros.core.planes import Plane
 
+
+def _axes(field: str, axes: str) -> dict[str, Callable[[Any], Any]]:
+    return {f'{field}_{axis}': itemgetter(index) for index, axis in enumerate(axes)}
+
+
+def _points(points: NDArray) -> str:
+    return ';'.join(' '.join(f'{x:.6g}' for x in point) for point in points)
+
+
 # Columns of the fields that are no single value; the covariance is symmetric.
-_PARTS: dict[str, dict[str, Any]] = {
-    'normal': {'normal_x': 0, 'normal_y': 1, 'normal_z': 2},
-    'centroid': {'centroid_x': 0, 'centroid_y': 1, 'centroid_z': 2},
+_PARTS: dict[str, dict[str, Callable[[Any], Any]]] = {
+    'normal': _axes('normal', 'xyz'),
+    'centroid': _axes('centroid', 'xyz'),
     'covariance': {
-        f'covariance_{row}{column}': ('xyzd'.index(row), 'xyzd'.index(column))
-        for index, row in enumerate('xyzd')
-        for column in 'xyzd'[index:]
+        f'covariance_{"xyzd"[i]}{"xyzd"[j]}': itemgetter((i, j))
+        for i, j in combinations_with_replacement(range(4), 2)
+    },
+    'extents': {'length': itemgetter(0), 'width': itemgetter(1)},
+    'centre': _axes('centre', 'xyz'),
+    'orientation': _axes('orientation', 'xyzw'),
+    'hull': {'hull': _points},
+    'outline': {
+        'hull': lambda outline: _points(outline.hull),
+        'holes': lambda outline: '|'.join(map(_points, outline.holes)),
     },
 }
 
@@ -28,8 +48,8 @@ _PARTS: dict[str, dict[str, Any]] = {
 def columns() -> list[str]:
     """Names of the columns, in the order of the fields of `Plane`.
 
-    `covariance_xd` is that of normal_x and distance. The hull is one column of points
-    'x y z' joined by ';'.
+    `covariance_xd` is that of normal_x and distance. Outlines are points 'x y z' joined by ';',
+    holes are joined by '|'.
     """
     return [column for field in fields(Plane) for column in _PARTS.get(field.name, (field.name,))]
 
@@ -52,9 +72,7 @@ class PlaneTable:
 
     def __init__(self, path: Path, leading: Sequence[str] = ()) -> None:
         self._file = path.open('w', newline='')
-        self._writer = csv.writer(self._file, lineterminator='\n')
-        self._writer.writerow([*leading, *columns()])
-        self._file.flush()
+        self._append([[*leading, *columns()]])
 
     def __enter__(self) -> PlaneTable:
         return self
@@ -69,7 +87,13 @@ class PlaneTable:
 
     def write(self, planes: Sequence[Plane], *leading: object) -> None:
         """Append `planes`, with the values of the leading columns in each row."""
-        self._writer.writerows([*leading, *row(plane)] for plane in planes)
+        self._append([*leading, *row(plane)] for plane in planes)
+
+    def _append(self, rows: Iterable[Sequence[object]]) -> None:
+        # In one piece, so that an interruption does not cut it.
+        text = io.StringIO()
+        csv.writer(text, lineterminator='\n').writerows(rows)
+        self._file.write(text.getvalue())
         self._file.flush()
 
 
@@ -77,12 +101,10 @@ def _values(plane: Plane) -> Iterator[Any]:
     for field in fields(Plane):
         value = getattr(plane, field.name)
         if field.name in _PARTS:
-            yield from (np.asarray(value)[index] for index in _PARTS[field.name].values())
+            yield from (part(value) for part in _PARTS[field.name].values())
         else:
             yield value
 
 
 def _text(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return ';'.join(' '.join(f'{x:.6g}' for x in point) for point in value)
     return f'{value:.9g}' if isinstance(value, float | np.floating) else str(value)

@@ -1,0 +1,93 @@
+"""What the package says of itself in several places agrees."""
+
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from unittest import mock
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def setup_arguments(monkeypatch):
+    """Arguments of setup() in setup.py."""
+    monkeypatch.chdir(ROOT)
+    setuptools = pytest.importorskip('setuptools')
+    with mock.patch.object(setuptools, 'setup') as setup:
+        runpy.run_path('setup.py')
+    return setup.call_args.kwargs
+
+
+def test_setup_and_package_xml_agree(setup_arguments):
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    assert package.get('format') == '3'
+    for tag in ('name', 'version', 'license'):
+        assert package.findtext(tag) == setup_arguments[tag]
+    assert package.findtext('export/build_type') == 'ament_python'
+    (wheel_only,) = re.findall(r'pip install ([\w ]+?) -->', (ROOT / 'package.xml').read_text())
+    keys = {
+        element.text.removeprefix('python3-').lower() for element in package.iter('exec_depend')
+    }
+    aliases = {'pyyaml': 'yaml', 'opencv-python-headless': 'opencv'}
+    for requirement in setup_arguments['install_requires']:
+        name = re.match(r'[\w-]+', requirement)[0].lower()
+        assert aliases.get(name, name) in keys | set(wheel_only.lower().split())
+
+
+def test_every_module_is_packaged(setup_arguments):
+    folders = {path.parent for path in (ROOT / 'rangeseg_ros').rglob('*.py')}
+    names = {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}
+    assert set(setup_arguments['packages']) == names
+
+
+def test_everything_is_installed_where_ros_looks(setup_arguments):
+    installed = {
+        f'{folder}/{Path(file).name}'
+        for folder, files in setup_arguments['data_files']
+        for file in files
+    }
+    assert installed >= {
+        'share/ament_index/resource_index/packages/rangeseg_ros',
+        'share/rangeseg_ros/package.xml',
+        'lib/rangeseg_ros/rangeseg',
+        'lib/rangeseg_ros/segment_planes',
+    }
+    for folder in ('launch', 'params'):
+        for path in (ROOT / folder).iterdir():
+            if path.is_file():
+                assert f'share/rangeseg_ros/{folder}/{path.name}' in installed
+
+
+def test_launchers_match_the_console_scripts(setup_arguments):
+    scripts = dict(
+        re.split(r' *= *', script) for script in setup_arguments['entry_points']['console_scripts']
+    )
+    assert set(scripts) == {path.name for path in (ROOT / 'scripts').iterdir()}
+    for name, target in scripts.items():
+        launcher = ROOT / 'scripts' / name
+        assert launcher.stat().st_mode & 0o111
+        assert 'from {} import {}\n'.format(*target.split(':')) in launcher.read_text()
+
+
+def test_launcher_takes_the_python_of_its_prefix(tmp_path):
+    launcher = tmp_path / 'lib/rangeseg_ros/rangeseg'
+    launcher.parent.mkdir(parents=True)
+    shutil.copy(ROOT / 'scripts/rangeseg', launcher)
+    (tmp_path / 'bin').mkdir()
+    python = tmp_path / 'bin/python3'
+    python.write_text(f'#!/bin/sh\nPYTHONPATH={ROOT} exec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    done = subprocess.run(
+        [launcher, '--help'],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env={'PATH': '/bin:/usr/bin'},
+    )
+    assert done.stdout.startswith('Usage: rangeseg'), done.stderr
