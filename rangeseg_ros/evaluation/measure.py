@@ -154,7 +154,7 @@ class Task:
 @cache
 def _code_digest() -> bytes:
     digest = hashlib.sha256()
-    for path in sorted(Path(next(iter(rangeseg_ros.core.__path__))).glob('*.py')):
+    for path in sorted(Path(rangeseg_ros.core.__path__[0]).glob('*.py')):
         digest.update(path.read_bytes())
     return digest.digest()
 
