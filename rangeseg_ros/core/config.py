@@ -128,6 +128,13 @@ class Config:
     range_noise: float = option(
         0.0, 'random error of the range, metres, for sensors like lasers', low=0.0, high=10.0
     )
+    white_noise: float = option(
+        0.33,
+        'share of the random variance that is new in every pixel; the default is the '
+        'quantisation of a Kinect, the rest is correlated noise of 0.37 steps of the disparity',
+        low=0.0,
+        high=1.0,
+    )
     noise_correlation: float = option(
         2.0,
         'width of the Gaussian the noise looks smoothed with, pixels; 0 is white noise',

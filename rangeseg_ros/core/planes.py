@@ -1,13 +1,21 @@
-"""Planes of regions: fit, parameters, uncertainty, outline."""
+"""Planes of regions: fit, uncertainty, place and shape."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY, Cells, variances
+from rangeseg_ros.core.coplanar import common_surfaces
+from rangeseg_ros.core.extents import areas_and_axes, rectangles
+from rangeseg_ros.core.moments import COUNT, SIZE, fit_all
+from rangeseg_ros.core.outlines import Outline
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.uncertainty import plane_jacobians, theta_covariances
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,109 +28,214 @@ class Plane:
         Value in the label image, 1...
     id : int
         Identity over time; the label when nothing is tracked.
+    surface : int
+        The same for regions of one image that lie on one plane, seen apart: the label of the
+        largest of them. See `coplanar.common_surfaces`.
     normal : (3,) float64
         Unit normal towards the sensor.
     distance : float
         Distance of the origin from the plane, metres, positive for a sensor at the origin.
     covariance : (4, 4) float64
-        Covariance of (normal, distance).
+        Covariance of (normal, distance), of rank 3, from the errors of the sensor model.
     centroid : (3,) float64
-        Mean of the region's points projected to the plane, metres.
+        Mean of the points that the plane explains, projected to the plane, metres.
     count : int
-        Number of pixels.
+        Number of measured pixels.
     rms : float
-        Root mean square distance of the region's points from the plane, metres.
+        Root mean square distance from the plane, metres, of the points that it explains.
+    confidence : float
+        0...1: the share of the pixels that the plane explains, times the mean square residual that
+        the sensor model expects of them over the observed one where that is larger. About 1 for
+        planes, less for what is bent, rough or spills over its border.
     area : float
-        Area of the region on the plane, square metres.
-    hull : (N, 3) float64
-        Outline of the region on the plane, metres, counter-clockwise seen from the sensor.
+        Area of the pixels on the plane, square metres.
+    extents : (2,) float64
+        Length and width of the rectangle around the region, its sides along the principal
+        axes of the region's area, metres.
+    centre : (3,) float64
+        Centre of that rectangle, metres.
+    orientation : (4,) float64
+        Quaternion x, y, z, w of the frame whose x axis runs along the length, pointing to the
+        image's right, and whose z axis is the normal.
+    outline : Outline
+        What `hull` and `holes` are made of when first asked for.
     """
 
     label: int
     id: int
+    surface: int
     normal: NDArray[np.float64]
     distance: float
     covariance: NDArray[np.float64]
     centroid: NDArray[np.float64]
     count: int
     rms: float
+    confidence: float
     area: float
-    hull: NDArray[np.float64]
+    extents: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+    outline: Outline = field(repr=False)
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """(N, 3) outline on the plane, metres, counter-clockwise seen from the sensor.
+
+        Follows the region's largest part within `outlines.TOLERANCE` pixels; concave as it is.
+        """
+        return self.outline.hull
+
+    @property
+    def holes(self) -> list[NDArray[np.float64]]:
+        """Outlines (N, 3) of the holes in the hull, clockwise seen from the sensor."""
+        return self.outline.holes
 
 
-def fit_planes(labels: NDArray[np.uint16], image: RangeImage) -> list[Plane]:
-    """Total-least-squares plane of every region.
+def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> list[Plane]:
+    """Plane of every region.
+
+    Weighted least squares in inverse range, where a plane is linear and the error of a camera
+    lies. An organised cloud tells neither its sensor's centre nor the direction of its errors;
+    there the plane is that of total least squares of the points. Either is fitted again
+    without the pixels that the first fit leaves beyond four standard deviations of the
+    sensor's errors, as borders of regions have them.
 
     Parameters
     ----------
     labels : (H, W) uint16
-        1...M, 0 for no plane; labels without three measured pixels are left out.
+        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
     image : RangeImage
         (H, W).
+    sensor : SensorModel
+        Errors of the image.
 
     Returns
     -------
     list of Plane
         In the order of the labels.
     """
-    region = labels[image.valid]
-    points = image.points[image.valid][region > 0].astype(np.float64)
-    region = region[region > 0]
-    size = int(labels.max(initial=0)) + 1
-    count = np.bincount(region, minlength=size)
-    safe = np.maximum(count, 1)
+    errors = variances(sensor)
+    cells = Cells.of(labels, image, errors)
+    count = cells.regions()[:, COUNT].astype(int)
+    outliers = cells.without_outliers(labels, image, _theta(cells.regions()), errors)
+    sums = cells.regions()
+    theta = _theta(sums)
+    if image.camera is None:
+        theta = _total_least_squares(sums, theta)
+    found = np.flatnonzero(theta.any(axis=1))
+    if not len(found):
+        return []
 
-    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(region, values, size) / safe
+    distance = np.zeros(len(theta))
+    distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
+    normal = -theta * distance[:, None]
+    inverse = np.zeros((len(theta), 3, 3))
+    inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
+    covariance = theta_covariances(cells, theta, inverse, sensor, errors)
+    surface = common_surfaces(cells, theta, covariance, inverse, errors, sensor.distortion_length)
+    jacobian = plane_jacobians(normal, distance)
+    covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
 
-    centroid = np.stack([mean(c) for c in points.T], axis=1)
-    # Moments about the centroid: far planes would lose their digits to the distance.
-    centred = (points - centroid[region]).T
-    scatter = np.empty((size, 3, 3))
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
-        scatter[:, i, j] = scatter[:, j, i] = mean(centred[i] * centred[j])
-    variance, axes = np.linalg.eigh(scatter)
-    normal = axes[:, :, 0]
-    distance = -np.einsum('ij,ij->i', normal, centroid)
-    flip = np.where(distance < 0, -1.0, 1.0)
-    normal, distance = normal * flip[:, None], distance * flip
-    rms = np.sqrt(np.maximum(variance[:, 0], 0))
-    area = _areas(labels, image, normal, distance)
+    inliers = np.maximum(sums[:, COUNT], 1)
+    centroid = sums[:, POINT:SCATTER] / inliers[:, None]
+    scatter = symmetric(sums[:, SCATTER:]) / inliers[:, None, None]
+    offset = (normal * centroid).sum(axis=1)
+    square = np.einsum('ki,kij,kj->k', normal, scatter, normal)
+    square += distance * (2 * offset + distance)
+    rms = np.sqrt(np.maximum(square, 0))
+    centroid = centroid - (offset + distance)[:, None] * normal
+    expected = distance**2 * _expected_square(cells, theta, errors)
+    share = 1 - outliers / np.maximum(count, 1)
+    confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
+
+    area, major = areas_and_axes(labels, image, theta, _tangents(normal))
+    axes = np.stack([major, np.cross(normal, major)], axis=1)
+    limits = rectangles(labels, image, theta, axes)[found]
+    extents = limits[..., 1] - limits[..., 0]
+    centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes[found])
+    centre -= distance[found, None] * normal[found]
+    frames = np.stack([axes[found, 0], axes[found, 1], normal[found]], axis=2)
+    orientation = Rotation.from_matrix(frames).as_quat()
+    orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
     return [
         Plane(
             label=int(k),
             id=int(k),
+            surface=int(surface[k]),
             normal=normal[k],
             distance=float(distance[k]),
-            covariance=np.zeros((4, 4)),
+            covariance=covariance[k],
             centroid=centroid[k],
             count=int(count[k]),
             rms=float(rms[k]),
+            confidence=float(confidence[k]),
             area=float(area[k]),
-            hull=np.empty((0, 3)),
+            extents=extents[index],
+            centre=centre[index],
+            orientation=orientation[index],
+            outline=_outline(int(k), labels, image, cells.box[k], theta[k]),
         )
-        for k in np.flatnonzero(count >= 3)
-        if k > 0
+        for index, k in enumerate(found)
     ]
 
 
-def _areas(
+def symmetric(triangle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (N, 3, 3) of upper triangles (N, 6), row by row."""
+    return triangle[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _theta(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least-squares planes theta . ray = inverse range; zeros where there is none."""
+    theta, _ = fit_all(sums[:, :SIZE])
+    theta[sums[:, COUNT] < 3] = 0
+    return theta
+
+
+def _total_least_squares(
+    sums: NDArray[np.float64], theta: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Planes of the smallest mean square distance, in the place of those that `theta` has."""
+    count = np.maximum(sums[:, COUNT], 1)
+    mean = sums[:, POINT:SCATTER] / count[:, None]
+    scatter = symmetric(sums[:, SCATTER:]) / count[:, None, None]
+    scatter -= mean[:, :, None] * mean[:, None, :]
+    normal = np.linalg.eigh(scatter)[1][:, :, 0]
+    distance = -(normal * mean).sum(axis=1)
+    # A plane through the sensor would be invisible.
+    seen = theta.any(axis=1) & (np.abs(distance) > 1e-9)
+    return np.where(seen[:, None], -normal / np.where(seen, distance, 1)[:, None], 0)
+
+
+def _expected_square(
+    cells: Cells, theta: NDArray[np.float64], errors: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean square distance from the planes, over distance^2, that the sensor's errors make."""
+    region = np.repeat(np.arange(len(theta)), np.diff(cells.start))
+    count, weight = cells.sums[:, COUNT], cells.sums[:, WEIGHT]
+    ray = cells.sums[:, WEIGHTED_RAY:WEIGHT]
+    level = (ray * theta[region]).sum(axis=1) / np.where(count > 0, weight, 1)
+    # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
+    squared = np.where(level > 0, level, 1) ** 2
+    constant, quartic = errors[0] + errors[2], errors[1] + errors[3]
+    total = np.bincount(region, count * (constant / squared + quartic * squared), len(theta))
+    return total / np.maximum(np.bincount(region, count, len(theta)), 1)
+
+
+def _tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two unit vectors across each normal, (N, 2, 3)."""
+    across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, across)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+    return np.stack([first, np.cross(normal, first)], axis=1)
+
+
+def _outline(
+    label: int,
     labels: NDArray[np.uint16],
     image: RangeImage,
-    normal: NDArray[np.float64],
-    distance: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Area in square metres that each region's pixels cover on its plane."""
-    size = len(normal)
-    if min(image.shape) < 2:
-        return np.zeros(size)
-    # The parallelogram between the rays of neighbouring pixels, cut by the plane: with rays
-    # r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
-    rays = image.rays.astype(np.float64)
-    du, dv = np.gradient(rays, axis=1), np.gradient(rays, axis=0)
-    solid = np.abs(np.einsum('ijk,ijk->ij', np.cross(du, dv), rays))
-    at = np.einsum('ijk,ijk->ij', rays, normal[labels])
-    with np.errstate(divide='ignore', invalid='ignore'):
-        cell = distance[labels] ** 2 * solid / np.abs(at) ** 3
-    cell[~(np.isfinite(cell) & image.valid)] = 0
-    return np.bincount(labels.ravel(), cell.ravel(), size)
+    box: NDArray[np.intp],
+    theta: NDArray[np.float64],
+) -> Outline:
+    top, left, bottom, right = (int(edge) for edge in box)
+    crop = slice(top, bottom), slice(left, right)
+    return Outline(labels[crop] == label, top, left, theta, image.camera or image.rays[crop])

@@ -29,8 +29,10 @@ class SensorModel:
         Random error of the inverse range, standard deviation, 1/m.
     range_noise : float
         Random error of the range, metres.
+    white : float
+        Share of the random variance that is new in every pixel, like quantisation.
     correlation : float
-        Width of the Gaussian kernel the noise looks smoothed with, pixels; 0 for white noise.
+        Width of the Gaussian kernel the rest looks smoothed with, pixels; 0 for white noise.
     distortion : float
         Smooth systematic error of the inverse range, standard deviation, 1/m.
     range_distortion : float
@@ -41,6 +43,7 @@ class SensorModel:
 
     noise: float
     range_noise: float
+    white: float
     correlation: float
     distortion: float
     range_distortion: float
@@ -52,6 +55,7 @@ class SensorModel:
         return cls(
             config.noise,
             config.range_noise,
+            config.white_noise,
             config.noise_correlation,
             config.distortion,
             config.range_distortion,

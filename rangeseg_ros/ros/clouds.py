@@ -23,9 +23,20 @@ PLANE_TYPE = np.dtype(
         ('distance', '<f4'),
         ('label', '<u4'),
         ('id', '<u4'),
+        ('surface', '<u4'),
         ('count', '<u4'),
         ('rms', '<f4'),
+        ('confidence', '<f4'),
         ('area', '<f4'),
+        ('length', '<f4'),
+        ('width', '<f4'),
+        ('centre_x', '<f4'),
+        ('centre_y', '<f4'),
+        ('centre_z', '<f4'),
+        ('orientation_x', '<f4'),
+        ('orientation_y', '<f4'),
+        ('orientation_z', '<f4'),
+        ('orientation_w', '<f4'),
         ('covariance', '<f4', 16),
     ]
 )
@@ -68,8 +79,12 @@ def planes_from_message(cloud: Any) -> NDArray[np.void]:
     -------
     (N,) structured array, one row per plane, with the columns of `PLANE_TYPE`: `x`, `y`, `z`
     (centroid, metres), `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance`
-    (metres: normal . p + distance = 0), `label`, `id`, `count` (pixels), `rms` (metres), `area`
-    (square metres), `covariance` ((N, 16): of normal and distance, 4x4 row by row).
+    (metres: normal . p + distance = 0), `label`, `id`, `surface` (the same for parts of one plane
+    seen apart), `count` (pixels), `rms` (metres), `confidence` (0...1), `area` (square metres),
+    `length`, `width`, `centre_x`, `centre_y`, `centre_z` (of the rectangle around the region,
+    metres), `orientation_x`, `orientation_y`, `orientation_z`, `orientation_w` (quaternion of the
+    frame with x along the length and z along the normal), `covariance` ((N, 16): of normal and
+    distance, 4x4 row by row).
 
     Raises
     ------
@@ -123,9 +138,14 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 plane.distance,
                 plane.label,
                 plane.id,
+                plane.surface,
                 plane.count,
                 plane.rms,
+                plane.confidence,
                 plane.area,
+                *plane.extents,
+                *plane.centre,
+                *plane.orientation,
                 plane.covariance.ravel(),
             )
             for plane in planes

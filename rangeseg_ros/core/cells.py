@@ -1,0 +1,264 @@
+"""Sums over the cells of regions: all that planes and their uncertainty need of the pixels.
+
+Each region's bounding box is cut into at most `MOST` square cells. What is linear in the pixels,
+like a fit, adds up over cells; what couples pairs of pixels, like correlated noise, couples pairs
+of cells instead.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.moments import COUNT, add_pixel
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+
+MOST = 100
+"""Cells of a region at most."""
+WEIGHTED_RAY, WEIGHT, POINT, SCATTER, RECORD = 12, 15, 16, 19, 25
+"""Entries of a cell after its moment vector: w r (3), w, p (3), p p^T (6); their number."""
+# Standard deviations of random and systematic error beyond which a pixel is an outlier.
+_OUTLIER = 4.0
+
+
+class Cells(NamedTuple):
+    """Regions 0...M cut into cells; region 0 has none.
+
+    Attributes
+    ----------
+    box : (M + 1, 4) int
+        First row and column of each region, and the ones after its last; zeros without pixels.
+    border : (M + 1,) int
+        Sides of pixels where a region ends.
+    size : (M + 1,) int
+        Rows and columns of a region's cells.
+    columns : (M + 1,) int
+        Cells side by side.
+    start : (M + 2,) int
+        Where each region's cells begin in `sums`.
+    sums : (N, 25) float64
+        A moment vector and the entries after it, for each cell.
+    """
+
+    box: NDArray[np.intp]
+    border: NDArray[np.intp]
+    size: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    start: NDArray[np.intp]
+    sums: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, labels: NDArray[np.uint16], image: RangeImage, variances: NDArray[np.float64]
+    ) -> Cells:
+        """Sums over all measured pixels.
+
+        Parameters
+        ----------
+        labels : (H, W) uint16
+            0...M.
+        image : RangeImage
+            (H, W).
+        variances : (4,) float64
+            See `variances`.
+        """
+        box, border = _boxes(labels, int(labels.max(initial=0)) + 1)
+        rows, columns = box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]
+        size = np.maximum(np.ceil(np.sqrt(rows * columns / MOST)).astype(np.intp), 1)
+        while (large := -(-rows // size) * -(-columns // size) > MOST).any():
+            size += large
+        rows, columns = -(-rows // size), -(-columns // size)
+        start = np.concatenate([[0], np.cumsum(rows * columns)])
+        cells = cls(box, border, size, columns, start, np.zeros((start[-1], RECORD)))
+        central = image.camera is not None
+        _accumulate(labels, image.inverse, image.rays, cells, variances, central)
+        return cells
+
+    def without_outliers(
+        self,
+        labels: NDArray[np.uint16],
+        image: RangeImage,
+        theta: NDArray[np.float64],
+        variances: NDArray[np.float64],
+    ) -> NDArray[np.intp]:
+        """Take the pixels that the planes `theta` (M + 1, 3) do not explain out of the sums.
+
+        A region keeps all of its pixels where that would be more than half of them: then it is
+        the sensor model that does not fit.
+
+        Returns
+        -------
+        (M + 1,) int
+            Number of outliers, whether taken out or kept.
+        """
+        central = image.camera is not None
+        return _subtract(labels, image.inverse, image.rays, self, variances, central, theta)
+
+    def regions(self) -> NDArray[np.float64]:
+        """Sums over whole regions, (M + 1, 25)."""
+        total = np.zeros((len(self.size), RECORD))
+        filled = np.flatnonzero(np.diff(self.start))
+        if len(filled):
+            total[filled] = np.add.reduceat(self.sums, self.start[filled])
+        return total
+
+
+def variances(sensor: SensorModel) -> NDArray[np.float64]:
+    """Variances of a sensor for the compiled loops.
+
+    (4,): random and systematic, each a + b y^4 at the inverse range y, as a, b.
+    """
+    parts = sensor.noise, sensor.range_noise, sensor.distortion, sensor.range_distortion
+    # Not quite 0: weights are reciprocals.
+    return np.maximum(np.square(parts), (1e-24, 0, 0, 0))
+
+
+@njit(cache=True)
+def _boxes(labels: NDArray[np.uint16], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Bounding box of each label and the number of pixel sides along its border."""
+    height, width = labels.shape
+    box = np.zeros((count, 4), np.intp)
+    border = np.zeros(count, np.intp)
+    for i in range(height):
+        before = 0
+        for j in range(width):
+            label = int(labels[i, j])
+            above = int(labels[i - 1, j]) if i > 0 else 0
+            if label != above:
+                border[label] += 1
+                border[above] += 1
+            if label != before:
+                border[label] += 1
+                border[before] += 1
+                _reach(box[before], i, j)
+                if label > 0:
+                    if box[label, 3] == 0:
+                        box[label, 0], box[label, 1] = i, j
+                    box[label, 1] = min(box[label, 1], j)
+            before = label
+        _reach(box[before], i, width)
+        border[before] += 1
+    for j in range(width):
+        border[labels[height - 1, j]] += 1
+    box[0] = 0
+    return box, border
+
+
+@njit(cache=True)
+def _reach(box: NDArray[np.intp], row: int, after: int) -> None:
+    """Let a box reach to a row, and to the column before `after`."""
+    box[2] = max(box[2], row + 1)
+    box[3] = max(box[3], after)
+
+
+@njit(cache=True)
+def _add(
+    record: NDArray[np.float64],
+    ray: NDArray[np.float32],
+    y: float,
+    variances: NDArray[np.float64],
+    central: bool,
+    sign: float,
+) -> None:
+    """Add a pixel to a cell, or take it out."""
+    # Seen from one centre, the error is in the inverse range; otherwise its direction is
+    # unknown, and the weights are those of plain distances from the plane (up to a constant).
+    squared = y * y
+    w = 1 / (variances[0] + variances[1] * squared * squared) if central else 1 / squared
+    w *= sign
+    add_pixel(record, ray, y, w)
+    record[COUNT] += sign - 1
+    x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
+    record[WEIGHTED_RAY] += w * x0
+    record[WEIGHTED_RAY + 1] += w * x1
+    record[WEIGHTED_RAY + 2] += w * x2
+    record[WEIGHT] += w
+    x0, x1, x2 = x0 / y, x1 / y, x2 / y
+    record[POINT] += sign * x0
+    record[POINT + 1] += sign * x1
+    record[POINT + 2] += sign * x2
+    record[SCATTER] += sign * x0 * x0
+    record[SCATTER + 1] += sign * x0 * x1
+    record[SCATTER + 2] += sign * x0 * x2
+    record[SCATTER + 3] += sign * x1 * x1
+    record[SCATTER + 4] += sign * x1 * x2
+    record[SCATTER + 5] += sign * x2 * x2
+
+
+@njit(cache=True)
+def _index(cells: Cells, label: int, i: int, j: int) -> int:
+    """Cell of a pixel."""
+    size = cells.size[label]
+    row, column = (i - cells.box[label, 0]) // size, (j - cells.box[label, 1]) // size
+    return int(cells.start[label] + row * cells.columns[label] + column)
+
+
+@njit(cache=True)
+def _accumulate(
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    cells: Cells,
+    variances: NDArray[np.float64],
+    central: bool,
+) -> None:
+    """Add every measured pixel to its cell."""
+    height, width = labels.shape
+    for i in range(height):
+        last, end, cell = 0, 0, 0
+        for j in range(width):
+            label = int(labels[i, j])
+            y = float(inverse[i, j])
+            if label == 0 or y == 0:
+                continue
+            # Divisions only where another cell begins.
+            if label != last or j >= end:
+                last, size, left = label, cells.size[label], cells.box[label, 1]
+                end = left + ((j - left) // size + 1) * size
+                cell = _index(cells, label, i, j)
+            _add(cells.sums[cell], rays[i, j], y, variances, central, 1.0)
+
+
+@njit(cache=True)
+def _subtract(
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    cells: Cells,
+    variances: NDArray[np.float64],
+    central: bool,
+    theta: NDArray[np.float64],
+) -> NDArray[np.intp]:
+    """Take outliers out of their cells; their number in each region."""
+    height, width = labels.shape
+    outliers = np.zeros(len(cells.size), np.intp)
+    counts = np.zeros(len(cells.size), np.intp)
+    found = np.empty(labels.size, np.intp)
+    number = 0
+    constant = _OUTLIER**2 * (variances[0] + variances[2])
+    quartic = _OUTLIER**2 * (variances[1] + variances[3])
+    for i in range(height):
+        for j in range(width):
+            label = int(labels[i, j])
+            y = float(inverse[i, j])
+            if label == 0 or y == 0:
+                continue
+            counts[label] += 1
+            ray, plane = rays[i, j], theta[label]
+            residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
+            squared = y * y
+            if residual * residual > constant + quartic * squared * squared:
+                outliers[label] += 1
+                found[number] = i * width + j
+                number += 1
+    for index in found[:number]:
+        i, j = index // width, index % width
+        label = int(labels[i, j])
+        if 2 * outliers[label] <= counts[label]:
+            record = cells.sums[_index(cells, label, i, j)]
+            _add(record, rays[i, j], float(inverse[i, j]), variances, central, -1.0)
+    return outliers
