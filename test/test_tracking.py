@@ -7,13 +7,16 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.planes import fit_planes
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.core.tracking import Tracker
 from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import Scene, kinect_room
 
+KINECT = SensorModel.from_config(Config())
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 FLOOR = (0.0, -1.0, 0.0, 1.0)
 WALL = (0.0, 0.0, -1.0, 3.0)
@@ -35,7 +38,7 @@ def frame(*regions):
         labels[rows, columns] = label
         facing = -CAMERA.rays[rows, columns] @ np.array(plane[:3]) / plane[3]
         inverse[rows, columns] = facing
-    return labels, fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA))
+    return labels, fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
 
 
 def ids(tracker, found, stamp=0):
@@ -198,7 +201,7 @@ def test_simulated_rooms_keep_their_ids(seed):
     frames = []
     for k in range(0, 60, 2):  # every other frame, so twice the speed
         view = simulate_kinect(scene, camera, frame=k, noise='measured')
-        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera))
+        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
         tracked = tracker.track(view.labels, planes, k)
         faces = {plane.label: plane.face for plane in view.planes}
         frames.append(ids_of_faces(view.labels, tracked, view.labels, faces, 100))
@@ -214,7 +217,7 @@ def test_a_room_seen_again_from_elsewhere():
     tracker, found = Tracker(), []
     for k, room in enumerate((scene, other)):
         view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(160, 120))
-        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, view.camera))
+        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, view.camera), KINECT)
         found.append(tracker.track(view.labels, planes, k))
     for b in found[1]:
         for a in found[0]:
@@ -267,9 +270,8 @@ class TestFigures:
     def test_ids_of_faces(self):
         truth = np.repeat(np.uint16([1, 2, 3, 9, 0]), [40, 30, 20, 10, 10])[None]
         labels = np.repeat(np.uint16([1, 2, 3, 0, 4]), [30, 35, 5, 20, 20])[None]
-        planes = [p for p in frame(*stay(), (*MIDDLE, BOX))[1]]
-        tracked = Tracker().track(labels, planes, 0)
-        tracked = [p for p in tracked if p.label != 3]
+        planes = frame(*stay(), (*MIDDLE, BOX))[1]
+        tracked = [p for p in Tracker().track(labels, planes, 0) if p.label != 3]
         # Label 1: 30 of 30 on face 5. Label 2: 10 on region 1 and 25 on region 2, both face 5.
         # Label 3 is no plane. Label 4: 10 of 20 on region 9, of no face.
         found = ids_of_faces(labels, tracked, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)

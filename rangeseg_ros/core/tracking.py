@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.planes import Plane
 
@@ -24,6 +25,8 @@ _SAMPLES = 60
 # their pixels are not the same: an offset, as share of the range, and an angle, at least and
 # for an offset over the plane's radius.
 _OFFSET, _ANGLE = 0.007, np.radians(1.0)
+# Larger standard deviations do not count: what is known of such planes fits anything.
+_LARGEST_OFFSET, _LARGEST_ANGLE = 0.03, np.radians(5.0)
 # Area in square metres that a plane counts with at least.
 _SMALLEST = 1e-4
 # Largest squared distance in standard deviations, of two degrees of freedom, that may match.
@@ -136,7 +139,7 @@ class _Tracks:
             samples[footprint] - 1,
         )
 
-    @property
+    @cached_property
     def size(self) -> NDArray[np.intp]:
         """(N,) number of samples of each plane."""
         return np.bincount(self.owner, minlength=len(self.id))
@@ -203,7 +206,8 @@ def _offset(known: _Tracks, seen: _Tracks) -> NDArray[np.float64]:
 
 def _variances(known: _Tracks, seen: _Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(T, N) variances to expect of the angles and offsets of planes of one surface."""
-    floor = _OFFSET**2 * np.einsum('ni,ni->n', seen.centroid, seen.centroid)
+    ranges = np.einsum('ni,ni->n', seen.centroid, seen.centroid)
+    floor = _OFFSET**2 * ranges
     lever = np.column_stack([seen.centroid, np.ones(len(seen.id))])
     spread = np.einsum('ni,nj->nij', lever, lever).reshape(len(lever), 16)
     # h^T C h for the covariances of both planes: that of the known one at a centroid far from
@@ -214,7 +218,7 @@ def _variances(known: _Tracks, seen: _Tracks) -> tuple[NDArray[np.float64], NDAr
         *(np.trace(t.covariance[:, :3, :3], axis1=1, axis2=2) for t in (known, seen))
     )
     angle += floor * np.add.outer(known.radius**-2, seen.radius**-2) + _ANGLE**2
-    return angle, offset
+    return np.minimum(angle, _LARGEST_ANGLE**2), np.minimum(offset, _LARGEST_OFFSET**2 * ranges)
 
 
 def _distance(known: _Tracks, seen: _Tracks) -> NDArray[np.float64]:
@@ -243,23 +247,23 @@ def _camera_motion(
     sure &= known.normal @ seen.normal.T > np.cos(_SURE_TURN)
     t, s = np.nonzero(sure)
     angle, offset = (variance[t, s] for variance in _variances(known, seen))
+    start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
     prior = np.diag(np.repeat([_TURN**-2, _SHIFT**-2], 3))
     for _ in range(_MOTION_ROUNDS):
-        moved = known.moved(rotation, shift)
-        n, c = moved.normal[t], seen.centroid[s]
-        turn = seen.normal[s] - n
-        gap = np.einsum('ni,ni->n', n, c) + moved.distance[t]
+        n = start @ rotation.T
+        turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
+        gap = np.einsum('ni,ni->n', n, c - shift) + distance
         weight = 1 / (1 + (np.einsum('ni,ni->n', turn, turn) / angle + gap**2 / offset) / 4)
-        # w x n = turn has the normal equations (I - n n^T) w = n x turn.
-        across = np.eye(3) - n[:, :, None] * n[:, None]
-        lever = np.hstack([np.cross(n, c), -n])
-        left = prior + np.einsum('n,ni,nj->ij', weight / offset, lever, lever)
-        left[:3, :3] += np.einsum('n,nij->ij', weight / angle, across)
-        right = -(weight / offset * gap) @ lever
-        right[:3] += (weight / angle) @ np.cross(n, turn)
+        # For w x n = n' - n the normal equations are (I - n n^T) w = n x n'.
+        across = np.eye(3) * (weight / angle).sum() - (n.T * (weight / angle)) @ n
+        slope = np.hstack([lever, -n])
+        left = prior + (slope.T * (weight / offset)) @ slope
+        left[:3, :3] += across
+        right = -(weight / offset * gap) @ slope
+        right[:3] += (weight / angle) @ turn
         step = np.linalg.solve(left, right)
-        twist = Rotation.from_rotvec(step[:3]).as_matrix()
+        twist = cv2.Rodrigues(step[:3])[0]
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
     return rotation, shift
 
@@ -289,11 +293,13 @@ def _oldest(
 ) -> NDArray[np.int64]:
     """(N,) ids of the matched planes, 0 for the others; of merged parts the lowest id."""
     matched = np.flatnonzero(match >= 0)
+    kept = match[matched]
+    free = known.unseen == 0
+    free[kept] = False
+    merged = free[:, None] & (2 * shared > known.size[:, None])[:, matched]
+    merged &= (distance <= _GATE)[:, matched] & (4 * known.size[:, None] >= known.size[kept])
+    parts = np.where(merged, known.id[:, None], known.id[kept])
     ids = np.zeros(len(match), np.int64)
-    ids[matched] = known.id[match[matched]]
-    merged = (2 * shared > known.size[:, None]) & (distance <= _GATE)
-    merged &= (known.unseen == 0)[:, None] & ~np.isin(np.arange(len(known.id)), match)[:, None]
-    for n in matched:
-        parts = known.id[merged[:, n] & (4 * known.size >= known.size[match[n]])]
-        ids[n] = min(ids[n], parts.min(initial=ids[n]))
+    if len(kept):
+        ids[matched] = parts.min(axis=0)
     return ids
