@@ -13,9 +13,10 @@ from rangeseg_ros.core.sensor import SensorModel
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
 # within two and a half times that.
-_SHARE, _PIXELS, _EXPONENT = 1.4**2, 1e4, 0.78
-# Nine agreeing pixels count as one; three terms of curvature; three standard deviations.
-_NOISE = 9.0 * 3.0 * 9.0
+_SHARE, _PIXELS, _EXPONENT = 1.35**2, 1e4, 0.78
+# Nine agreeing pixels count as one; the chi-squared of three terms of curvature stays below four
+# times its mean.
+_NOISE = 9.0 * 3.0 * 4.0
 _STRIDE = 2
 # Standard deviations, of noise and twice the distortion, to which a residual is the region's.
 _INLIER = 4.0

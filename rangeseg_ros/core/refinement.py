@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 
 from rangeseg_ros.core.growing import DISTORTION_PIXELS
 from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, add_pixel, fit_all
@@ -29,6 +30,8 @@ _NO_PLANE = 6.0 / _PATCH
 _CAP = 8.0 / _PATCH
 # Systematic variances granted to the pixels of a plane.
 _GRANTED = 2.0
+# An improvement smaller than this is rounding.
+_STEP = 1e-6
 # Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
 _REACH, _BAND = 3, 4
 
@@ -37,7 +40,6 @@ BLOCK = 4
 """Rows and columns of the blocks that surfaces are grown from."""
 _SEED = 250
 """Pixels of the smallest surface whose plane is tried."""
-_ROUNDS = 2
 
 
 def refine(
@@ -45,7 +47,7 @@ def refine(
     surfaces: NDArray[np.intp],
     moments: NDArray[np.float64],
     sensor: SensorModel,
-) -> tuple[NDArray[np.int32], float]:
+) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels with the planes of surfaces, refit the planes, label again.
 
     Parameters
@@ -61,18 +63,23 @@ def refine(
     -------
     labels : (H, W) int32
         0 = no plane.
-    energy : float
-        Of that labelling with the planes it was found for.
+    models : Models
+        The planes the labelling was found for.
     """
     kept = moments[:, COUNT] >= _SEED
     kept[0] = True
     surfaces = np.where(kept, np.cumsum(kept) - 1, 0)[surfaces]
     moments = moments[kept]
-    for _ in range(_ROUNDS):
-        models = Models.of(moments)
-        labels, value = label_pixels(problem, surfaces, models)
-        moments = region_moments(problem, labels, len(moments), sensor)
-    return labels, value
+    blocks = surfaces.astype(np.int32)
+    models = Models.of(moments)
+    labels, _ = _descended(problem, blocks, models)
+    models = Models.of(region_moments(problem, labels, len(moments), sensor))
+    labels, cost = _descended(problem, blocks, models)
+    boxes = find_objects(labels, len(moments) - 1)
+    for alpha, box in enumerate(boxes, 1):
+        if box is not None:
+            _expand(alpha, box, labels, cost, problem, models)
+    return labels, models
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,26 +152,15 @@ class Models:
         return cls(theta, 1 + _GRANTED * ratio)
 
 
-def label_pixels(
-    problem: Problem, surfaces: NDArray[np.intp], models: Models
-) -> tuple[NDArray[np.int32], float]:
-    """Labelling of low energy for given planes.
+def _descended(
+    problem: Problem, surfaces: NDArray[np.int32], models: Models
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """A labelling that no change of a single pixel improves, and what its labels cost.
 
-    Parameters
-    ----------
-    problem : Problem
-    surfaces : (rows, columns) int
-        Label of each block, 0...K: planes compete for pixels near their own blocks only.
-    models : Models
-
-    Returns
-    -------
-    labels : (H, W) int32
-        0 = no plane.
-    energy : float
+    Costs in the interior of surfaces, where no label competes, are left at 0.
     """
     labels, cost = _nearest(
-        surfaces.astype(np.int32),
+        surfaces,
         problem.inverse,
         problem.rays,
         problem.weight,
@@ -182,16 +178,17 @@ def label_pixels(
         models.theta,
         models.tolerance,
     )
-    for alpha in range(len(models.theta)):
-        _expand(alpha, labels, cost, problem, models)
-    return labels, energy(labels, cost, problem)
+    return labels, cost
 
 
-def energy(labels: NDArray[np.int32], cost: NDArray[np.float32], problem: Problem) -> float:
+def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
     """Value of eq. 5.3: data costs plus the weights of the edges between unlike labels."""
+    data = _total_cost(
+        labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
+    )
     unlike = problem.horizontal[labels[:, 1:] != labels[:, :-1]].sum(dtype=np.float64)
     unlike += problem.vertical[labels[1:] != labels[:-1]].sum(dtype=np.float64)
-    return float(cost.sum(dtype=np.float64) + _SMOOTHNESS * unlike)
+    return float(data + _SMOOTHNESS * unlike)
 
 
 @njit(cache=True)
@@ -212,6 +209,25 @@ def _data_cost(
 
 
 @njit(cache=True)
+def _total_cost(
+    labels: NDArray[np.int32],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    theta: NDArray[np.float64],
+    tolerance: NDArray[np.float64],
+) -> float:
+    total = 0.0
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if weight[i, j] > 0:
+                total += _data_cost(
+                    labels[i, j], rays[i, j], inverse[i, j], weight[i, j], theta, tolerance
+                )
+    return total
+
+
+@njit(cache=True)
 def _nearest(
     surfaces: NDArray[np.int32],
     inverse: NDArray[np.float32],
@@ -229,19 +245,24 @@ def _nearest(
     candidates = np.empty(side * side, np.int32)
     for bi in range(rows):
         for bj in range(columns):
-            count = 0
+            count, settled = 0, True
             for i in range(max(bi - _REACH, 0), min(bi + _REACH + 1, rows)):
                 for j in range(max(bj - _REACH, 0), min(bj + _REACH + 1, columns)):
                     label = surfaces[i, j]
                     known = label == 0
+                    settled &= label > 0
                     for k in range(count):
                         known |= candidates[k] == label
                     if not known:
                         candidates[count] = label
                         count += 1
+            settled &= count == 1
             for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
                 for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
                     if weight[i, j] == 0:
+                        continue
+                    if settled:
+                        labels[i, j] = candidates[0]
                         continue
                     best, least = 0, np.float32(_NO_PLANE)
                     for k in range(count):
@@ -275,91 +296,114 @@ def _descend(
 ) -> None:
     """Iterated conditional modes (Besag 1986): pixels take a neighbour's label where it pays.
 
-    In place, four sweeps. It leaves the energy in a poor local minimum, but one from which the
-    cuts have only the boundaries left to move.
+    In place, until no pixel changes. It leaves the energy in a poor local minimum, but one from
+    which the cuts have only the boundaries left to move.
     """
     height, width = labels.shape
     around = np.zeros(4, np.int32)
     links = np.zeros(4, np.float32)
-    for sweep in range(4):
-        for step_i in range(height):
-            i = step_i if sweep % 2 == 0 else height - 1 - step_i
-            for step_j in range(width):
-                j = step_j if sweep % 2 == 0 else width - 1 - step_j
-                if weight[i, j] == 0:
-                    continue
-                here = labels[i, j]
-                around[:] = here
-                links[:] = 0
-                if j > 0:
-                    around[0], links[0] = labels[i, j - 1], horizontal[i, j - 1]
-                if j + 1 < width:
-                    around[1], links[1] = labels[i, j + 1], horizontal[i, j]
-                if i > 0:
-                    around[2], links[2] = labels[i - 1, j], vertical[i - 1, j]
-                if i + 1 < height:
-                    around[3], links[3] = labels[i + 1, j], vertical[i, j]
-                unlike = False
-                for k in range(4):
-                    unlike |= around[k] != here and links[k] > 0
-                if not unlike:
-                    continue
-                total = cost[i, j]
-                for k in range(4):
-                    if around[k] != here:
-                        total += _SMOOTHNESS * links[k]
-                for k in range(5):
-                    label = around[k] if k < 4 else 0
-                    if label == labels[i, j] or (k < 4 and links[k] == 0):
-                        continue
-                    data = np.float32(
-                        _data_cost(
-                            label, rays[i, j], inverse[i, j], weight[i, j], theta, tolerance
-                        )
-                    )
-                    other = data
-                    for m in range(4):
-                        if around[m] != label:
-                            other += _SMOOTHNESS * links[m]
-                    if other < total:
-                        total, labels[i, j], cost[i, j] = other, label, data
+    queue = np.empty(height * width, np.int32)
+    queued = np.zeros((height, width), np.bool_)
+    first = last = 0
+    for i in range(height):
+        for j in range(width):
+            here = labels[i, j]
+            if (
+                (j > 0 and labels[i, j - 1] != here)
+                or (j + 1 < width and labels[i, j + 1] != here)
+                or (i > 0 and labels[i - 1, j] != here)
+                or (i + 1 < height and labels[i + 1, j] != here)
+            ) and weight[i, j] > 0:
+                queue[last] = i * width + j
+                queued[i, j] = True
+                last += 1
+    waiting = last
+    last %= len(queue)
+    while waiting > 0:
+        i, j = queue[first] // width, queue[first] % width
+        first = (first + 1) % len(queue)
+        waiting -= 1
+        queued[i, j] = False
+        here = labels[i, j]
+        around[:] = here
+        links[:] = 0
+        if j > 0:
+            around[0], links[0] = labels[i, j - 1], horizontal[i, j - 1]
+        if j + 1 < width:
+            around[1], links[1] = labels[i, j + 1], horizontal[i, j]
+        if i > 0:
+            around[2], links[2] = labels[i - 1, j], vertical[i - 1, j]
+        if i + 1 < height:
+            around[3], links[3] = labels[i + 1, j], vertical[i, j]
+        least = cost[i, j]
+        for k in range(4):
+            if around[k] != here:
+                least += _SMOOTHNESS * links[k]
+        least -= _STEP
+        for k in range(5):
+            label = around[k] if k < 4 else np.int32(0)
+            if label == here or (k < 4 and links[k] == 0):
+                continue
+            data = np.float32(
+                _data_cost(label, rays[i, j], inverse[i, j], weight[i, j], theta, tolerance)
+            )
+            total = data
+            for m in range(4):
+                if around[m] != label:
+                    total += _SMOOTHNESS * links[m]
+            if total < least:
+                least, labels[i, j], cost[i, j] = total, label, data
+        if labels[i, j] == here:
+            continue
+        for k in range(4):
+            if links[k] > 0:
+                ni, nj = i + (k == 3) - (k == 2), j + (k == 1) - (k == 0)
+                if not queued[ni, nj]:
+                    queued[ni, nj] = True
+                    queue[last] = ni * width + nj
+                    last = (last + 1) % len(queue)
+                    waiting += 1
 
 
 def _expand(
     alpha: int,
+    box: tuple[slice, slice],
     labels: NDArray[np.int32],
     cost: NDArray[np.float32],
     problem: Problem,
     models: Models,
 ) -> None:
-    """Give label `alpha` to the best set of pixels near its own, in place."""
-    own = (labels == alpha).astype(np.uint8)
+    """Give label `alpha` to the best set of pixels near its own, which `box` holds; in place."""
+    rows, columns = (slice(max(part.start - _BAND - 1, 0), part.stop + _BAND + 1) for part in box)
+    here = labels[rows, columns]
+    own = (here == alpha).astype(np.uint8)
     near = cv2.dilate(own, np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8)) > own
-    near &= problem.weight > 0
+    near &= problem.weight[rows, columns] > 0
     sites = np.flatnonzero(near)
     if not len(sites):
         return
-    index = np.full(labels.shape, -1, np.int32)
+    index = np.full(here.shape, -1, np.int32)
     index.ravel()[sites] = np.arange(len(sites))
     excess, new, first, second, link = _expansion(
         alpha,
         sites,
         index,
-        labels,
-        cost,
-        problem.inverse,
-        problem.rays,
-        problem.weight,
-        problem.horizontal,
-        problem.vertical,
+        here,
+        cost[rows, columns],
+        problem.inverse[rows, columns],
+        problem.rays[rows, columns],
+        problem.weight[rows, columns],
+        problem.horizontal[rows, columns],
+        problem.vertical[rows, columns],
         models.theta,
         models.tolerance,
     )
     switched = minimum_cut(excess, first, second, link)
     value = excess[switched].sum() + link[switched[first] != switched[second]].sum()
-    if value < -1e-6:
-        labels.ravel()[sites[switched]] = alpha
-        cost.ravel()[sites[switched]] = new[switched]
+    if value < -_STEP:
+        chosen = np.unravel_index(sites[switched], here.shape)
+        here[chosen] = alpha
+        cost[rows, columns][chosen] = new[switched]
 
 
 @njit(cache=True)

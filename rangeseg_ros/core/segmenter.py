@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.refinement import BLOCK, Problem, refine
+from rangeseg_ros.core.refinement import energy as plane_energy
 from rangeseg_ros.core.regions import plane_regions, relabel
 from rangeseg_ros.core.sensor import SensorModel
 
@@ -35,19 +38,24 @@ class Segmentation:
         0 = no plane, otherwise the label of a plane.
     planes : list of Plane
         In the order of their labels.
-    energy : float
-        Value of eq. 5.3 for the labelling the regions were made from.
     timings : dict
         Milliseconds per stage, in the order of the stages.
     reason : str
         Why there is no plane; empty when there is one.
+    energy_of_labels : callable
+        Evaluates `energy`.
     """
 
     labels: NDArray[np.uint16]
     planes: list[Plane]
-    energy: float
     timings: dict[str, float]
     reason: str
+    energy_of_labels: Callable[[], float]
+
+    @cached_property
+    def energy(self) -> float:
+        """Value of eq. 5.3 for the labelling the regions were made from, worked out when read."""
+        return self.energy_of_labels()
 
 
 class Segmenter:
@@ -72,10 +80,10 @@ class Segmenter:
         horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, value = method(image, horizontal, vertical, watch)
-        planes = fit_planes(regions, image)
+        regions, sensor, value = method(image, horizontal, vertical, watch)
+        planes = fit_planes(regions, image, sensor)
         watch.lap('planes')
-        return Segmentation(regions, planes, value, watch.laps, _reason(image, planes))
+        return Segmentation(regions, planes, watch.laps, _reason(image, planes), value)
 
     def _by_planes(
         self,
@@ -83,8 +91,8 @@ class Segmenter:
         horizontal: NDArray[np.float32],
         vertical: NDArray[np.float32],
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], float]:
-        """Regions and energy with planes as labels."""
+    ) -> tuple[NDArray[np.uint16], SensorModel, Callable[[], float]]:
+        """Regions, the sensor and the energy, with planes as labels."""
         blocks = block_moments(image.inverse, image.rays, horizontal, vertical, BLOCK)
         sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, BLOCK))
         watch.lap('blocks')
@@ -92,14 +100,14 @@ class Segmenter:
         surface, moments = surfaces(weighted(blocks, sensor), links)
         watch.lap('surfaces')
         problem = Problem.of(image, sensor, horizontal, vertical)
-        labels, value = refine(problem, surface, moments, sensor)
+        labels, models = refine(problem, surface, moments, sensor)
         watch.lap('labels')
         regions = plane_regions(
             labels, image.valid & (labels > 0), horizontal, vertical, self.config
         )
         regions = relabel(regions, ~curved(problem, regions, sensor))
         watch.lap('regions')
-        return regions, value
+        return regions, sensor, lambda: plane_energy(labels, problem, models)
 
     def _by_normals(
         self,
@@ -107,22 +115,26 @@ class Segmenter:
         horizontal: NDArray[np.float32],
         vertical: NDArray[np.float32],
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], float]:
-        """Regions and energy with discretised normals as labels (thesis 5.11)."""
+    ) -> tuple[NDArray[np.uint16], SensorModel, Callable[[], float]]:
+        """Regions, the sensor and the energy, with discretised normals as labels (thesis 5.11)."""
         config = self.config
-        normals = observed_normals(image, config)
+        normals = observed_normals(image, horizontal, vertical, config)
         watch.lap('normals')
         problem = normals, self._directions, horizontal, vertical, config.smoothness
         if config.exact:
             labels = moves.minimise(*problem, config.cycles, config.moves)
         else:
             labels = coarse_to_fine.minimise(*problem, config.cycles)
-        data = angle(np.moveaxis(normals, 2, 0), self._directions.T.astype(np.float32)[:, labels])
-        value = energy(data, labels, horizontal, vertical, config.smoothness)
         watch.lap('labels')
         regions = plane_regions(labels, image.valid, horizontal, vertical, config)
         watch.lap('regions')
-        return regions, value
+
+        def value() -> float:
+            chosen = self._directions.T.astype(np.float32)[:, labels]
+            data = angle(np.moveaxis(normals, 2, 0), chosen)
+            return energy(data, labels, horizontal, vertical, config.smoothness)
+
+        return regions, SensorModel.from_config(config), value
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:
