@@ -71,7 +71,8 @@ def minimise(
         if above is None:
             labelling.minimise(len(candidates), cycles)
         else:
-            for label, blocks in _windows(labels, tables[above], smoothness):
+            threshold = 2 * smoothness * size
+            for label, blocks in _windows(labelling, labels, tables[above], threshold):
                 labelling.expand(label, np.flatnonzero(_enlarged(blocks, above // size)))
         labels, above = labelling.image, size
     return candidates[labels[:height, :width]]
@@ -101,7 +102,12 @@ def _block_costs(cost: AngularCost, shape: tuple[int, int]) -> dict[int, NDArray
 
 def _lookup(table: NDArray[np.float32]) -> Cost:
     """Data cost of blocks from their table (K, h, w)."""
-    return lambda label, blocks: table[label].ravel().take(blocks)
+
+    def cost(label: int, blocks: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
+        costs = table[label].ravel()
+        return costs if blocks is None else costs.take(blocks)
+
+    return cost
 
 
 def _block_sum(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
@@ -126,17 +132,39 @@ def _enlarged(blocks: NDArray, ratio: int) -> NDArray:
 
 
 def _windows(
-    labels: NDArray[np.integer], table: NDArray[np.float32], smoothness: float
+    labelling: Labelling,
+    above: NDArray[np.integer],
+    table: NDArray[np.float32],
+    threshold: float,
 ) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Labels with the blocks (h, w) where they may lower the energy on the next finer level."""
+    """Labels with the blocks where they may lower the energy of the next finer level.
+
+    Parameters
+    ----------
+    labelling : Labelling
+        Of the finer level.
+    above : (h, w) int
+        Labelling of the blocks.
+    table : (K, h, w) float32
+        Data costs of the blocks.
+    threshold : float
+        What the sites of a block that suit a label better must save together.
+
+    Yields
+    ------
+    label : int
+    blocks : (h, w) bool
+        At the boundaries of the label's regions, and wherever it would save more than the
+        threshold, a block around included.
+    """
     kernel = np.ones((3, 3), np.uint8)
-    drawn = labels.astype(np.float32)
+    drawn = above.astype(np.float32)
     boundary = cv2.dilate(drawn, kernel) != cv2.erode(drawn, kernel)
-    best = table.argmin(axis=0)
-    gain = np.take_along_axis(table, labels[None], 0)[0] - table.min(axis=0)
-    # A region of one pixel, its four edges cut, costs 4 lambda.
-    best = np.where(gain > 4 * smoothness, best, -1)
-    for label in np.unique(np.append(labels, best[best >= 0])):
-        around = cv2.dilate((labels == label).astype(np.uint8), kernel) > 0
-        suited = cv2.dilate((best == label).astype(np.uint8), kernel) > 0
-        yield int(label), (around & boundary) | suited
+    saved = np.take_along_axis(table, above[None], 0)[0] - table.min(axis=0)
+    best = table.argmin(axis=0)[saved > threshold]
+    ratio = len(labelling.image) // len(above)
+    for label in np.unique(np.append(above, best)):
+        around = cv2.dilate((above == label).astype(np.uint8), kernel) > 0
+        gain = np.maximum(labelling.data - labelling.cost(int(label)), 0)
+        suited = _block_sum(gain.reshape(labelling.image.shape), ratio) > threshold
+        yield int(label), (around & boundary) | (cv2.dilate(suited.astype(np.uint8), kernel) > 0)

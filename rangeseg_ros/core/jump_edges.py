@@ -13,6 +13,9 @@ from rangeseg_ros.core.range_image import RangeImage
 GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 _WINDOW = 3
+# A step between two pixels that needs no look at their surroundings, in units of `step`: steeper
+# than all but planes seen edge-on from centimetres away.
+_CLEAR = 5
 
 
 def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
@@ -58,7 +61,7 @@ def sobel(image: RangeImage) -> NDArray[np.bool_]:
         (strength >= left) & (strength > right),
         (strength >= upper) & (strength > lower),
     )
-    return _bridged(strong & ridge)
+    return bridged(strong & ridge)
 
 
 def beside(pixels: NDArray[np.bool_]) -> GridEdges:
@@ -75,7 +78,7 @@ def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 _RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
 
 
-def _bridged(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bridged(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
     kernel = np.zeros((3, 3), np.float32)
     for bit, position in enumerate(_RING):
@@ -123,9 +126,20 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
     mask = valid.astype(np.float32)
     mean = _mean(inverse, mask, _WINDOW)
     above = inverse > _mean(inverse, mask, 2 * _WINDOW + 1)
-    across, down = _deviation(mean), _deviation(mean.T).T
-    horizontal = (across > step) & (above[:, 1:] != above[:, :-1]) & valid[:, 1:] & valid[:, :-1]
-    vertical = (down > step) & (above[1:] != above[:-1]) & valid[1:] & valid[:-1]
+    across, down = _deviation(mean, step), _deviation(mean.T, step).T
+    # A boundary that runs along the rows shows in the columns alone, the risers of its staircase
+    # too: what counts is a pixel's deviation in either direction.
+    strong = np.zeros(image.shape, bool)
+    strong[:, :-1] |= across
+    strong[:, 1:] |= across
+    strong[:-1] |= down
+    strong[1:] |= down
+    strong &= valid
+    horizontal = (above[:, 1:] != above[:, :-1]) & strong[:, 1:] & strong[:, :-1]
+    vertical = (above[1:] != above[:-1]) & strong[1:] & strong[:-1]
+    # Where three surfaces meet, two may lie on the same side of the mean.
+    horizontal |= (np.abs(np.diff(inverse, axis=1)) > _CLEAR * step) & valid[:, 1:] & valid[:, :-1]
+    vertical |= (np.abs(np.diff(inverse, axis=0)) > _CLEAR * step) & valid[1:] & valid[:-1]
     return horizontal, vertical
 
 
@@ -141,16 +155,14 @@ def _mean(inverse: NDArray[np.float32], mask: NDArray[np.float32], window: int) 
     return mean
 
 
-def _deviation(mean: NDArray[np.float32]) -> NDArray[np.float32]:
-    """How far the step across each boundary along the rows leaves the steps beside it."""
-    step = np.full((mean.shape[0], mean.shape[1] - 1 + 2 * _WINDOW), np.nan, np.float32)
+def _deviation(mean: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
+    """Whether the step across each boundary along the rows leaves the steps beside it so far."""
+    framed = np.full((mean.shape[0], mean.shape[1] - 1 + 2 * _WINDOW), np.nan, np.float32)
     # Boundary k, between pixels k and k+1: the windows around k-1 and k+2.
-    step[:, _WINDOW + 1 : -_WINDOW - 1] = mean[:, _WINDOW:] - mean[:, :-_WINDOW]
-    before, here, after = (
-        step[:, : -2 * _WINDOW],
-        step[:, _WINDOW:-_WINDOW],
-        step[:, 2 * _WINDOW :],
-    )
-    # fmin and fmax leave out a side that was not measured.
+    framed[:, _WINDOW + 1 : -_WINDOW - 1] = mean[:, _WINDOW:] - mean[:, :-_WINDOW]
+    before = framed[:, : -2 * _WINDOW]
+    here = framed[:, _WINDOW:-_WINDOW]
+    after = framed[:, 2 * _WINDOW :]
+    # fmin and fmax leave out a side that was not measured; comparisons with NaN are false.
     low, high = np.fmin(before, after), np.fmax(before, after)
-    return np.nan_to_num(np.fmax(here - high, low - here), nan=0.0)
+    return (here - high > step) | (low - here > step)

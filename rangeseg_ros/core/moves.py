@@ -14,9 +14,9 @@ cost of staying or of switching.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from itertools import combinations
+from typing import Protocol
 
 import maxflow
 import numpy as np
@@ -24,8 +24,14 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.energy import AngularCost
 
-# Data cost (n,) of a label at pixels (n,) given by their index in raster order.
-Cost = Callable[[int, NDArray[np.intp]], NDArray[np.floating]]
+
+class Cost(Protocol):
+    """Data cost (n,) of a label at pixels (n,) given by their index in raster order, or at all."""
+
+    def __call__(
+        self, label: int, pixels: NDArray[np.intp] | None = None, /
+    ) -> NDArray[np.floating]: ...
+
 
 # A move must lower the energy by more than the rounding of its sums.
 ROUNDING = 1e-3
@@ -48,6 +54,9 @@ class Labelling:
     ----------
     labels : (H * W,) int32
         In raster order.
+    data : (H * W,) float32
+        Data cost of each pixel's label.
+    cost : Cost
     """
 
     def __init__(
@@ -60,18 +69,18 @@ class Labelling:
     ) -> None:
         self._shape = height, width = labels.shape
         self.labels = labels.astype(np.int32).ravel()
-        self._cost = cost
+        self.cost = cost
         # Neighbours to the right, below, to the left, above; no weight beyond the image.
         self._offsets = np.array([[1], [width], [-1], [-width]])
         weight = np.zeros((4, height, width), np.float32)
         weight[0, :, :-1] = weight[2, :, 1:] = smoothness * horizontal
         weight[1, :-1] = weight[3, 1:] = smoothness * vertical
         self._weight = weight.reshape(4, -1)
-        self._data = np.empty(labels.size, np.float32)
+        self.data = np.empty(labels.size, np.float32)
         self._position = np.full(labels.size, -1, np.int32)
         for label in np.unique(self.labels):
             pixels = np.flatnonzero(self.labels == label)
-            self._data[pixels] = cost(int(label), pixels)
+            self.data[pixels] = cost(int(label), pixels)
 
     @property
     def image(self) -> NDArray[np.int32]:
@@ -118,18 +127,16 @@ class Labelling:
         unlike = theirs != self.labels[pixels]
         half = unlike * weight / 2
         link = weight - half
-        cost = self._cost(alpha, pixels)
+        cost = self.cost(alpha, pixels)
         known = np.where(theirs == alpha, -link, link)
-        excess = (
-            cost - self._data[pixels] - half.sum(axis=0) + np.where(free, 0, known).sum(axis=0)
-        )
+        excess = cost - self.data[pixels] - half.sum(axis=0) + np.where(free, 0, known).sum(axis=0)
         if not (excess < 0).any():
             return False
         chosen = self._best(pixels, excess, neighbours, free, link, np.zeros(len(pixels), bool))
         if chosen is None:
             return False
         self.labels[pixels[chosen]] = alpha
-        self._data[pixels[chosen]] = cost[chosen]
+        self.data[pixels[chosen]] = cost[chosen]
         return True
 
     def swap(self, alpha: int, beta: int) -> bool:
@@ -138,14 +145,14 @@ class Labelling:
         if not pixels.size:
             return False
         neighbours, weight, free = self._surroundings(pixels)
-        costs = self._cost(alpha, pixels), self._cost(beta, pixels)
+        costs = self.cost(alpha, pixels), self.cost(beta, pixels)
         before = self.labels[pixels] == alpha
         # Edges to other labels cost the same either way.
         chosen = self._best(pixels, costs[0] - costs[1], neighbours, free, weight, before)
         if chosen is None:
             return False
         self.labels[pixels] = np.where(chosen, alpha, beta)
-        self._data[pixels] = np.where(chosen, *costs)
+        self.data[pixels] = np.where(chosen, *costs)
         return True
 
     def _surroundings(

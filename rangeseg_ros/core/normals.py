@@ -10,11 +10,37 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
 
 
-def observed_normals(image: RangeImage, config: Config) -> NDArray[np.float32]:
-    """Normals by the method that `config` names, (H, W, 3); NaN where undefined."""
+def observed_normals(
+    image: RangeImage,
+    horizontal: NDArray[np.floating],
+    vertical: NDArray[np.floating],
+    config: Config,
+) -> NDArray[np.float32]:
+    """Normals by the method that `config` names.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    horizontal, vertical : (H, W-1), (H-1, W) float
+        Neighbourhood weights, 0 where disconnected.
+    config : Config
+        `normals`, `normal_baseline`, `normal_radius` and `jump_edges` are read.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        Unit vectors, NaN where undefined. With jump edges by plane deviation, which lie between
+        pixels, that is also where a tangent crosses one.
+    """
     if config.normals == 'plane_fit':
         return plane_fit(image, config.normal_radius)
-    return cross_product(image, config.normal_baseline)
+    normals = cross_product(image, config.normal_baseline)
+    if config.jump_edges == 'plane':
+        reach = config.normal_baseline
+        broken = _within(horizontal <= 0, reach) | _within(vertical.T <= 0, reach).T
+        normals[broken] = np.nan
+    return normals
 
 
 def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
@@ -107,3 +133,11 @@ def _towards_sensor(normals: NDArray, image: RangeImage) -> NDArray[np.float32]:
         scale = np.where(length > 0, -np.sign(facing) / length, np.nan)
     scale[scale == 0] = np.nan
     return (normals * scale[..., None]).astype(np.float32)
+
+
+def _within(edges: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Pixels (H, W) with an edge of (H, W-1) among the `reach` to their left or right."""
+    framed = np.pad(edges, ((0, 0), (reach, reach)))
+    kernel = np.ones((1, 2 * reach), np.uint8)
+    near = cv2.dilate(framed.astype(np.uint8), kernel, anchor=(reach, 0))
+    return near[:, reach : reach + edges.shape[1] + 1] > 0

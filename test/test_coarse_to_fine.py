@@ -1,0 +1,65 @@
+"""The fast minimiser against the full expansion on the same energy."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core import coarse_to_fine, moves
+from rangeseg_ros.core.directions import directions
+from rangeseg_ros.core.energy import angle, energy
+
+DIRECTIONS = directions('platonic', 73)
+
+
+def patches(seed, height, width, noise):
+    """Normals of a random arrangement of rectangles, noisy, with holes."""
+    random = np.random.default_rng(seed)
+    label = np.zeros((height, width), int)
+    for k in range(1, 7):
+        y, x = random.integers(0, height - 20), random.integers(0, width - 20)
+        label[y : y + random.integers(15, 45), x : x + random.integers(15, 45)] = k
+    truth = DIRECTIONS[random.permutation(len(DIRECTIONS))[:7]][label]
+    normals = truth + noise * random.normal(size=truth.shape)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals[random.random((height, width)) < 0.05] = np.nan
+    return normals.astype(np.float32), label
+
+
+def problem(seed, height=75, width=101, noise=0.15):
+    normals, label = patches(seed, height, width, noise)
+    horizontal, vertical = np.ones((height, width - 1)), np.ones((height - 1, width))
+    horizontal[10:60, 50] = 0
+    return (normals, DIRECTIONS, horizontal, vertical, 40.0), label
+
+
+def value(labels, normals, found, horizontal, vertical, smoothness):
+    data = angle(np.moveaxis(normals, 2, 0), found.T.astype(np.float32)[:, labels])
+    return energy(data, labels, horizontal, vertical, smoothness)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_energy_is_close_to_that_of_the_full_expansion(seed):
+    """0.5 % is the package's promise."""
+    arguments, _ = problem(seed)
+    fast = value(coarse_to_fine.minimise(*arguments, 5), *arguments)
+    full = value(moves.minimise(*arguments, 20), *arguments)
+    assert fast <= 1.005 * full
+
+
+def test_noise_free_patches_are_found_to_the_pixel():
+    arguments, label = problem(3, noise=0.0)
+    found = coarse_to_fine.minimise(*arguments, 5)
+    assert len(np.unique(np.stack([found.ravel(), label.ravel()]), axis=1).T) <= 7
+    assert np.mean(found == moves.minimise(*arguments, 5)) > 0.999
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 30), (7, 9), (8, 16)])
+def test_any_size_of_image(shape):
+    normals = np.tile(DIRECTIONS[5].astype(np.float32), (*shape, 1))
+    edges = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
+    assert (coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0, 3) == 5).all()
+
+
+def test_no_normal_at_all():
+    normals = np.full((20, 30, 3), np.nan, np.float32)
+    edges = np.ones((20, 29)), np.ones((19, 30))
+    assert len(np.unique(coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0, 3))) == 1

@@ -1,0 +1,158 @@
+"""Jump edges of exact scenes: where they are, that they close, and what must not fire."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.jump_edges import beside, bridged, plane_deviation, sobel
+from rangeseg_ros.core.range_image import RangeImage
+
+STEP = 0.0044
+CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)
+QUANTUM = 2.9e-3
+
+
+def image_of(inverse):
+    return RangeImage(CAMERA.rays, np.asarray(inverse, np.float32), CAMERA)
+
+
+def ramp(a=0.0, b=0.0, c=0.5):
+    """Inverse depth of a plane."""
+    rows, columns = np.indices(CAMERA.shape)
+    return c + a * (columns - 60) + b * (rows - 50)
+
+
+def parts(edges):
+    """Number of 4-connected parts that the edges cut the image into."""
+    height, width = CAMERA.shape
+    grid = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
+    grid[::2, ::2] = 1
+    grid[::2, 1::2] = ~edges[0]
+    grid[1::2, ::2] = ~edges[1]
+    return cv2.connectedComponents(grid, connectivity=4)[1][::2, ::2]
+
+
+@pytest.mark.parametrize('slope', [(0, 0), (0.002, -0.001), (-0.004, 0.003)])
+def test_planes_have_no_jump(slope):
+    horizontal, vertical = plane_deviation(image_of(ramp(*slope, c=1.0)), STEP)
+    assert not horizontal.any() and not vertical.any()
+
+
+@pytest.mark.parametrize('sign', [-1, 1])
+def test_creases_have_no_jump(sign):
+    """Two planes that meet: any slopes, convex or concave."""
+    inverse = 0.8 + sign * 0.004 * np.abs(np.indices(CAMERA.shape)[1] - 57.3)
+    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
+    assert not horizontal.any() and not vertical.any()
+
+
+@pytest.mark.parametrize('height', [2 * STEP, 0.1, -0.1])
+@pytest.mark.parametrize('slope', [(0, 0), (0.001, 0.001)])
+def test_a_jump_lies_exactly_between_its_pixels(height, slope):
+    inverse = ramp(*slope)
+    inverse[:, 70:] += height
+    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
+    expected = np.zeros_like(horizontal)
+    expected[:, 69] = True
+    np.testing.assert_array_equal(horizontal, expected)
+    assert not vertical.any()
+
+
+@pytest.mark.parametrize(
+    'outline',
+    [
+        [(30, 20), (90, 20), (90, 70), (30, 70)],
+        [(30, 20), (95, 35), (80, 80), (20, 60)],
+        [(60, 10), (64, 90), (50, 90)],
+        [(20, 50), (60, 15), (100, 50), (60, 85)],
+    ],
+)
+def test_contours_of_objects_close(outline):
+    """The object is one part, the background another, and nothing else is cut off."""
+    shape = np.zeros(CAMERA.shape, np.uint8)
+    cv2.fillPoly(shape, [np.array(outline)], 1)
+    inverse = ramp(0.0003, 0.0005) + 0.05 * shape
+    found = parts(plane_deviation(image_of(inverse), STEP))
+    assert found.max() == 2
+    np.testing.assert_array_equal(found == found[np.nonzero(shape)][0], shape > 0)
+
+
+def test_two_centimetres_at_two_metres_count_and_one_quantum_does_not():
+    depth = np.full(CAMERA.shape, 2.0)
+    depth[:, 60:] = 1.98
+    assert plane_deviation(image_of(1 / depth), STEP)[0][:, 59].all()
+    banded = ramp(0.0007)
+    banded[:, 60:] += QUANTUM
+    assert not plane_deviation(image_of(banded), STEP)[0].any()
+
+
+def test_quantised_noise_rarely_fires():
+    """Noise of a third of a quantum, correlated over two pixels, on a slanted plane."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).normal(size=CAMERA.shape), (0, 0), 2)
+    inverse = ramp(0.001, 0.0015) + 0.37 * QUANTUM * noise / noise.std()
+    inverse = QUANTUM * np.round(inverse / QUANTUM)
+    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
+    assert horizontal.mean() < 0.01 and vertical.mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    'detect', [lambda i: plane_deviation(i, STEP), lambda i: beside(sobel(i))]
+)
+def test_shadow_alone_makes_no_edge(detect):
+    inverse = ramp(0.0003, 0.0002)
+    inverse[20:40, 30:50] = 0
+    inverse[60, 10:100] = 0
+    inverse[70:90, 80] = 0
+    horizontal, vertical = detect(image_of(inverse))
+    assert not horizontal.any() and not vertical.any()
+
+
+def test_jumps_continue_up_to_a_shadow():
+    inverse = ramp()
+    inverse[:, 70:] += 0.1
+    inverse[40:60, 66:74] = 0
+    horizontal, _ = plane_deviation(image_of(inverse), STEP)
+    assert horizontal[:40, 69].all() and horizontal[60:, 69].all()
+    assert not horizontal[40:60].any()
+
+
+def test_sobel_finds_a_thin_line_beside_the_jump():
+    inverse = ramp()
+    inverse[:, 70:] += 0.2
+    edges = sobel(image_of(inverse))
+    columns = np.flatnonzero(edges.any(axis=0))
+    assert edges[2:-2].any(axis=1).all()
+    assert len(columns) == 1 and columns[0] in (69, 70)
+
+
+def test_bridging_joins_neighbours_that_do_not_touch():
+    """The example in the documentation of MATLAB's bwmorph(..., 'bridge')."""
+    edges = np.array([[1, 0, 0], [1, 0, 1], [0, 0, 1]], bool)
+    expected = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]], bool)
+    np.testing.assert_array_equal(bridged(edges), expected)
+
+
+def test_bridging_leaves_touching_neighbours_alone():
+    edges = np.zeros((7, 7), bool)
+    edges[1:6, 3] = edges[3, 3:6] = True
+    corner = np.eye(7, dtype=bool)
+    np.testing.assert_array_equal(bridged(corner), corner)
+    assert bridged(edges)[edges].all()
+
+
+def test_edge_pixels_lose_all_their_edges():
+    pixels = np.zeros((3, 3), bool)
+    pixels[1, 1] = True
+    horizontal, vertical = beside(pixels)
+    assert horizontal.tolist() == [[False] * 2, [True] * 2, [False] * 2]
+    assert vertical.T.tolist() == [[False] * 2, [True] * 2, [False] * 2]
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 7), (2, 2), (5, 3)])
+def test_small_images(shape):
+    image = RangeImage(np.ones((*shape, 3), np.float32), np.ones(shape, np.float32))
+    for edges in (plane_deviation(image, STEP), beside(sobel(image))):
+        assert edges[0].shape == (shape[0], shape[1] - 1)
+        assert edges[1].shape == (shape[0] - 1, shape[1])
+        assert not edges[0].any() and not edges[1].any()

@@ -1,0 +1,96 @@
+"""Observed normals of exact planes, their sign, and where they are undefined."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.normals import cross_product, observed_normals, plane_fit
+from rangeseg_ros.core.range_image import RangeImage
+
+CAMERA = Camera(40, 30, 50.0, 55.0, 19.0, 15.5)
+
+
+def plane_image(normal, distance, camera=CAMERA):
+    """Exact depth of the plane normal . p + distance = 0, zero where it is behind the sensor."""
+    with np.errstate(divide='ignore'):
+        depth = -distance / (camera.rays.astype(float) @ np.asarray(normal, float))
+    depth[~(depth > 0)] = 0
+    return RangeImage.from_depth(depth, camera)
+
+
+NORMALS = [(0, 0, -1), (0.3, -0.4, -np.sqrt(0.75)), (-0.6, 0.0, -0.8), (0, -0.8, -0.6)]
+METHODS = [
+    lambda image: cross_product(image, 1),
+    lambda image: cross_product(image, 3),
+    lambda image: plane_fit(image, 1),
+    lambda image: plane_fit(image, 3),
+]
+
+
+@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('normal', NORMALS)
+def test_normal_of_an_exact_plane(normal, method):
+    image = plane_image(normal, 1.7)
+    found = method(image)
+    defined = np.isfinite(found[..., 0])
+    assert defined[8:-8, 8:-8].all() or not image.valid.all()
+    assert defined.any()
+    angle = np.degrees(np.arccos(np.clip(found[defined] @ normal, -1, 1)))
+    assert angle.max() < 0.1
+    np.testing.assert_allclose(np.linalg.norm(found[defined], axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize('method', METHODS)
+def test_clouds_of_another_frame_point_to_the_sensor_too(method):
+    """The wall x = 2 in front of a scanner that looks along x."""
+    azimuth = np.radians(np.linspace(-20, 20, 40))[None, :]
+    elevation = np.radians(np.linspace(15, -15, 30))[:, None]
+    y, z = 2 * np.tan(azimuth), 2 * np.tan(elevation) / np.cos(azimuth)
+    points = np.stack(np.broadcast_arrays(2.0, y, z), axis=-1)
+    found = method(RangeImage.from_points(points))
+    np.testing.assert_allclose(found[15, 20], [-1, 0, 0], atol=2e-3)
+
+
+@pytest.mark.parametrize(('method', 'reach'), list(zip(METHODS, [1, 3, 1, 3], strict=True)))
+def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reach):
+    depth = plane_image((0, 0, -1), 1.0).points[..., 2].copy()
+    depth[15, 20] = np.nan
+    found = np.isfinite(method(RangeImage.from_depth(depth, CAMERA))[..., 0])
+    rows, columns = np.indices(found.shape)
+    inside = (rows >= reach) & (rows < 30 - reach) & (columns >= reach) & (columns < 40 - reach)
+    assert not found[~inside].any()
+    assert not found[15, 20]
+    assert not found[15, 20 + reach] and not found[15 - reach, 20]
+    assert found[inside & (np.hypot(rows - 15, columns - 20) > 1.5 * reach)].all()
+
+
+def test_thesis_form_is_the_cross_product_of_the_four_neighbours():
+    depth = np.random.default_rng(0).uniform(1, 2, CAMERA.shape)
+    image = RangeImage.from_depth(depth, CAMERA)
+    p = image.points.astype(float)
+    y, x = 11, 17
+    expected = np.cross(p[y, x + 1] - p[y, x - 1], p[y + 1, x] - p[y - 1, x])
+    expected *= -np.sign(expected @ p[y, x]) / np.linalg.norm(expected)
+    np.testing.assert_allclose(cross_product(image, 1)[y, x], expected, atol=1e-4)
+
+
+def test_tangents_do_not_cross_disconnected_edges():
+    image = plane_image((0, 0, -1), 1.0)
+    horizontal, vertical = np.ones((30, 39), np.float32), np.ones((29, 40), np.float32)
+    horizontal[12, 20] = 0  # between the pixels 20 and 21 of row 12
+    config = Config(method='normals', normal_baseline=3)
+    found = np.isfinite(observed_normals(image, horizontal, vertical, config)[..., 0])
+    row = found[12, 3:-3]
+    assert list(np.flatnonzero(~row) + 3) == [18, 19, 20, 21, 22, 23]
+    assert found[11, 3:-3].all() and found[13, 3:-3].all()
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (2, 5), (6, 6)])
+@pytest.mark.parametrize('method', METHODS)
+def test_images_too_small_have_no_normals_or_right_ones(shape, method):
+    camera = Camera(shape[1], shape[0], 50.0, 50.0, 1.0, 1.0)
+    found = method(plane_image((0, 0, -1), 1.0, camera))
+    assert found.shape == (*shape, 3)
+    defined = found[np.isfinite(found[..., 0])]
+    np.testing.assert_allclose(defined, np.tile([0, 0, -1], (len(defined), 1)), atol=1e-3)

@@ -1,0 +1,99 @@
+"""Connected components against SciPy's, noise regions by hand."""
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components as graph_components
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.regions import (
+    connected_components,
+    is_noise,
+    merge,
+    plane_regions,
+    relabel,
+)
+
+
+def uncut(shape):
+    return np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_components_of_random_images(seed):
+    random = np.random.default_rng(seed)
+    h, w = random.integers(1, 25, 2)
+    labels = random.integers(0, 3, (h, w))
+    horizontal = (random.random((h, w - 1)) < 0.8).astype(float)
+    vertical = (random.random((h - 1, w)) < 0.8).astype(float)
+    index = np.arange(h * w).reshape(h, w)
+    right = (horizontal > 0) & (labels[:, 1:] == labels[:, :-1])
+    below = (vertical > 0) & (labels[1:] == labels[:-1])
+    i = np.concatenate([index[:, :-1][right], index[:-1][below]])
+    j = np.concatenate([index[:, 1:][right], index[1:][below]])
+    count, expected = graph_components(coo_array((np.ones(len(i)), (i, j)), (h * w, h * w)))
+    found = connected_components(labels, horizontal, vertical)
+    pairs = np.unique(np.stack([found.ravel(), expected]), axis=1)
+    assert pairs.shape[1] == count == len(np.unique(found))
+
+
+def test_noise_is_less_than_two_pixels_per_pixel_of_perimeter():
+    """7 x 7: 49 pixels, 24 of them on the perimeter; 6 x 6: 36 and 20."""
+    regions = np.ones((7, 13), np.int32)
+    regions[:, 7:] = 3
+    regions[:6, 7:] = 2
+    noise = is_noise(regions)
+    assert noise.tolist() == [False, False, True, True]
+
+
+def test_no_region_is_never_noise():
+    assert not is_noise(np.zeros((3, 3), np.int32))[0]
+
+
+def test_merge_erodes_towards_the_majority():
+    regions = np.zeros((5, 12), np.int32)
+    regions[:, :5] = 1
+    regions[:, 5:7] = 2
+    regions[:, 7:] = 3
+    merged = merge(regions, np.array([False, False, True, False]))
+    expected = np.where(np.arange(12) < 6, 1, 3)
+    assert (merged == expected).all()
+
+
+def test_merge_keeps_noise_that_touches_nothing():
+    regions = np.zeros((5, 5), np.int32)
+    regions[2, 2] = 1
+    assert merge(regions, np.array([False, True]))[2, 2] == 1
+
+
+def test_relabel_counts_down_by_size():
+    regions = np.array([[1, 2, 2], [3, 3, 3], [0, 0, 0]])
+    found = relabel(regions, np.array([False, True, True, True]))
+    assert found.tolist() == [[3, 2, 2], [1, 1, 1], [0, 0, 0]]
+    assert found.dtype == np.uint16
+
+
+@pytest.mark.parametrize(
+    ('noise_regions', 'line', 'speck'), [('leave', 2, 0), ('identify', 0, 0), ('merge', 1, 1)]
+)
+def test_noise_regions_are_left_marked_or_merged(noise_regions, line, speck):
+    labels = np.zeros((40, 40), int)
+    labels[:, 20] = 5
+    labels[10, 10] = 5
+    config = Config(noise_regions=noise_regions, min_pixels=30)
+    found = plane_regions(labels, np.ones((40, 40), bool), *uncut((40, 40)), config)
+    assert found[20, 5] == 1
+    assert found[20, 35] in (1, 2)
+    assert (found[20, 20] > 0) == (line > 0)
+    assert (found[10, 10] > 0) == (speck > 0)
+
+
+def test_small_regions_and_shadow_are_no_plane():
+    labels = np.zeros((20, 20), int)
+    labels[:5, :5] = 1
+    valid = np.ones((20, 20), bool)
+    valid[:, 15:] = False
+    config = Config(min_pixels=26, noise_regions='leave')
+    found = plane_regions(labels, valid, *uncut((20, 20)), config)
+    assert not found[:5, :5].any() and not found[:, 15:].any()
+    assert (found[5:, :15] == 1).all()
