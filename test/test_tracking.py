@@ -1,5 +1,7 @@
 """Ids over time: motion, occlusion, splitting and merging, loops; figures of known tracks."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -54,6 +56,7 @@ def stay():
     ]
 
 
+ALL = slice(None)
 MIDDLE = (slice(50, 80), slice(50, 100))
 
 
@@ -131,6 +134,38 @@ def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
     assert ids(tracker, now) == [3, 1, 2]
 
 
+def test_a_surface_keeps_its_id_through_its_parts():
+    def view(*columns):
+        return frame(*((slice(0, 80), c, WALL) for c in columns), (slice(90, 120), ALL, FLOOR))
+
+    tracker = Tracker()
+
+    def surfaces(found):
+        return [(p.id, p.surface) for p in tracker.track(*found, 0)]
+
+    left, right = slice(0, 60), slice(80, 160)
+    assert surfaces(view(left)) == [(1, 1), (2, 2)]
+    assert surfaces(view(left, right)) == [(1, 1), (3, 1), (2, 2)]
+    assert surfaces(view(right)) == [(3, 1), (2, 2)]
+    assert surfaces(view(right)) == [(3, 1), (2, 2)]
+    assert surfaces(view(left, right)) == [(1, 1), (3, 1), (2, 2)]
+
+
+def test_surfaces_taken_for_one_come_apart_with_their_ids():
+    tracker = Tracker()
+    labels, planes = frame(*stay())
+
+    def surfaces(*groups):
+        grouped = [replace(p, surface=g) for p, g in zip(planes, groups, strict=True)]
+        return [p.surface for p in tracker.track(labels, grouped, 0)]
+
+    assert surfaces(1, 2, 3) == [1, 2, 3]
+    assert surfaces(1, 1, 3) == [1, 1, 3]
+    assert surfaces(1, 2, 3) == [1, 2, 3]
+    assert surfaces(1, 2, 2) == [1, 2, 2]
+    assert surfaces(1, 2, 3) == [1, 2, 3]
+
+
 def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
     tracker = Tracker()
     sliver = (slice(0, 80), slice(0, 10), WALL)
@@ -204,7 +239,8 @@ def test_simulated_rooms_keep_their_ids(seed):
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
         tracked = tracker.track(view.labels, planes, k)
         faces = {plane.label: plane.face for plane in view.planes}
-        frames.append(ids_of_faces(view.labels, tracked, view.labels, faces, 100))
+        found = {plane.label: plane.id for plane in tracked}
+        frames.append(ids_of_faces(view.labels, found, view.labels, faces, 100))
     figures = track_figures(frames)
     assert figures['faces'] >= 5
     assert figures['coverage'] == 1
@@ -270,12 +306,9 @@ class TestFigures:
     def test_ids_of_faces(self):
         truth = np.repeat(np.uint16([1, 2, 3, 9, 0]), [40, 30, 20, 10, 10])[None]
         labels = np.repeat(np.uint16([1, 2, 3, 0, 4]), [30, 35, 5, 20, 20])[None]
-        planes = frame(*stay(), (*MIDDLE, BOX))[1]
-        tracked = [p for p in Tracker().track(labels, planes, 0) if p.label != 3]
+        ids = {1: 11, 2: 12, 4: 14}
         # Label 1: 30 of 30 on face 5. Label 2: 10 on region 1 and 25 on region 2, both face 5.
         # Label 3 is no plane. Label 4: 10 of 20 on region 9, of no face.
-        found = ids_of_faces(labels, tracked, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)
-        assert found == {5: [2, 1], 6: []}
-        assert ids_of_faces(labels, tracked, truth, {1: 5, 2: 5, 3: 6}, min_pixels=21) == {
-            5: [2, 1]
-        }
+        found = ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)
+        assert found == {5: [12, 11], 6: []}
+        assert ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=21) == {5: [12, 11]}

@@ -39,13 +39,16 @@ _MOTION_ROUNDS = 3
 
 
 class Tracker:
-    """Gives planes ids that persist from frame to frame.
+    """Gives planes, and the surfaces they are parts of, ids that persist from frame to frame.
 
     A plane keeps its id while the camera moves and while it is out of sight for up to `memory`
     frames. When an occluder splits a plane, the part that overlaps most with the plane as it
     was, so in general the largest, keeps the id and the others get ids of their own; when parts
     merge, the oldest id stays (unless it belonged to a part of less than a quarter of the
-    other) and the other part's id waits in the memory for the next split. No id is ever given
+    other) and the other part's id waits in the memory for the next split. What the parts have
+    in common is `Plane.surface`: from a frame's groups of coplanar planes it becomes the id of
+    the surface, the lowest that any part has had; it persists when that part goes out of sight
+    and the others stay. No id is ever given
     twice in the life of a tracker, and the same input gives the same ids.
 
     Parameters
@@ -84,7 +87,7 @@ class Tracker:
         Returns
         -------
         list of Plane
-            In the order given.
+            In the order given, `id` and `surface` set.
         """
         if stamp < self._stamp or labels.shape != self._shape:
             self._tracks = _Tracks.of([], np.zeros(0, np.intp))
@@ -99,9 +102,40 @@ class Tracker:
         new = seen.id == 0
         seen.id[new] = self._next + np.arange(new.sum())
         self._next += int(new.sum())
+        seen.surface[:] = self._surfaces(planes, seen, known)
         lost = ~np.isin(known.id, seen.id) & (known.unseen < self.memory)
         self._tracks = seen.joined(known.where(lost).aged())
-        return [replace(plane, id=int(i)) for plane, i in zip(planes, seen.id, strict=True)]
+        return [
+            replace(plane, id=int(i), surface=int(surface))
+            for plane, i, surface in zip(planes, seen.id, seen.surface, strict=True)
+        ]
+
+    def _surfaces(self, planes: Sequence[Plane], seen: _Tracks, known: _Tracks) -> list[int]:
+        """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
+        before = dict(zip(known.id.tolist(), known.surface.tolist(), strict=True))
+        parts: dict[int, list[int]] = {}
+        for n, plane in enumerate(planes):
+            parts.setdefault(plane.surface, []).append(n)
+        claims = []
+        for members in parts.values():
+            own = seen.id[members].tolist()
+            claim = min(before.get(i, i) for i in own)
+            largest = max(members, key=lambda n: planes[n].count)
+            size = sum(planes[n].count for n in members)
+            # Of surfaces that come apart, the one with the plane that gave the id keeps it.
+            claims.append((claim not in own, -size, min(own), claim, largest, members))
+        distance = _distance(seen, seen)
+        holders: dict[int, int] = {}
+        surfaces = [0] * len(planes)
+        for _, _, own, claim, largest, members in sorted(claims):
+            # Parts once found on one surface stay together for as long as they may be on one.
+            for surface in (claim, own, self._next):
+                if distance[holders.setdefault(surface, largest), largest] <= _GATE:
+                    break
+            self._next += surface == self._next
+            for n in members:
+                surfaces[n] = surface
+        return surfaces
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,6 +148,7 @@ class _Tracks:
     """
 
     id: NDArray[np.int64]
+    surface: NDArray[np.int64]
     normal: NDArray[np.float64]
     distance: NDArray[np.float64]
     covariance: NDArray[np.float64]
@@ -128,6 +163,7 @@ class _Tracks:
         """Planes seen now, without ids (0)."""
         footprint = np.flatnonzero(samples)
         return cls(
+            np.zeros(len(planes), np.int64),
             np.zeros(len(planes), np.int64),
             np.array([p.normal for p in planes], np.float64).reshape(-1, 3),
             np.array([p.distance for p in planes], np.float64),

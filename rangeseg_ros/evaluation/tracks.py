@@ -9,19 +9,18 @@ to associate: HybridBoosted multi-target tracker for crowded scene", CVPR 2009 (
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.evaluation.hoover import Overlap
 
 
 def ids_of_faces(
     labels: NDArray[np.uint16],
-    planes: Iterable[Plane],
+    ids: Mapping[int, int],
     truth: NDArray[np.uint16],
     faces: Mapping[int, int],
     min_pixels: int = 1000,
@@ -32,8 +31,8 @@ def ids_of_faces(
     ----------
     labels : (H, W) uint16
         0 = no plane.
-    planes : iterable of Plane
-        Of `labels`, with their ids.
+    ids : mapping of label to int
+        The id of each plane, or that of its surface.
     truth : (H, W) uint16
         True regions.
     faces : mapping of label to int
@@ -44,15 +43,14 @@ def ids_of_faces(
     Returns
     -------
     dict
-        For each face in sight the ids of the planes with more than half their pixels on it, the
-        largest first.
+        For each face in sight the ids of the planes with more than half their pixels on it,
+        that of the largest plane first.
     """
     numbers = sorted(set(faces.values()))
     table = np.zeros(65536, np.int64)
     for label, face in faces.items():
         table[label] = 1 + numbers.index(face)
     overlap = Overlap.between(table[truth], labels)
-    id_of = {plane.label: plane.id for plane in planes}
     found: dict[int, list[int]] = {
         numbers[number - 1]: []
         for number, size in zip(overlap.truth, overlap.truth_sizes, strict=True)
@@ -61,8 +59,8 @@ def ids_of_faces(
     for pair in np.argsort(-overlap.shared, kind='stable'):
         g, m = overlap.pairs[pair]
         face, label = numbers[overlap.truth[g] - 1], int(overlap.labels[m])
-        if overlap.of_labels[pair] > 0.5 and face in found and label in id_of:
-            found[face].append(id_of[label])
+        if overlap.of_labels[pair] > 0.5 and face in found and label in ids:
+            found[face].append(ids[label])
     return found
 
 
