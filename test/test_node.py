@@ -208,7 +208,8 @@ def test_diagnostics_tell_where_the_time_goes(bench):
 def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     """Of frames that come during a long computation only the newest is segmented."""
     dropped = 'frames dropped for newer ones'
-    assert bench.set_parameters(exact=True)[0].successful
+    slow = {'method': 'normals', 'exact': True}
+    assert bench.set_parameters(atomically=True, **slow).successful
     images = [bench.image() for _ in range(5)]
     bench.camera_info.publish(bench.info())
     bench.depth.publish(images[0])
@@ -216,7 +217,7 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     for image in images[1:]:
         bench.depth.publish(image)
     # The answer comes while the first frame is being computed.
-    assert bench.set_parameters(exact=False)[0].successful
+    assert bench.set_parameters(method='planes')[0].successful
     assert not bench.find('labels', images[0])
     np.testing.assert_array_equal(bench.labels_of(images[4]), expected)
     assert bench.find('labels', images[0])
@@ -229,7 +230,7 @@ def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
     assert not bench.segment().any()
     status = bench.status(lambda status: status.message.startswith('no planes'))
     assert status.level == DiagnosticStatus.WARN and len(status.message) > len('no planes: ')
-    assert bench.set_parameters(min_pixels=250)[0].successful
+    assert bench.set_parameters(min_pixels=Config().min_pixels)[0].successful
     np.testing.assert_array_equal(bench.segment(), expected)
 
 

@@ -111,6 +111,12 @@ class DepthInput:
         """Number of publishers of depth messages."""
         return self._subscription.publishers
 
+    def follow_publishers(self) -> None:
+        """Keep the quality of service at what the publishers offer."""
+        self._subscription.follow_publishers()
+        if self._info_subscription:
+            self._info_subscription.follow_publishers()
+
     def destroy(self) -> None:
         """Unsubscribe."""
         self._subscription.destroy()

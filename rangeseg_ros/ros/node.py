@@ -10,6 +10,7 @@ import traceback
 from itertools import pairwise
 from threading import Thread
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.event_handler import PublisherEventCallbacks
@@ -19,7 +20,9 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 
+from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
@@ -56,7 +59,7 @@ class SegmentPlanes(Node):
             for name, output in OUTPUTS.items()
         }
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = self.create_timer(1.0, self._report)
+        self._timer = self.create_timer(1.0, self._look_around)
         self._worker = Thread(target=self._work, name='segmentation', daemon=True)
         self._worker.start()
 
@@ -91,6 +94,7 @@ class SegmentPlanes(Node):
             self._statistics.dropped.add()
 
     def _work(self) -> None:
+        self._warm_up()
         while frame := self._frames.take():
             try:
                 self._segment(frame)
@@ -103,6 +107,11 @@ class SegmentPlanes(Node):
                     return  # publishing has ended
                 self._refuse(f'{type(error).__name__}: {error}')
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
+
+    def _warm_up(self) -> None:
+        """Have the core's functions compiled, or loaded, before the first frame needs them."""
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        self._segmenter.segment(RangeImage.from_depth(np.full((48, 64), 1000, np.uint16), camera))
 
     def _segment(self, frame: DepthFrame) -> None:
         ticks = [time.perf_counter()]
@@ -135,7 +144,10 @@ class SegmentPlanes(Node):
         self._statistics.refused.add()
         self.get_logger().warning(f'frame refused: {problem}', throttle_duration_sec=5.0)
 
-    def _report(self) -> None:
+    def _look_around(self) -> None:
+        """Once a second: follow the publishers, report."""
+        if self._input:
+            self._input.follow_publishers()
         name = self.get_fully_qualified_name().lstrip('/')
         status = self._statistics.status(name, self._input, self._config.stall_timeout)
         report = DiagnosticArray(status=[status])

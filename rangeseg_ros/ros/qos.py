@@ -17,7 +17,7 @@ class MatchedSubscription:
     """A subscription that is reliable where every publisher offers it, else best effort.
 
     The middleware's own `best_available` policy looks once, when the subscription is made, and
-    takes a topic without publishers for a reliable one. Here the choice is made anew whenever
+    takes a topic without publishers for a reliable one. Here the choice is made anew when
     publishers come or go. The parameter `qos_overrides.<topic>.subscription.reliability` ends it.
 
     Parameters
@@ -43,8 +43,8 @@ class MatchedSubscription:
         self._node = node
         self._arguments = kind, topic, callback
         self._events = SubscriptionEventCallbacks(
-            matched=self._follow_publishers,
-            incompatible_qos=self._follow_publishers,
+            matched=lambda event: self.follow_publishers(),
+            incompatible_qos=lambda event: self.follow_publishers(),
             message_lost=lambda event: lost(_newly_lost(event)),
         )
         self._subscription = self._create()
@@ -60,6 +60,18 @@ class MatchedSubscription:
         """Number of publishers, whether their quality of service fits or not."""
         count: int = self._node.count_publishers(self.topic)
         return count
+
+    def follow_publishers(self) -> None:
+        """Subscribe anew where the publishers there are now offer something else.
+
+        Called by the middleware's events, and to be called now and then: the event of a
+        publisher that leaves may come before the list of publishers is without it.
+        """
+        # A topic that has lost its last publisher keeps its policies for when that comes back.
+        best = self._best_offered(self.topic)
+        if best and best != self._offered and not self._overridden:
+            self.destroy()
+            self._subscription = self._create()
 
     def destroy(self) -> None:
         """Unsubscribe."""
@@ -99,13 +111,6 @@ class MatchedSubscription:
             DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         return best if offers else None
-
-    def _follow_publishers(self, event: Any) -> None:
-        # A topic that has lost its last publisher keeps its policies for when that comes back.
-        best = self._best_offered(self.topic)
-        if best and best != self._offered and not self._overridden:
-            self.destroy()
-            self._subscription = self._create()
 
 
 def _newly_lost(event: QoSMessageLostInfo) -> int:
