@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
@@ -13,6 +14,8 @@ from rangeseg_ros.core.range_image import RangeImage
 GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 _WINDOW = 3
+# The farthest window that a boundary looks at.
+_MARGIN = 2 * _WINDOW - 1
 # A step between two pixels that needs no look at their surroundings, in units of `step`: steeper
 # than all but planes seen edge-on from centimetres away.
 _CLEAR = 5
@@ -122,47 +125,103 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
         Never true beside a pixel that was not measured.
     """
     inverse = image.inverse
-    valid = image.valid
-    mask = valid.astype(np.float32)
-    mean = _mean(inverse, mask, _WINDOW)
-    above = inverse > _mean(inverse, mask, 2 * _WINDOW + 1)
-    across, down = _deviation(mean, step), _deviation(mean.T, step).T
-    # A boundary that runs along the rows shows in the columns alone, the risers of its staircase
-    # too: what counts is a pixel's deviation in either direction.
-    strong = np.zeros(image.shape, bool)
-    strong[:, :-1] |= across
-    strong[:, 1:] |= across
-    strong[:-1] |= down
-    strong[1:] |= down
-    strong &= valid
-    horizontal = (above[:, 1:] != above[:, :-1]) & strong[:, 1:] & strong[:, :-1]
-    vertical = (above[1:] != above[:-1]) & strong[1:] & strong[:-1]
-    # Where three surfaces meet, two may lie on the same side of the mean.
-    horizontal |= (np.abs(np.diff(inverse, axis=1)) > _CLEAR * step) & valid[:, 1:] & valid[:, :-1]
-    vertical |= (np.abs(np.diff(inverse, axis=0)) > _CLEAR * step) & valid[1:] & valid[:-1]
+    mask = (inverse > 0).astype(np.float32)
+    near, wide = (_window_sums(inverse, mask, size) for size in (_WINDOW, 2 * _WINDOW + 1))
+    strong = _strong(inverse, *near, step)
+    return _crossings(inverse, strong, *wide, _CLEAR * step)
+
+
+def _window_sums(
+    inverse: NDArray[np.float32], mask: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sum and number of the measurements in the window around each pixel."""
+    window, border = (size, size), cv2.BORDER_CONSTANT
+    total = cv2.boxFilter(inverse, -1, window, normalize=False, borderType=border)
+    count = cv2.boxFilter(mask, -1, window, normalize=False, borderType=border)
+    return np.asarray(total), np.asarray(count)
+
+
+@njit(cache=True)
+def _strong(
+    inverse: NDArray[np.float32],
+    total: NDArray[np.float32],
+    count: NDArray[np.float32],
+    step: float,
+) -> NDArray[np.bool_]:
+    """Pixels at which the step to some neighbour leaves the steps beside it by more than `step`.
+
+    A boundary that runs along the rows shows in the columns alone, the risers of its staircase
+    too: what counts is a pixel's deviation in either direction.
+    """
+    height, width = inverse.shape
+    mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
+    for i in range(height):
+        for j in range(width):
+            if count[i, j] > 0.5:
+                mean[i + _MARGIN, j + _MARGIN] = total[i, j] / count[i, j]
+    strong = np.zeros((height, width), np.bool_)
+    for i in range(height):
+        row = mean[i + _MARGIN]
+        for j in range(width):
+            # Boundaries with the next pixel: the windows around the last but one and so on.
+            k = j + _MARGIN
+            if j + 1 < width and _leaves(row[k - 4], row[k - 1], row[k + 2], row[k + 5], step):
+                strong[i, j] = strong[i, j + 1] = True
+            m = i + _MARGIN
+            if i + 1 < height and _leaves(
+                mean[m - 4, k], mean[m - 1, k], mean[m + 2, k], mean[m + 5, k], step
+            ):
+                strong[i, j] = strong[i + 1, j] = True
+    return strong
+
+
+@njit(cache=True)
+def _leaves(a: float, b: float, c: float, d: float, step: float) -> bool:
+    """Whether the step from b to c lies outside those from a to b and from c to d so far.
+
+    A side that was not measured (NaN) is left out.
+    """
+    here, before, after = c - b, b - a, d - c
+    if np.isnan(here) or (np.isnan(before) and np.isnan(after)):
+        return False
+    above = (np.isnan(before) or here - before > step) and (np.isnan(after) or here - after > step)
+    below = (np.isnan(before) or before - here > step) and (np.isnan(after) or after - here > step)
+    return above or below
+
+
+@njit(cache=True)
+def _crossings(
+    inverse: NDArray[np.float32],
+    strong: NDArray[np.bool_],
+    total: NDArray[np.float32],
+    count: NDArray[np.float32],
+    clear: float,
+) -> GridEdges:
+    """Edges between strong pixels on unlike sides of the local mean, and all of a clear step.
+
+    The latter because where three surfaces meet, two may lie on the same side of the mean.
+    """
+    height, width = inverse.shape
+    horizontal = np.zeros((height, width - 1), np.bool_)
+    vertical = np.zeros((height - 1, width), np.bool_)
+    for i in range(height):
+        for j in range(width):
+            here = inverse[i, j]
+            if here == 0:
+                continue
+            above = here * count[i, j] > total[i, j]
+            if j + 1 < width and inverse[i, j + 1] > 0:
+                there = inverse[i, j + 1]
+                horizontal[i, j] = abs(here - there) > clear or (
+                    strong[i, j]
+                    and strong[i, j + 1]
+                    and above != (there * count[i, j + 1] > total[i, j + 1])
+                )
+            if i + 1 < height and inverse[i + 1, j] > 0:
+                there = inverse[i + 1, j]
+                vertical[i, j] = abs(here - there) > clear or (
+                    strong[i, j]
+                    and strong[i + 1, j]
+                    and above != (there * count[i + 1, j] > total[i + 1, j])
+                )
     return horizontal, vertical
-
-
-def _mean(inverse: NDArray[np.float32], mask: NDArray[np.float32], window: int) -> NDArray:
-    """Mean of the measured pixels of a window; NaN where there is none."""
-    size = (window, window)
-    border = cv2.BORDER_CONSTANT
-    total = cv2.boxFilter(inverse, -1, size, normalize=False, borderType=border)
-    count = cv2.boxFilter(mask, -1, size, normalize=False, borderType=border)
-    with np.errstate(invalid='ignore', divide='ignore'):
-        mean = total / count
-    mean[count < 0.5] = np.nan
-    return mean
-
-
-def _deviation(mean: NDArray[np.float32], step: float) -> NDArray[np.bool_]:
-    """Whether the step across each boundary along the rows leaves the steps beside it so far."""
-    framed = np.full((mean.shape[0], mean.shape[1] - 1 + 2 * _WINDOW), np.nan, np.float32)
-    # Boundary k, between pixels k and k+1: the windows around k-1 and k+2.
-    framed[:, _WINDOW + 1 : -_WINDOW - 1] = mean[:, _WINDOW:] - mean[:, :-_WINDOW]
-    before = framed[:, : -2 * _WINDOW]
-    here = framed[:, _WINDOW:-_WINDOW]
-    after = framed[:, 2 * _WINDOW :]
-    # fmin and fmax leave out a side that was not measured; comparisons with NaN are false.
-    low, high = np.fmin(before, after), np.fmax(before, after)
-    return (here - high > step) | (low - here > step)
