@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
@@ -33,13 +33,15 @@ def plane_regions(
     (H, W) uint16
         0 = no plane, 1...M by falling size.
     """
-    regions = np.where(valid, connected_components(labels, horizontal, vertical), 0)
+    regions = connected_components(labels, horizontal, vertical)
+    regions[~valid] = 0
+    area, perimeter = _measures(regions)
     if config.noise_regions != 'leave':
-        noise = is_noise(regions)
+        noise = _thin(area, perimeter)
         if config.noise_regions == 'merge':
             regions = merge(regions, noise)
-        regions = np.where(noise[regions], 0, regions)
-    area = np.bincount(regions.ravel())
+            area = np.bincount(regions.ravel(), minlength=len(area))
+        area = np.where(noise, 0, area)
     area[0] = 0
     return relabel(regions, area >= config.min_pixels)
 
@@ -62,14 +64,52 @@ def connected_components(
     (H, W) int32
         1...N.
     """
+    return _components(labels, horizontal, vertical)
+
+
+@njit(cache=True)
+def _components(
+    labels: NDArray[np.integer],
+    horizontal: NDArray[np.floating],
+    vertical: NDArray[np.floating],
+) -> NDArray[np.int32]:
+    """Two passes over the image with a table of equivalent labels (thesis 3.1.1)."""
     height, width = labels.shape
-    # Pixels and the edges between them, drawn on a grid of twice the resolution.
-    grid = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
-    grid[::2, ::2] = 1
-    grid[::2, 1::2] = (labels[:, 1:] == labels[:, :-1]) & (horizontal > 0)
-    grid[1::2, ::2] = (labels[1:] == labels[:-1]) & (vertical > 0)
-    components = cv2.connectedComponents(grid, connectivity=4, ltype=cv2.CV_32S)[1]
-    return np.ascontiguousarray(components[::2, ::2])
+    found = np.empty((height, width), np.int32)
+    parent = np.empty(height * width + 1, np.int32)
+    count = 0
+    for i in range(height):
+        for j in range(width):
+            left = j > 0 and horizontal[i, j - 1] > 0 and labels[i, j] == labels[i, j - 1]
+            up = i > 0 and vertical[i - 1, j] > 0 and labels[i, j] == labels[i - 1, j]
+            if left:
+                found[i, j] = found[i, j - 1]
+                if up:
+                    a, b = found[i, j], found[i - 1, j]
+                    while parent[a] != a:
+                        a = parent[a]
+                    while parent[b] != b:
+                        b = parent[b]
+                    parent[max(a, b)] = min(a, b)
+            elif up:
+                found[i, j] = found[i - 1, j]
+            else:
+                count += 1
+                parent[count] = count
+                found[i, j] = count
+    # A parent has a lower number than its children, so that one pass resolves and renumbers.
+    number = np.zeros(count + 1, np.int32)
+    last = 0
+    for k in range(1, count + 1):
+        if parent[k] == k:
+            last += 1
+            number[k] = last
+        else:
+            number[k] = number[parent[k]]
+    for i in range(height):
+        for j in range(width):
+            found[i, j] = number[found[i, j]]
+    return found
 
 
 def is_noise(regions: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -85,18 +125,40 @@ def is_noise(regions: NDArray[np.int32]) -> NDArray[np.bool_]:
     (N + 1,) bool
         Whether region k is noise; never for region 0.
     """
-    framed = cv2.copyMakeBorder(regions, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=-1)
-    inner = framed[1:-1, 1:-1]
-    perimeter = (
-        (inner != framed[1:-1, 2:])
-        | (inner != framed[1:-1, :-2])
-        | (inner != framed[2:, 1:-1])
-        | (inner != framed[:-2, 1:-1])
-    )
-    area = np.bincount(regions.ravel())
-    noise = area < 2 * np.bincount(regions[perimeter], minlength=len(area))
+    return _thin(*_measures(regions))
+
+
+def _thin(area: NDArray[np.int64], perimeter: NDArray[np.int64]) -> NDArray[np.bool_]:
+    noise = area < 2 * perimeter
     noise[0] = False
     return noise
+
+
+@njit(cache=True)
+def _measures(regions: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of pixels of each region, and of those that touch another or the border."""
+    height, width = regions.shape
+    count = 1
+    for i in range(height):
+        for j in range(width):
+            count = max(count, regions[i, j] + 1)
+    area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    for i in range(height):
+        for j in range(width):
+            here = regions[i, j]
+            area[here] += 1
+            if (
+                i == 0
+                or j == 0
+                or i == height - 1
+                or j == width - 1
+                or regions[i, j - 1] != here
+                or regions[i, j + 1] != here
+                or regions[i - 1, j] != here
+                or regions[i + 1, j] != here
+            ):
+                perimeter[here] += 1
+    return area, perimeter
 
 
 def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.int32]:
