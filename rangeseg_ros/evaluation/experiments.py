@@ -31,7 +31,8 @@ THESIS = Config(
     direction_count=305,
     smoothness=55.0,
     noise_regions='identify',
-    min_pixels=1,
+    # The pixels of jump edges, disconnected one by one, are no regions (white in figure 5.6).
+    min_pixels=2,
 )
 """The parameters of the thesis (6.6)."""
 
