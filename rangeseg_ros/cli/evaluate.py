@@ -7,7 +7,6 @@ from pathlib import Path
 import click
 
 from rangeseg_ros.cli import measures, options
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluated, table
 from rangeseg_ros.evaluation.measure import Task, run_all
@@ -17,11 +16,7 @@ from rangeseg_ros.io.params import read_config
 @click.command(cls=measures.ToleranceCommand)
 @click.argument('folder', metavar='DIR', type=options.FOLDER)
 @options.params
-@click.option(
-    '--method',
-    type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
-    help='Method, in place of that of the parameters.',
-)
+@options.method
 @measures.tolerance
 @click.option(
     '--min-pixels',

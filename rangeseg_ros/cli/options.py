@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 import click
 from tqdm import tqdm
 
+from rangeseg_ros.core.config import Config
+
 T = TypeVar('T')
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -26,6 +28,11 @@ params: Callable[..., Any] = click.option(
     'params_file',
     type=FILE,
     help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
+)
+method: Callable[..., Any] = click.option(
+    '--method',
+    type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
+    help='Method, in place of that of the parameters.',
 )
 exact: Callable[..., Any] = click.option(
     '--exact',

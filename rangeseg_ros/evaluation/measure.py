@@ -144,7 +144,7 @@ class Task:
 
     def _key(self) -> str:
         """Digest of all that the measurement depends on: code, parameters, files."""
-        digest = hashlib.sha256(_code_digest())
+        digest = hashlib.sha256(code_digest())
         digest.update(repr((asdict(self.config), self.case)).encode())
         for path in (self.case.image, self.case.truth):
             digest.update(path.read_bytes())
@@ -152,7 +152,8 @@ class Task:
 
 
 @cache
-def _code_digest() -> bytes:
+def code_digest() -> bytes:
+    """Digest of the source of `core`, which decides every result."""
     digest = hashlib.sha256()
     for path in sorted(Path(rangeseg_ros.core.__path__[0]).glob('*.py')):
         digest.update(path.read_bytes())
