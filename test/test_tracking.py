@@ -77,7 +77,7 @@ def test_the_rest_of_a_plane_is_as_it_was():
 
 @pytest.mark.parametrize(('hidden', 'same'), [(5, True), (6, False)])
 def test_memory_is_exact(hidden, same):
-    tracker = Tracker(memory=5)
+    tracker = Tracker(Config(track_memory=5))
     whole = frame(*stay(), (*MIDDLE, BOX))
     assert ids(tracker, whole) == [1, 2, 3, 4]
     for _ in range(hidden):
@@ -215,7 +215,7 @@ def test_whatever_comes_ids_are_unique_new_after_a_jump_and_the_same_again(seque
         (stamp, frame(*((slice(i, i + h), slice(j, j + w), p) for i, j, h, w, p in regions)))
         for stamp, regions in sequence
     ]
-    tracker, again = Tracker(memory=2), Tracker(memory=2)
+    tracker, again = (Tracker(Config(track_memory=2)) for _ in range(2))
     used, last = set(), 0
     for stamp, found in frames:
         now = ids(tracker, found, stamp)

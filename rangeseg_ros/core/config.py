@@ -164,6 +164,38 @@ class Config:
         low=0.0,
         high=10.0,
     )
+    track_memory: int = option(
+        30,
+        'frames that a plane may be out of sight, or go unnoticed, and keep its id',
+        low=0,
+        high=100000,
+    )
+    up_x: float = option(0.0, 'up in the frame of the image, x', low=-1000.0, high=1000.0)
+    up_y: float = option(
+        -1.0,
+        'up in the frame of the image, y; the default is that of a level camera',
+        low=-1000.0,
+        high=1000.0,
+    )
+    up_z: float = option(0.0, 'up in the frame of the image, z', low=-1000.0, high=1000.0)
+    role_tolerance: float = option(
+        10.0,
+        'largest angle of floor, table, ceiling and wall to the horizontal or vertical, degrees',
+        low=0.0,
+        high=45.0,
+    )
+    role_height: float = option(
+        0.1,
+        'planes within this distance of the floor or ceiling belong to it, metres',
+        low=0.0,
+        high=10.0,
+    )
+    role_area: float = option(
+        0.3,
+        'smallest area, square metres, from which a surface can be floor, ceiling or wall',
+        low=0.0,
+        high=1000.0,
+    )
     seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
     def __post_init__(self) -> None:
@@ -174,6 +206,8 @@ class Config:
             check_count(self.directions, self.direction_count)
         except DirectionsError as error:
             raise ConfigError(f'parameter direction_count: {error}') from None
+        if self.up_x == self.up_y == self.up_z == 0:
+            raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:

@@ -27,10 +27,11 @@ class Plane:
     label : int
         Value in the label image, 1...
     id : int
-        Identity over time; the label when nothing is tracked.
+        Identity over time, see `tracking.Tracker`; the label when nothing is tracked.
     surface : int
         The same for regions of one image that lie on one plane, seen apart: the label of the
-        largest of them. See `coplanar.common_surfaces`.
+        largest of them. See `coplanar.common_surfaces`. When tracked, the identity of the
+        surface over time.
     normal : (3,) float64
         Unit normal towards the sensor.
     distance : float
@@ -59,6 +60,8 @@ class Plane:
         image's right, and whose z axis is the normal.
     outline : Outline
         What `hull` and `holes` are made of when first asked for.
+    role : str
+        Of `roles.ROLES`; empty when none is asked for.
     """
 
     label: int
@@ -76,6 +79,7 @@ class Plane:
     centre: NDArray[np.float64]
     orientation: NDArray[np.float64]
     outline: Outline = field(repr=False)
+    role: str = ''
 
     @property
     def hull(self) -> NDArray[np.float64]:

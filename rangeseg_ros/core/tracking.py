@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.planes import Plane
 
 # Rows or columns, whichever are fewer, at which overlap is looked at.
@@ -41,20 +42,22 @@ _MOTION_ROUNDS = 3
 class Tracker:
     """Gives planes, and the surfaces they are parts of, ids that persist from frame to frame.
 
-    A plane keeps its id while the camera moves and while it is out of sight for up to `memory`
-    frames. When an occluder splits a plane, the part that overlaps most with the plane as it
-    was, so in general the largest, keeps the id and the others get ids of their own; when parts
-    merge, the oldest id stays (unless it belonged to a part of less than a quarter of the
-    other) and the other part's id waits in the memory for the next split. What the parts have
-    in common is `Plane.surface`: from a frame's groups of coplanar planes it becomes the id of
-    the surface, the lowest that any part has had; it persists when that part goes out of sight
-    and the others stay. No id is ever given
-    twice in the life of a tracker, and the same input gives the same ids.
+    A plane keeps its id while the camera moves and while it is out of sight for up to
+    `track_memory` frames. When an occluder splits a plane, the part that overlaps most with the
+    plane as it was, so in general the largest, keeps the id and the others get ids of their own.
+    When parts merge, the oldest id stays, unless it belonged to a part of less than a quarter of
+    the other, and the other part's id waits in the memory for the next split.
+
+    What parts have in common is `Plane.surface`: from a frame's groups of coplanar planes it
+    becomes the id of the surface, the lowest that any part has had, which persists when that
+    part goes out of sight and others stay.
+
+    No id is ever given twice in the life of a tracker, and the same input gives the same ids.
 
     Parameters
     ----------
-    memory : int
-        Number of frames a plane may be out of sight, or go unnoticed, and keep its id.
+    config : Config, optional
+        `track_memory`.
 
     Examples
     --------
@@ -62,8 +65,8 @@ class Tracker:
     >>> planes = tracker.track(result.labels, result.planes, stamp)
     """
 
-    def __init__(self, memory: int = 30) -> None:
-        self.memory = memory
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
@@ -103,7 +106,7 @@ class Tracker:
         seen.id[new] = self._next + np.arange(new.sum())
         self._next += int(new.sum())
         seen.surface[:] = self._surfaces(planes, seen, known)
-        lost = ~np.isin(known.id, seen.id) & (known.unseen < self.memory)
+        lost = ~np.isin(known.id, seen.id) & (known.unseen < self.config.track_memory)
         self._tracks = seen.joined(known.where(lost).aged())
         return [
             replace(plane, id=int(i), surface=int(surface))

@@ -1,0 +1,164 @@
+"""Roles of planes: rooms with known answers, tolerances to the degree, tilted cameras."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.planes import fit_planes
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.roles import ROLES, RolesError, roles
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import Pose, Scene
+from rangeseg_ros.simulation.solids import box, half_space
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+LEVEL = Config()
+BOTTOM, LEFT, RIGHT = ((slice(90, 120), slice(0, 160)), *(
+    (slice(40, 80), columns) for columns in (slice(0, 75), slice(80, 160))
+))  # fmt: skip
+TOP = slice(0, 25), slice(0, 160)
+
+
+def planes(*regions):
+    """Planes of ((rows, columns), normal, distance) in the frame of a level camera."""
+    labels = np.zeros(CAMERA.shape, np.uint16)
+    inverse = np.zeros(CAMERA.shape, np.float32)
+    for label, (where, normal, distance) in enumerate(regions, 1):
+        normal = np.array(normal) / np.linalg.norm(normal)
+        labels[where] = label
+        inverse[where] = -CAMERA.rays[where] @ normal / distance
+    assert (inverse[labels > 0] > 0).all()
+    image = RangeImage(CAMERA.rays, inverse, CAMERA)
+    return fit_planes(labels, image, SensorModel.from_config(LEVEL))
+
+
+def tilted(degrees):
+    """Normal that is so many degrees from up."""
+    return 0, -np.cos(np.radians(degrees)), -np.sin(np.radians(degrees))
+
+
+UP, DOWN, AHEAD = tilted(0), tilted(180), tilted(90)
+
+
+def test_room():
+    found = planes((BOTTOM, UP, 1.2), (LEFT, AHEAD, 3), (RIGHT, (-1, 0, -1), 3), (TOP, DOWN, 1.3))
+    assert roles(found, LEVEL) == ['floor', 'wall', 'wall', 'ceiling']
+
+
+def test_table_above_the_floor_whatever_the_order():
+    low, high = slice(95, 120), slice(65, 90)
+    floor = (high, slice(0, 80)), UP, 1.2
+    table = (low, slice(80, 160)), UP, 0.5
+    assert roles(planes(floor, table), LEVEL) == ['floor', 'table']
+    assert roles(planes(table, floor), LEVEL) == ['table', 'floor']
+
+
+def test_parts_of_the_floor_and_what_lies_beneath_it():
+    scrap = slice(100, 106)
+    found = planes(
+        ((slice(80, 95), slice(0, 160)), UP, 1.2),
+        ((scrap, slice(0, 10)), UP, 1.11),
+        ((scrap, slice(30, 40)), UP, 1.09),
+        ((scrap, slice(60, 70)), UP, 1.29),
+        ((scrap, slice(90, 100)), UP, 1.31),
+    )
+    apart = [replace(plane, surface=plane.label) for plane in found]
+    together = [replace(plane, surface=1) for plane in found]
+    for found in (apart, together):
+        assert roles(found, LEVEL) == ['floor', 'floor', 'table', 'floor', 'other']
+    assert roles(found, Config(role_height=0.0905))[1:3] == ['floor', 'table']
+    assert roles(found, Config(role_height=0.12))[1:] == ['floor'] * 4
+
+
+def test_small_planes_are_no_floor_wall_or_ceiling():
+    found = planes(
+        ((slice(100, 110), slice(0, 20)), UP, 0.5),
+        ((slice(50, 60), slice(0, 20)), AHEAD, 1),
+        ((slice(0, 10), slice(0, 20)), DOWN, 0.5),
+    )
+    assert max(plane.area for plane in found) < 0.1
+    assert roles(found, LEVEL) == ['other'] * 3
+    assert roles(found, Config(role_area=0.001)) == ['floor', 'wall', 'ceiling']
+
+
+def test_parts_of_one_surface_are_large_together():
+    found = planes((LEFT, AHEAD, 1), (RIGHT, AHEAD, 1))
+    assert found[0].surface == found[1].surface
+    area = sum(plane.area for plane in found)
+    assert roles(found, Config(role_area=area - 1e-6)) == ['wall', 'wall']
+    assert roles(found, Config(role_area=area + 1e-6)) == ['other', 'other']
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'where', 'role'),
+    [
+        (9.9, BOTTOM, 'floor'),
+        (10.1, BOTTOM, 'other'),
+        (79.9, LEFT, 'other'),
+        (80.1, LEFT, 'wall'),
+        (99.9, LEFT, 'wall'),
+        (100.1, LEFT, 'other'),
+        (169.9, TOP, 'other'),
+        (170.1, TOP, 'ceiling'),
+    ],
+)
+def test_tolerance(degrees, where, role):
+    found = planes((where, tilted(degrees), 1.5))
+    assert roles(found, LEVEL) == [role]
+
+
+def test_up_of_any_length_in_the_frame_of_a_tilted_camera():
+    tilt = Rotation.from_euler('xyz', [35, 10, -8], degrees=True)
+    level = planes((BOTTOM, UP, 1.2), (LEFT, AHEAD, 3))
+    turned = [(where, tilt.apply(n), d) for where, n, d in ((BOTTOM, UP, 1.2), (LEFT, AHEAD, 3))]
+    up = tilt.apply((0, -1, 0))
+    assert roles(level, LEVEL) == ['floor', 'wall']
+    assert roles(planes(*turned), LEVEL) == ['other', 'other']
+    assert roles(planes(*turned), LEVEL, 9.81 * up) == ['floor', 'wall']
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2])
+    assert roles(planes(*turned), config) == ['floor', 'wall']
+
+
+def test_a_simulated_room():
+    """Truth by construction: floor, wall, a table top and its side, seen by a tilted camera."""
+    pose = Pose.looking((0, 0, 1.4), yaw=0, pitch=25, roll=3)
+    solids = (
+        half_space((0, 0, 1), (0, 0, 0)),
+        half_space((-1, 0, 0), (3.5, 0, 0)),
+        box((0.8, 1.0, 0.7), np.eye(3), (2.0, 0, 0.35)),
+    )
+    view = simulate_kinect(Scene(solids, (pose,)), kinect_camera(320, 240))
+    image = RangeImage.from_depth(view.depth, view.camera)
+    found = fit_planes(view.labels, image, SensorModel.from_config(LEVEL))
+    up = pose.rotation.T @ (0, 0, 1)
+    named = dict(zip([p.label for p in found], roles(found, LEVEL, up), strict=True))
+    world = {p.label: pose.rotation @ p.normal for p in view.planes if p.count > 300}
+    for plane in view.planes:
+        if plane.count <= 300:
+            continue
+        height = pose.rotation[2] @ (-plane.distance * plane.normal) + 1.4
+        upward = world[plane.label][2] > 0.9
+        expected = ('table' if height > 0.5 else 'floor') if upward else 'wall'
+        assert named[plane.label] == expected
+    assert {'floor', 'table', 'wall'} <= set(named.values())
+
+
+@pytest.mark.parametrize('up', [(0, 0, 0), (np.nan, 0, 1), (0, 1), np.inf, (np.inf, 0, 0)])
+def test_directions_that_are_none(up):
+    with pytest.raises(RolesError, match='up must be a direction'):
+        roles(planes((BOTTOM, UP, 1.2)), LEVEL, up)
+
+
+def test_configured_directions_that_are_none():
+    with pytest.raises(ConfigError, match='up_x, up_y, up_z must not all be 0'):
+        Config(up_y=0)
+
+
+def test_nothing():
+    assert roles([], LEVEL) == []
+    assert len(set(ROLES)) == len(ROLES)
