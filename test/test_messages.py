@@ -1,6 +1,7 @@
 """Arrays <-> messages, with the message classes of rosbags and, where there is one, of rclpy."""
 
 from contextlib import suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from rangeseg_ros import CameraError, Plane, RangeImage, Segmentation, planes_from_message
+from rangeseg_ros import CameraError, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.ros.clouds import CloudError, planes_message, points_from_message
 from rangeseg_ros.ros.markers import ARROW_LENGTH, markers_message
@@ -38,19 +39,28 @@ def header(make=make_rosbags):
     return make('std_msgs/msg/Header', stamp=stamp, frame_id='optical')
 
 
-def plane(label, hull=((-1, -1, 2), (1, -1, 2), (1, 1, 2), (-1, 1, 2))):
-    """A square of 2 m at z = 2 m."""
-    return Plane(
+SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
+
+
+def plane(label, hull=SQUARE, holes=()):
+    """A region of the plane z = 2 m with the attributes of a Plane."""
+    return SimpleNamespace(
         label=label,
         id=label + 100,
+        surface=label,
         normal=np.array([0.0, 0.0, -1.0]),
         distance=2.0,
         covariance=np.arange(16.0).reshape(4, 4),
         centroid=np.array([0.25 * label, 0.5, 2.0]),
         count=1000 * label,
         rms=0.003,
+        confidence=0.9,
         area=4.0,
+        extents=np.array([2.0, 1.5]),
+        centre=np.array([0.0, 0.25, 2.0]),
+        orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         hull=np.array(hull, float).reshape(-1, 3),
+        holes=[np.array(hole, float) for hole in holes],
     )
 
 
@@ -139,6 +149,16 @@ def test_planes_read_back_as_they_were():
     np.testing.assert_array_equal(planes['normal_z'], [-1, -1])
     np.testing.assert_array_equal(planes['distance'], [2, 2])
     np.testing.assert_array_equal(planes['covariance'], [np.arange(16)] * 2)
+    np.testing.assert_array_equal(planes['surface'], [1, 2])
+    np.testing.assert_array_equal(planes['confidence'], np.float32([0.9, 0.9]))
+    for column, value in {
+        'length': 2,
+        'width': 1.5,
+        'centre_y': 0.25,
+        'orientation_x': 1,
+        'orientation_w': 0,
+    }.items():
+        np.testing.assert_array_equal(planes[column], [value, value])
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])
@@ -170,33 +190,51 @@ def test_node_and_replay_write_the_same_bytes(name, planes):
     assert len(sent) == len(written) and sent_again == written
 
 
+def corners_of(marker):
+    """Triangles (M, 3, 3) of a TRIANGLE_LIST."""
+    return np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3, 3)
+
+
+def area_of(triangles):
+    first, second, third = np.moveaxis(triangles, 1, 0)
+    return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
+
+
 def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
     message = markers_message(make_rosbags, header(), [plane(1), plane(2, hull=())])
     clear, *drawn = message.markers
     assert clear.action == clear.DELETEALL
     assert [(m.ns, m.id) for m in drawn] == [
-        ('hulls', 101),
-        ('normals', 101),
-        ('ids', 101),
-        ('normals', 102),
-        ('ids', 102),
+        (namespace, number) for number in (101, 102) for namespace in ('hulls', 'normals', 'ids')
     ]
-    hull, normal, number = drawn[:3]
+    hull, normal, number, no_hull = drawn[:4]
     assert (hull.type, normal.type, number.type) == (
         hull.TRIANGLE_LIST,
         hull.ARROW,
         hull.TEXT_VIEW_FACING,
     )
-    corners = np.array([(p.x, p.y, p.z) for p in hull.points]).reshape(-1, 3, 3)
-    areas = np.linalg.norm(
-        np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-    )
-    assert areas.sum() / 2 == pytest.approx(4.0)
+    assert area_of(corners_of(hull)) == pytest.approx(4.0)
+    assert no_hull.points == []
     start, tip = ((p.x, p.y, p.z) for p in normal.points)
     np.testing.assert_allclose(np.subtract(tip, start), (0, 0, -ARROW_LENGTH), atol=1e-12)
     assert number.text == '101'
     rgb = np.array([hull.color.r, hull.color.g, hull.color.b]) * 255
     np.testing.assert_allclose(rgb, colours([101])[0])
+
+
+def test_concave_hull_with_a_hole_is_filled_and_no_more():
+    """A U of three by three metres with a notch of 1 x 2 and a hole of 0.5 x 0.5."""
+    outline = [(0, 0), (0, 3), (3, 3), (3, 0), (2, 0), (2, 2), (1, 2), (1, 0)]
+    hole = [(0.25, 1), (0.75, 1), (0.75, 1.5), (0.25, 1.5)]
+    rings = [[(x, y, 2.0) for x, y in ring] for ring in (outline, hole)]
+    message = markers_message(make_rosbags, header(), [plane(1, rings[0], rings[1:])])
+    triangles = corners_of(message.markers[1])
+    assert area_of(triangles) == pytest.approx(9 - 2 - 0.25)
+    np.testing.assert_allclose(triangles[..., 2], 2.0, atol=1e-12)
+    centres = triangles.mean(axis=1)
+    notch = (centres[:, 0] > 1) & (centres[:, 0] < 2) & (centres[:, 1] < 2)
+    inside = (abs(centres[:, 0] - 0.5) < 0.25) & (abs(centres[:, 1] - 1.25) < 0.25)
+    assert not (notch | inside).any()
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])

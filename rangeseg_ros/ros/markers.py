@@ -7,7 +7,8 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+import shapely
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.drawing import colours
@@ -31,18 +32,17 @@ def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     for plane, colour in zip(planes, colours([plane.id for plane in planes]) / 255, strict=True):
         rgb = [float(part) for part in colour]
         tip = plane.centroid + ARROW_LENGTH * plane.normal
-        if len(plane.hull) > 2:
-            markers.append(
-                _marker(
-                    make,
-                    header,
-                    'hulls',
-                    plane.id,
-                    TRIANGLE_LIST,
-                    colour=(*rgb, 0.6),
-                    points=_fan(_points(make, plane.hull)),
-                )
+        markers.append(
+            _marker(
+                make,
+                header,
+                'hulls',
+                plane.id,
+                TRIANGLE_LIST,
+                colour=(*rgb, 0.6),
+                points=_points(make, _triangles(plane)),
             )
+        )
         markers.append(
             _marker(
                 make,
@@ -76,10 +76,23 @@ def _points(make: Make, coordinates: ArrayLike) -> list[Any]:
     return [make('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in rows]
 
 
-def _fan(corners: list[Any]) -> list[Any]:
-    """Corners of the triangles that make up a convex polygon."""
-    first, *others = corners
-    return [corner for side in pairwise(others) for corner in (first, *side)]
+def _triangles(plane: Plane) -> NDArray[np.float64]:
+    """Corners (3 M, 3) of triangles that make up the hull of `plane` without its holes."""
+    if len(plane.hull) < 3:
+        return np.empty((0, 3))
+    axes = np.linalg.svd(plane.normal[None])[2][1:]
+    outline, *holes = ((ring - plane.centroid) @ axes.T for ring in (plane.hull, *plane.holes))
+    polygon = shapely.make_valid(shapely.Polygon(outline, holes))
+    # No corner lies inside a Delaunay triangle, so sides only cut across: the parts are convex.
+    parts = shapely.intersection(shapely.get_parts(shapely.delaunay_triangles(polygon)), polygon)
+    rings = [part.exterior.coords[:-1] for part in shapely.get_parts(parts) if part.area > 0]
+    corners = [
+        corner
+        for first, *others in rings
+        for side in pairwise(others)
+        for corner in (first, *side)
+    ]
+    return np.array(corners).reshape(-1, 2) @ axes + plane.centroid
 
 
 def _marker(
