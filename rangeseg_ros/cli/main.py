@@ -16,6 +16,7 @@ COMMANDS = {
     'simulate': 'Simulate range images with ground truth.',
     'evaluate': 'Segment images and compare the results with their truth.',
     'compare': 'Compare label images with ground truth.',
+    'tracks': 'Measure how well planes keep their ids.',
     'experiment': 'Repeat the experiments of the thesis.',
     'bench': 'Measure the time and memory of each stage.',
     'play': 'Publish the messages of a recording in ROS 2.',

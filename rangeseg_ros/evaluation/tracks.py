@@ -9,22 +9,30 @@ to associate: HybridBoosted multi-target tracker for crowded scene", CVPR 2009 (
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.tracking import Tracker
 from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
 
 
 def ids_of_faces(
     labels: NDArray[np.uint16],
     ids: Mapping[int, int],
     truth: NDArray[np.uint16],
-    faces: Mapping[int, int],
+    faces: Mapping[int, Hashable],
     min_pixels: int = 1000,
-) -> dict[int, list[int]]:
+) -> dict[Hashable, list[int]]:
     """Ids of the planes found on each physical face in a frame.
 
     Parameters
@@ -35,8 +43,9 @@ def ids_of_faces(
         The id of each plane, or that of its surface.
     truth : (H, W) uint16
         True regions.
-    faces : mapping of label to int
-        The face that a region of `truth` is part of; regions of no face do not count.
+    faces : mapping of label to face
+        The face, however it is called, that a region of `truth` is part of; regions of no face
+        do not count.
     min_pixels : int
         Faces with fewer pixels in the frame do not count.
 
@@ -46,12 +55,12 @@ def ids_of_faces(
         For each face in sight the ids of the planes with more than half their pixels on it,
         that of the largest plane first.
     """
-    numbers = sorted(set(faces.values()))
+    numbers = list(dict.fromkeys(faces.values()))
     table = np.zeros(65536, np.int64)
     for label, face in faces.items():
         table[label] = 1 + numbers.index(face)
     overlap = Overlap.between(table[truth], labels)
-    found: dict[int, list[int]] = {
+    found: dict[Hashable, list[int]] = {
         numbers[number - 1]: []
         for number, size in zip(overlap.truth, overlap.truth_sizes, strict=True)
         if size >= min_pixels
@@ -64,7 +73,7 @@ def ids_of_faces(
     return found
 
 
-def track_figures(frames: Sequence[Mapping[int, Sequence[int]]]) -> dict[str, Any]:
+def track_figures(frames: Sequence[Mapping[Hashable, Sequence[int]]]) -> dict[str, Any]:
     """Figures of the ids in a sequence.
 
     A face stays with its id as long as any plane on it has that id; otherwise the first id on it
@@ -85,10 +94,10 @@ def track_figures(frames: Sequence[Mapping[int, Sequence[int]]]) -> dict[str, An
         turn; `coverage`, share of the faces in sight that were found, over all frames;
         `track_length`, mean number of frames in which a face kept one id.
     """
-    current: dict[int, int] = {}
-    owner: dict[int, int] = {}
-    history: dict[int, list[int]] = {}
-    missed: set[int] = set()
+    current: dict[Hashable, int] = {}
+    owner: dict[int, Hashable] = {}
+    history: dict[Hashable, list[int]] = {}
+    missed: set[Hashable] = set()
     switches = transfers = fragmentations = found = visible = 0
     for frame in frames:
         for face, ids in frame.items():
@@ -121,3 +130,57 @@ def track_figures(frames: Sequence[Mapping[int, Sequence[int]]]) -> dict[str, An
         'coverage': found / max(visible, 1),
         'track_length': found / max(len(tracks), 1),
     }
+
+
+@dataclass(frozen=True, eq=False)
+class RoomFrame:
+    """Ids on the faces of a simulated room in one frame.
+
+    Attributes
+    ----------
+    planes, surfaces : dict
+        As `ids_of_faces`, by the ids of the planes and of their surfaces; the faces are
+        (room, face).
+    milliseconds : float
+        The tracker took.
+    """
+
+    planes: dict[Hashable, list[int]]
+    surfaces: dict[Hashable, list[int]]
+    milliseconds: float
+
+
+def track_rooms(
+    rooms: Iterable[int], frames: int, speed: int, config: Config
+) -> Iterator[RoomFrame]:
+    """Segment and track what a moving Kinect sees of simulated rooms.
+
+    Parameters
+    ----------
+    rooms : iterable of int
+        Seeds of `kinect_room`.
+    frames : int
+        Number of frames of each room, at 30 Hz.
+    speed : int
+        Times the speed of `camera_motion`: every `speed`-th of its frames is taken.
+    config : Config
+    """
+    segmenter, tracker = Segmenter(config), Tracker(config)
+    for room in rooms:
+        scene = kinect_room(room, frames * speed)
+        for k in range(frames):
+            view = simulate_kinect(scene, frame=k * speed, seed=room)
+            result = segmenter.segment(RangeImage.from_depth(view.depth, view.camera))
+            begin = time.perf_counter()
+            # Each room's time begins with 0, so that the tracker begins anew.
+            planes = tracker.track(result.labels, result.planes, k)
+            milliseconds = 1000 * (time.perf_counter() - begin)
+            faces = {plane.label: (room, plane.face) for plane in view.planes}
+            by_plane, by_surface = (
+                ids_of_faces(result.labels, ids, view.labels, faces)
+                for ids in (
+                    {plane.label: plane.id for plane in planes},
+                    {plane.label: plane.surface for plane in planes},
+                )
+            )
+            yield RoomFrame(by_plane, by_surface, milliseconds)
