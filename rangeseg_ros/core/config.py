@@ -106,8 +106,9 @@ class Config:
     )
     exact: bool = option(
         False,
-        'method normals: expand all directions at full resolution, which takes minutes, instead '
-        'of coarse to fine',
+        'minimise the energy without shortcuts: method normals expands all directions at full '
+        'resolution (minutes), method planes expands all planes and refits them until nothing '
+        'changes (seconds)',
     )
     noise_regions: str = option(
         'identify',

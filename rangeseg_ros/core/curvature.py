@@ -13,7 +13,7 @@ from rangeseg_ros.core.sensor import SensorModel
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
 # within two and a half times that.
-_SHARE, _PIXELS, _EXPONENT = 1.35**2, 1e4, 0.78
+_SHARE, _PIXELS, _EXPONENT = 1.5**2, 1e4, 0.78
 # Nine agreeing pixels count as one; the chi-squared of three terms of curvature stays below four
 # times its mean.
 _NOISE = 9.0 * 3.0 * 4.0

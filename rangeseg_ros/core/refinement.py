@@ -40,6 +40,7 @@ BLOCK = 4
 """Rows and columns of the blocks that surfaces are grown from."""
 _SEED = 250
 """Pixels of the smallest surface whose plane is tried."""
+_ROUNDS = 10
 
 
 def refine(
@@ -47,8 +48,9 @@ def refine(
     surfaces: NDArray[np.intp],
     moments: NDArray[np.float64],
     sensor: SensorModel,
+    exact: bool = False,
 ) -> tuple[NDArray[np.int32], Models]:
-    """Label the pixels with the planes of surfaces, refit the planes, label again.
+    """Label the pixels with the planes of surfaces.
 
     Parameters
     ----------
@@ -58,6 +60,10 @@ def refine(
     moments : (K + 1, 12) float64
         Of the surfaces.
     sensor : SensorModel
+    exact : bool
+        Expand labels from wherever they compete, not just near their boundaries, until no
+        expansion helps, refit the planes, and repeat until the labelling stands still (at most
+        ten times).
 
     Returns
     -------
@@ -70,15 +76,21 @@ def refine(
     kept[0] = True
     surfaces = np.where(kept, np.cumsum(kept) - 1, 0)[surfaces]
     moments = moments[kept]
-    blocks = surfaces.astype(np.int32)
     models = Models.of(moments)
-    labels, _ = _descended(problem, blocks, models)
-    models = Models.of(region_moments(problem, labels, len(moments), sensor))
-    labels, cost = _descended(problem, blocks, models)
-    boxes = find_objects(labels, len(moments) - 1)
-    for alpha, box in enumerate(boxes, 1):
-        if box is not None:
-            _expand(alpha, box, labels, cost, problem, models)
+    labels, cost = _descended(problem, surfaces.astype(np.int32), models)
+    if not exact:
+        _expand_each(labels, cost, problem, models, _BAND)
+        return labels, models
+    for _ in range(_ROUNDS):
+        before = labels.copy()
+        while _expand_each(labels, cost, problem, models, _REACH * BLOCK):
+            pass
+        if np.array_equal(labels, before):
+            break
+        models = Models.of(region_moments(problem, labels, len(moments), sensor))
+        cost = _costs(
+            labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
+        )
     return labels, models
 
 
@@ -183,12 +195,12 @@ def _descended(
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
     """Value of eq. 5.3: data costs plus the weights of the edges between unlike labels."""
-    data = _total_cost(
+    cost = _costs(
         labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
     )
     unlike = problem.horizontal[labels[:, 1:] != labels[:, :-1]].sum(dtype=np.float64)
     unlike += problem.vertical[labels[1:] != labels[:-1]].sum(dtype=np.float64)
-    return float(data + _SMOOTHNESS * unlike)
+    return float(cost.sum(dtype=np.float64) + _SMOOTHNESS * unlike)
 
 
 @njit(cache=True)
@@ -209,22 +221,23 @@ def _data_cost(
 
 
 @njit(cache=True)
-def _total_cost(
+def _costs(
     labels: NDArray[np.int32],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     weight: NDArray[np.float32],
     theta: NDArray[np.float64],
     tolerance: NDArray[np.float64],
-) -> float:
-    total = 0.0
+) -> NDArray[np.float32]:
+    """What each pixel's label costs it; 0 where nothing was measured."""
+    cost = np.zeros(labels.shape, np.float32)
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             if weight[i, j] > 0:
-                total += _data_cost(
+                cost[i, j] = _data_cost(
                     labels[i, j], rays[i, j], inverse[i, j], weight[i, j], theta, tolerance
                 )
-    return total
+    return cost
 
 
 @njit(cache=True)
@@ -365,6 +378,21 @@ def _descend(
                     waiting += 1
 
 
+def _expand_each(
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+    reach: int,
+) -> bool:
+    """Expand every label once, by at most `reach` pixels; in place. Whether that helped."""
+    helped = False
+    for alpha, box in enumerate(find_objects(labels, len(models.theta) - 1), 1):
+        if box is not None:
+            helped |= _expand(alpha, box, labels, cost, problem, models, reach)
+    return helped
+
+
 def _expand(
     alpha: int,
     box: tuple[slice, slice],
@@ -372,16 +400,20 @@ def _expand(
     cost: NDArray[np.float32],
     problem: Problem,
     models: Models,
-) -> None:
-    """Give label `alpha` to the best set of pixels near its own, which `box` holds; in place."""
-    rows, columns = (slice(max(part.start - _BAND - 1, 0), part.stop + _BAND + 1) for part in box)
+    reach: int,
+) -> bool:
+    """Give label `alpha` to the best set of pixels near its own, which `box` holds; in place.
+
+    Whether that lowered the energy.
+    """
+    rows, columns = (slice(max(part.start - reach - 1, 0), part.stop + reach + 1) for part in box)
     here = labels[rows, columns]
     own = (here == alpha).astype(np.uint8)
-    near = cv2.dilate(own, np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8)) > own
+    near = cv2.dilate(own, np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)) > own
     near &= problem.weight[rows, columns] > 0
     sites = np.flatnonzero(near)
     if not len(sites):
-        return
+        return False
     index = np.full(here.shape, -1, np.int32)
     index.ravel()[sites] = np.arange(len(sites))
     excess, new, first, second, link = _expansion(
@@ -400,10 +432,12 @@ def _expand(
     )
     switched = minimum_cut(excess, first, second, link)
     value = excess[switched].sum() + link[switched[first] != switched[second]].sum()
-    if value < -_STEP:
-        chosen = np.unravel_index(sites[switched], here.shape)
-        here[chosen] = alpha
-        cost[rows, columns][chosen] = new[switched]
+    if value >= -_STEP:
+        return False
+    chosen = np.unravel_index(sites[switched], here.shape)
+    here[chosen] = alpha
+    cost[rows, columns][chosen] = new[switched]
+    return True
 
 
 @njit(cache=True)

@@ -100,7 +100,7 @@ class Segmenter:
         surface, moments = surfaces(weighted(blocks, sensor), links)
         watch.lap('surfaces')
         problem = Problem.of(image, sensor, horizontal, vertical)
-        labels, models = refine(problem, surface, moments, sensor)
+        labels, models = refine(problem, surface, moments, sensor, self.config.exact)
         watch.lap('labels')
         regions = plane_regions(
             labels, image.valid & (labels > 0), horizontal, vertical, self.config
