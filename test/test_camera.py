@@ -1,0 +1,86 @@
+"""Pinhole intrinsics from every source, and what is refused."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros import Camera
+from rangeseg_ros.core.camera import CameraError
+
+K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
+P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]
+
+
+def test_rays_project_back_to_their_pixels():
+    camera = Camera(7, 5, 500.0, 510.0, 3.2, 1.9)
+    assert camera.shape == (5, 7) and camera.rays.dtype == np.float32
+    columns = camera.rays[..., 0] * 500 + 3.2
+    rows = camera.rays[..., 1] * 510 + 1.9
+    np.testing.assert_allclose(columns, np.tile(np.arange(7), (5, 1)), atol=1e-4)
+    np.testing.assert_allclose(rows, np.tile(np.arange(5)[:, None], 7), atol=1e-4)
+    assert (camera.rays[..., 2] == 1).all()
+
+
+def test_projection_matrix_wins_when_rectified():
+    assert Camera.from_matrices(640, 480, K).fx == 500
+    assert Camera.from_matrices(640, 480, K, P) == Camera(640, 480, 450, 460, 310, 235)
+    assert Camera.from_matrices(640, 480, K, np.zeros(12)).fx == 500
+
+
+def test_binning_keeps_the_rays_of_the_collected_pixels():
+    full, binned = (
+        Camera.from_matrices(640, 480, K),
+        Camera.from_matrices(640, 480, K, None, (2, 4)),
+    )
+    assert binned.shape == (120, 320)
+    block = full.rays[4:8, 6:8].reshape(-1, 3).mean(axis=0)
+    np.testing.assert_allclose(binned.rays[1, 3], block, atol=1e-6)
+
+
+def test_region_of_interest_moves_the_principal_point():
+    full = Camera.from_matrices(640, 480, K)
+    part = Camera.from_matrices(640, 480, K, None, (0, 0), (100, 50, 320, 200))
+    assert part.shape == (200, 320)
+    np.testing.assert_allclose(part.rays[10, 20], full.rays[60, 120], atol=1e-6)
+
+
+def test_calibration_file_content():
+    calibration = {
+        'image_width': 640,
+        'image_height': 480,
+        'camera_matrix': {'data': np.ravel(K).tolist()},
+        'projection_matrix': {'data': np.ravel(P).tolist()},
+    }
+    assert Camera.from_calibration(calibration).fx == 450
+    del calibration['projection_matrix']
+    assert Camera.from_calibration(calibration).fx == 500
+
+
+@pytest.mark.parametrize(
+    ('change', 'message'),
+    [
+        ({'width': 0}, 'size'),
+        ({'fx': 0.0}, 'fx'),
+        ({'fy': -1.0}, 'fy'),
+        ({'fx': np.nan}, 'fx'),
+        ({'cy': np.inf}, 'cy'),
+    ],
+)
+def test_impossible_intrinsics(change, message):
+    values = {'width': 4, 'height': 3, 'fx': 1.0, 'fy': 1.0, 'cx': 0.0, 'cy': 0.0, **change}
+    with pytest.raises(CameraError, match=message):
+        Camera(**values)
+
+
+@pytest.mark.parametrize(
+    ('calibration', 'message'),
+    [
+        ({}, 'image_width'),
+        ({'image_width': 4, 'image_height': 3}, 'camera_matrix'),
+        ({'image_width': 4, 'image_height': 3, 'camera_matrix': {'data': [1, 2]}}, '9 values'),
+        ({'image_width': 4, 'image_height': 3, 'camera_matrix': 5}, 'malformed'),
+        ([], 'malformed'),
+    ],
+)
+def test_malformed_calibrations(calibration, message):
+    with pytest.raises(CameraError, match=message):
+        Camera.from_calibration(calibration)

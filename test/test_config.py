@@ -1,0 +1,67 @@
+"""One place for parameters: defaults, types, ranges."""
+
+from dataclasses import fields
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rangeseg_ros import Config
+from rangeseg_ros.core.config import ConfigError
+
+FIELDS = {f.name: f for f in fields(Config)}
+
+
+def test_every_default_lies_in_its_range_and_every_parameter_is_described():
+    Config()
+    for f in FIELDS.values():
+        assert len(f.metadata['description']) > 5
+        assert f.metadata['choices'] or f.metadata['low'] is not None or f.type == 'bool'
+
+
+def test_mapping_gives_what_the_constructor_gives():
+    assert Config.from_mapping({'smoothness': 10, 'exact': True}) == Config(
+        smoothness=10.0, exact=True
+    )
+
+
+@pytest.mark.parametrize(
+    ('values', 'words'),
+    [
+        ({'smothness': 1.0}, ['smothness', 'smoothness']),
+        ({'smoothness': -1.0}, ['smoothness', '0', '10000']),
+        ({'smoothness': float('nan')}, ['smoothness']),
+        ({'smoothness': 'high'}, ['smoothness', 'float']),
+        ({'cycles': 2.5}, ['cycles', 'int']),
+        ({'cycles': True}, ['cycles', 'int']),
+        ({'exact': 1}, ['exact', 'bool']),
+        ({'method': 'magic'}, ['method', 'planes', 'normals']),
+        ({'direction_count': 300}, ['direction_count', '305']),
+        ({'directions': 'regular', 'direction_count': 224}, ['direction_count', '225']),
+    ],
+)
+def test_refusals_name_the_parameter_and_what_it_takes(values, words):
+    with pytest.raises(ConfigError) as refusal:
+        Config.from_mapping(values)
+    message = str(refusal.value)
+    assert '\n' not in message
+    for word in words:
+        assert word in message
+
+
+@given(
+    st.dictionaries(
+        st.sampled_from(sorted(FIELDS)),
+        st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5)),
+        max_size=3,
+    )
+)
+def test_any_mapping_gives_a_valid_config_or_a_config_error(mapping):
+    try:
+        config = Config.from_mapping(mapping)
+    except ConfigError:
+        return
+    for name, f in FIELDS.items():
+        value, low = getattr(config, name), f.metadata['low']
+        assert type(value) is type(f.default)
+        assert low is None or low <= value <= f.metadata['high']

@@ -1,0 +1,79 @@
+"""Depth images and organised clouds become rays, inverse range and validity."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros import Camera, RangeImage
+from rangeseg_ros.core.range_image import RangeImageError
+
+CAMERA = Camera(4, 3, 2.0, 3.0, 1.5, 1.0)
+
+
+def test_millimetres_and_metres_agree():
+    depth = np.random.default_rng(0).integers(1, 65536, CAMERA.shape).astype(np.uint16)
+    metres = depth / 1000
+    first, second = RangeImage.from_depth(depth, CAMERA), RangeImage.from_depth(metres, CAMERA)
+    np.testing.assert_allclose(first.inverse, second.inverse, rtol=1e-6)
+    np.testing.assert_allclose(first.points[..., 2], metres, rtol=1e-6)
+    expected = CAMERA.rays * metres[..., None]
+    np.testing.assert_allclose(first.points, expected, rtol=1e-5)
+
+
+def test_scale_of_a_unit():
+    image = RangeImage.from_depth(np.full(CAMERA.shape, 5000, np.uint16), CAMERA, 1 / 5000)
+    np.testing.assert_allclose(image.points[..., 2], 1.0)
+
+
+def test_what_is_no_measurement():
+    depth = np.array([[0, -1, np.nan, np.inf], [-np.inf, 1, 2, 3], [1e-30, 1e30, 4, 5]])
+    image = RangeImage.from_depth(depth, CAMERA)
+    assert image.valid[1, 1:].all() and image.valid[2, 2:].all()
+    assert not image.valid[0].any() and not image.valid[1, 0]
+    assert np.isnan(image.points[~image.valid]).all()
+    assert np.isfinite(image.inverse).all()
+
+
+def test_clouds_keep_their_points():
+    points = np.random.default_rng(1).normal(size=(5, 6, 3)) * 3
+    points[2, 3] = np.nan
+    points[0, 0] = 0
+    points[1, 1, 2] = np.inf
+    image = RangeImage.from_points(points)
+    assert np.argwhere(~image.valid).tolist() == [[0, 0], [1, 1], [2, 3]]
+    np.testing.assert_allclose(image.points[image.valid], points[image.valid], rtol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(image.rays[image.valid], axis=1), 1, rtol=1e-6)
+
+
+def test_dithering_adds_the_stated_noise_to_the_ranges():
+    camera = Camera(200, 150, 100.0, 100.0, 99.5, 74.5)
+    depth = np.full(camera.shape, 2.0)
+    depth[:, :50] = 0
+    image = RangeImage.from_depth(depth, camera).dithered(0.01, seed=4)
+    assert not image.valid[:, :50].any() and image.valid[:, 50:].all()
+    z = image.points[:, 50:, 2]
+    assert z.mean() == pytest.approx(2.0, abs=5e-4) and z.std() == pytest.approx(0.01, rel=0.03)
+    again = RangeImage.from_depth(depth, camera).dithered(0.01, seed=4)
+    np.testing.assert_array_equal(image.inverse, again.inverse)
+
+
+@pytest.mark.parametrize(
+    ('depth', 'scale', 'message'),
+    [
+        (np.zeros((3, 4, 3), np.uint16), None, 'one channel'),
+        (np.zeros((3, 4), np.uint8), None, 'uint16 or float'),
+        (np.zeros((4, 4), np.uint16), None, '4x4'),
+        (np.zeros((3, 4), np.uint16), 0.0, 'scale'),
+        (np.zeros((3, 4), np.uint16), np.nan, 'scale'),
+    ],
+)
+def test_refused_depth_images(depth, scale, message):
+    with pytest.raises(RangeImageError, match=message):
+        RangeImage.from_depth(depth, CAMERA, scale)
+
+
+@pytest.mark.parametrize(
+    'points', [np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int)]
+)
+def test_refused_clouds(points):
+    with pytest.raises(RangeImageError, match='organised cloud'):
+        RangeImage.from_points(points)

@@ -1,0 +1,155 @@
+"""Method `normals` from depth to planes: noise-free rooms, degenerate frames, determinism."""
+
+import hashlib
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
+
+NORMALS = Config(method='normals')
+# Without noise neither a wide baseline nor much smoothing is called for.
+NOISE_FREE = replace(NORMALS, normal_baseline=1, smoothness=20.0, noise_regions='leave')
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+
+
+def corner(noise=0.0):
+    """Depth in metres of a floor and two walls."""
+    rays = CAMERA.rays.astype(float)
+    planes = [((0, -0.8, -0.6), 1.0), ((-0.8, 0.36, -0.48), 1.4), ((0.8, 0.36, -0.48), 1.2)]
+    inverse = np.max([rays @ n / -d for n, d in planes], axis=0)
+    return 1 / inverse + noise * np.random.default_rng(0).normal(size=CAMERA.shape)
+
+
+def segment(depth, config=NORMALS, camera=CAMERA):
+    return Segmenter(config).segment(RangeImage.from_depth(depth, camera))
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_every_face_of_a_noise_free_room_is_found(seed):
+    """Faces of 500 pixels that are nowhere thinner than the 9 pixels jump edges look at."""
+    frame = simulate_kinect(kinect_room(seed), noise='none', seed=seed)
+    result = segment(frame.depth, NOISE_FREE, frame.camera)
+    checked = 0
+    for plane in frame.planes:
+        face = frame.labels == plane.label
+        thick = cv2.erode(face.astype(np.uint8), np.ones((9, 9), np.uint8)).any()
+        if face.sum() < 500 or not thick:
+            continue
+        counts = np.bincount(result.labels[face], minlength=len(result.planes) + 1)
+        counts[0] = 0
+        label = int(counts.argmax())
+        assert counts[label] >= 0.8 * face.sum(), plane
+        assert counts[label] >= 0.8 * (result.labels == label).sum(), plane
+        found = next(p for p in result.planes if p.label == label)
+        assert np.degrees(np.arccos(min(1.0, found.normal @ plane.normal))) < 0.3
+        assert found.distance == pytest.approx(plane.distance, abs=0.01)
+        checked += 1
+    assert checked >= 8
+
+
+def test_coarse_to_fine_and_exact_agree_on_a_corner():
+    fast = segment(corner(0.002))
+    full = segment(corner(0.002), replace(NORMALS, exact=True))
+    assert len(fast.planes) == len(full.planes) == 3
+    assert np.mean(fast.labels == full.labels) > 0.97
+    assert full.energy <= fast.energy <= 1.005 * full.energy
+
+
+@pytest.mark.parametrize(
+    'options',
+    [
+        {'normals': 'plane_fit'},
+        {'normal_baseline': 1},
+        {'directions': 'regular', 'direction_count': 225},
+        {'directions': 'spiral', 'direction_count': 300},
+        {'directions': 'random', 'direction_count': 500},
+        {'jump_edges': 'sobel'},
+        {'jump_edges': 'none'},
+        {'weighting': 'distance'},
+        {'exact': True, 'moves': 'swap', 'direction_count': 73},
+        {'noise_regions': 'leave'},
+        {'noise_regions': 'merge'},
+        {'dithering': 0.001},
+    ],
+    ids=lambda options: ' '.join(f'{name}={value}' for name, value in options.items()),
+)
+def test_every_option_finds_the_corner(options):
+    result = segment(corner(), replace(NORMALS, **options))
+    large = [plane for plane in result.planes if plane.count > 300]
+    assert len(large) == 3
+    truth = np.array([(0, -0.8, -0.6), (-0.8, 0.36, -0.48), (0.8, 0.36, -0.48)])
+    angles = np.degrees(np.arccos(np.clip(np.array([p.normal for p in large]) @ truth.T, -1, 1)))
+    assert (angles.min(axis=0) < 2).all()
+
+
+@pytest.mark.parametrize('method', ['normals', 'planes'])
+@pytest.mark.parametrize(
+    'depth',
+    [
+        np.zeros((48, 64), np.uint16),
+        np.full((48, 64), np.nan),
+        np.full((48, 64), np.inf),
+        np.full((48, 64), -1.0),
+        np.where(np.eye(48, 64) > 0, 1.0, np.inf),
+    ],
+    ids=['zero', 'nan', 'infinite', 'negative', 'diagonal'],
+)
+def test_frames_without_a_plane_say_why(depth, method):
+    result = segment(depth, Config(method=method))
+    assert result.planes == [] and not result.labels.any()
+    assert result.reason
+
+
+@pytest.mark.parametrize('method', ['normals', 'planes'])
+@pytest.mark.parametrize('shape', [(1, 1), (1, 50), (50, 1), (2, 2), (7, 9)])
+def test_tiny_images(shape, method):
+    camera = Camera(shape[1], shape[0], 50.0, 50.0, 0.0, 0.0)
+    result = segment(np.full(shape, 1500, np.uint16), Config(method=method), camera)
+    assert result.planes == [] and result.labels.shape == shape
+    assert result.reason
+
+
+def test_holes_and_infinities_leave_the_rest_alone():
+    depth = corner()
+    depth[5:9, 20:30] = np.inf
+    depth[30:34, 10:20] = np.nan
+    result = segment(depth)
+    assert len(result.planes) == 3
+    assert not result.labels[5:9, 20:30].any() and not result.labels[30:34, 10:20].any()
+
+
+def _digest():
+    frame = simulate_kinect(kinect_room(3), Camera(160, 120, 146.0, 146.0, 79.5, 59.5), seed=1)
+    return hashlib.sha256(segment(frame.depth, NORMALS, frame.camera).labels.tobytes()).hexdigest()
+
+
+def test_same_labels_bit_for_bit_twice_and_in_another_process():
+    first = _digest()
+    assert first == _digest()
+    program = 'import test_segmenter; print(test_segmenter._digest())'
+    other = subprocess.run(
+        [sys.executable, '-c', program],
+        cwd=Path(__file__).parent,
+        env={**os.environ, 'PYTHONPATH': os.pathsep.join(['.', *sys.path])},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert other.stdout.strip() == first
+
+
+def test_dithering_repeats_with_its_seed():
+    config = replace(NORMALS, dithering=0.002)
+    first, again = segment(corner(), config), segment(corner(), config)
+    other = segment(corner(), replace(config, seed=1))
+    np.testing.assert_array_equal(first.labels, again.labels)
+    assert first.energy == again.energy != other.energy
