@@ -59,7 +59,7 @@ def plot_tolerances(path: Path, rows: Sequence[Row], title: str) -> None:
     figure.legend(fontsize=8, loc='outside right upper')
     if any(_published(row) for row in rows):
         title += '; published: real Perceptron set'
-    figure.suptitle(title)
+    axes.set_title(title, fontsize=10)
     _save(path, figure)
 
 
