@@ -227,7 +227,6 @@ def _plane(**changes):
         'normal': np.array([0.0, 0.6, -0.8]),
         'covariance': np.arange(16.0).reshape(4, 4),
         'centroid': np.array([0.1, 0.2, 1.7]),
-        'hull': TRIANGLE,
         'extents': np.array([2.0, 1.0]),
         'centre': np.array([0.3, 0.4, 1.8]),
         'orientation': np.array([0.1, 0.2, 0.3, 0.4]),

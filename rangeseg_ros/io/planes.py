@@ -37,7 +37,6 @@ _PARTS: dict[str, dict[str, Callable[[Any], Any]]] = {
     'extents': {'length': itemgetter(0), 'width': itemgetter(1)},
     'centre': _axes('centre', 'xyz'),
     'orientation': _axes('orientation', 'xyzw'),
-    'hull': {'hull': _points},
     'outline': {
         'hull': lambda outline: _points(outline.hull),
         'holes': lambda outline: '|'.join(map(_points, outline.holes)),
