@@ -26,7 +26,7 @@ DISTORTION_PIXELS = 2000.0
 _NOISE = 16.0 * 4.0
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
 # are merged at once.
-_CLEAR = 12.0
+_CLEAR = 24.0
 # Systematic variances granted between blocks of a patch, between neighbouring patches, and
 # within a surface (4 standard deviations).
 _WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 2.0, 10.0, 30.0
