@@ -14,7 +14,7 @@ from rangeseg_ros.evaluation import experiments, plots
 from rangeseg_ros.evaluation.hoover import Overlap
 from rangeseg_ros.evaluation.measure import Measurement, Task
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.params import read_config
+from rangeseg_ros.io.params import read_config, read_params
 
 
 @pytest.fixture
@@ -77,8 +77,17 @@ def test_lambda(folder, tmp_path, monkeypatch, measured):
     picture(output / 'lambda.png')
     assert len(measured) == 2 * 9
     config = read_config(params)
-    assert config.method == Config().method and config.normal_baseline == 1
+    assert config.method == 'normals' and config.normal_baseline == 1
     assert config.smoothness in (20.0, 85.0, 150.0)
+
+
+def test_trained_parameters_leave_open_what_the_given_ones_do(folder, tmp_path, monkeypatch):
+    given, params = tmp_path / 'given.yaml', tmp_path / 'params.yaml'
+    given.write_text('normal_baseline: 2\n')
+    args = ('lambda', folder, '--output', tmp_path / 'out', '--step', '130', '--params', given)
+    assert run(monkeypatch, *args, '--train', params) == 0
+    assert set(read_params(params)) <= {'normal_baseline', 'smoothness'}
+    assert read_params(params)['normal_baseline'] == 2
 
 
 def test_resumes(folder, tmp_path, monkeypatch, measured):

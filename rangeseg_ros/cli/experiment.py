@@ -25,6 +25,7 @@ class Setting:
 
     cases: list[Case]
     base: Config
+    names_method: bool
     bench: experiments.Bench
     output: Path
     images: int | None
@@ -70,16 +71,20 @@ def experiment(function: Callable[..., None]) -> Callable[..., None]:
         jobs: int | None,
         **rest: Any,
     ) -> None:
-        base = experiments.THESIS
+        base, given = experiments.THESIS, {'method': 'normals'}
         if params_file:
-            base = Config.from_mapping({'method': 'normals', **read_params(params_file)})
+            given = read_params(params_file)
+            base = Config.from_mapping({'method': 'normals', **given})
         bench = experiments.Bench(
             output / 'cache',
             jobs,
             lambda items, total: options.progress(items, total, 'image'),
         )
         source = f'{"real" if real else "simulated"} set {folder.resolve().name}'
-        function(Setting(find_cases(folder), base, bench, output, images, source), **rest)
+        function(
+            Setting(find_cases(folder), base, 'method' in given, bench, output, images, source),
+            **rest,
+        )
 
     for decorate in (
         measures.jobs,
@@ -195,14 +200,16 @@ def _lambdas(step: int) -> list[float]:
 def _write_params(path: Path, setting: Setting, rows: list[experiments.Row]) -> None:
     """Parameter file with the best lambda and whatever else differs from the defaults.
 
-    The method stays out of it: lambda is there for whoever chooses `normals`.
+    Where --params names no method the file names none either: lambda is then there for whoever
+    chooses `normals`.
     """
     best = max((r for r in rows if r['series'] == 'identified'), key=lambda row: row['correct'])
     defaults = Config()
     chosen = {
         name: getattr(setting.base, name)
         for name in Config.__dataclass_fields__
-        if name != 'method' and getattr(setting.base, name) != getattr(defaults, name)
+        if getattr(setting.base, name) != getattr(defaults, name)
+        and (name != 'method' or setting.names_method)
     }
     params = {**chosen, 'smoothness': best['lambda']}
     text = (
