@@ -18,7 +18,7 @@ setup(
     maintainer_email='rangeseg-ros@example.org',
     license='GPL-3.0-or-later',
     packages=find_packages(include=[package_name, f'{package_name}.*']),
-    package_data={package_name: ['py.typed']},
+    package_data={package_name: ['py.typed', 'report/templates/*.html']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (share, ['package.xml']),
@@ -30,6 +30,7 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'click>=8.0',
+        'jinja2>=3.0',
         'lz4',
         'matplotlib>=3.6',
         'mcap>=1.2.1',
@@ -45,6 +46,8 @@ setup(
     ],
     extras_require={
         'test': ['hypothesis>=6.90', 'pytest>=7.4'],
+        'dask': ['distributed>=2023.1'],
+        'view': ['rerun-sdk>=0.22'],
         'lint': ['mypy>=1.8', 'ruff>=0.4', 'types-PyYAML'],
         # The node where no ROS 2 is installed: rclpy over Fast DDS as wheels. A sourced ROS 2 has
         # all of these, so do not install this extra beside one.

@@ -14,7 +14,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import segcomp
 from rangeseg_ros.evaluation.datasets import ScanCase, SegcompCase, find_cases
 from rangeseg_ros.evaluation.hoover import classify
-from rangeseg_ros.evaluation.measure import Measurement, Task, run_all
+from rangeseg_ros.evaluation.measure import Measurement, Task
 from rangeseg_ros.evaluation.pictures import (
     CORRECT,
     MISSED,
@@ -25,6 +25,7 @@ from rangeseg_ros.evaluation.pictures import (
 )
 from rangeseg_ros.evaluation.segcomp_geometry import abw_calibration
 from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.parallel import run_all
 
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 # Two walls that meet in the vertical line x = 0, z = 2.

@@ -149,7 +149,8 @@ def test_pack_and_replay(folder, run):
     assert (code, error) == (0, '')
     stems = ('000000_1.000000000', '000001_1.250000000')
     pictures = [f'{stem}_{kind}.png' for stem in stems for kind in ('labels', 'overlay')]
-    assert files(folder / 'out') == [*pictures, 'planes.csv']
+    bag = ['bag/bag.mcap', 'bag/metadata.yaml']
+    assert files(folder / 'out') == [*pictures, *bag, 'planes.csv', 'report.html']
     assert '1 frames without a plane: no valid depth' in output
     assert 'out: 2 frames' in output
     run('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'same')
@@ -194,12 +195,18 @@ def test_bad_input_of_pack(folder, run):
     assert (code, error) == (2, 'rangeseg: bag: exists already, not overwritten\n')
 
 
-def test_several_bags_are_one_sequence(folder, run):
+def test_several_bags_have_a_folder_each(folder, run):
     for name in ('a', 'b'):
         record(folder / name, 'mcap', depth_images(2) * 0)
-    assert run('replay', 'a', 'b', '--output', 'out')[0] == 0
-    labels = [name[:6] for name in files(folder / 'out') if name.endswith('_labels.png')]
-    assert labels == ['000000', '000001', '000002', '000003']
+    assert run('replay', 'a', 'b', '--output', 'out', '--jobs', 1)[0] == 0
+    alone = files(folder / 'out/a')
+    assert len(alone) == 8
+    assert files(folder / 'out/b') == alone
+    record(folder / 'other/b', 'mcap', depth_images(2) * 0)
+    code, output, error = run('replay', 'b', 'other/b', '--output', 'new')
+    assert (code, output) == (2, '')
+    assert error == 'rangeseg: 2 recordings named b would write the same results\n'
+    assert not (folder / 'new').exists()
 
 
 @pytest.mark.parametrize('storage', SUFFIXES)
@@ -212,11 +219,12 @@ def test_a_truncated_bag_is_reported_and_its_first_frames_are_kept(folder, run, 
     with DepthBag(path) as bag:
         count = len(bag)
     assert count > 5
-    code, output, error = run('replay', path, 'whole', '--output', 'out')
+    code, output, error = run('replay', path, 'whole', '--output', 'out', '--jobs', 1)
     assert code == 1
     assert error.startswith(f'rangeseg: {path}: damaged after {count} frames: ')
     assert error.count('\n') == 1
-    assert f'out: {count + 1} frames' in output
+    assert f'out/bag: {count} frames' in output
+    assert 'out/whole: 1 frames' in output
     assert sum(name.endswith('_labels.png') for name in files(folder / 'out')) == count + 1
 
 

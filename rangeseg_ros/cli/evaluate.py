@@ -9,8 +9,9 @@ import click
 from rangeseg_ros.cli import measures, options
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluated, table
-from rangeseg_ros.evaluation.measure import Task, run_all
+from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.io.params import read_config
+from rangeseg_ros.parallel import run_all
 
 
 @click.command(cls=measures.ToleranceCommand)

@@ -1,17 +1,18 @@
-"""`rangeseg replay`: recordings to labels and planes."""
+"""`rangeseg replay`: recordings to labels, planes, bags and reports."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import click
 
-from rangeseg_ros.cli import options
-from rangeseg_ros.cli.results import make_segmenter, write_pictures
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.io.bags import DamagedBagError, DepthBag
-from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.batch.replay import Outcome, Replay
+from rangeseg_ros.cli import measures, options
+from rangeseg_ros.io.params import read_config
+from rangeseg_ros.parallel import run_all, run_on_cluster
+from rangeseg_ros.ros.outputs import OUTPUTS
 
 
 @click.command()
@@ -24,6 +25,23 @@ from rangeseg_ros.io.planes import PlaneTable
 )
 @click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@click.option(
+    '--topic',
+    'topics',
+    type=click.Choice(list(OUTPUTS)),
+    multiple=True,
+    default=Replay.topics,
+    show_default=True,
+    help='Topic of the node to write into the bag; several may be given.',
+)
+@click.option('--copy', is_flag=True, help='Copy the topics of the recording into the bag.')
+@measures.jobs
+@click.option(
+    '--scheduler',
+    metavar='ADDRESS',
+    help='Run on the workers of this Dask cluster, e.g. tcp://host:8786; needs the extra dask. '
+    'The workers see BAGs and output under the same names.',
+)
 @options.params
 @options.exact
 @click.pass_context
@@ -33,43 +51,75 @@ def command(
     output: Path,
     depth_topic: str | None,
     camera_topic: str | None,
+    topics: tuple[str, ...],
+    copy: bool,
+    jobs: int | None,
+    scheduler: str | None,
     params_file: Path | None,
     exact: bool,
 ) -> None:
     """Segment the depth images of recordings: rosbag2 (mcap, sqlite3) and ROS 1 bags.
 
-    Writes planes.csv (a row for each plane and frame) and for each frame
-    <frame>_<stamp>_labels.png (16 bits, 0 = no plane) and <frame>_<stamp>_overlay.png. Several
-    BAGs count as one sequence. A damaged one is read up to the damage, and the exit code is 1.
+    \b
+    Writes, into a folder for each recording if there are several:
+      <frame>_<stamp>_labels.png    16 bits, 0 = no plane
+      <frame>_<stamp>_overlay.png   planes in colour
+      planes.csv                    a row for each plane and frame
+      bag                           what the node would publish (mcap)
+      report.html                   pictures, planes over time, times
+
+    A recording that is done is not done again, one that was interrupted starts anew. A damaged
+    one is read up to the damage, and the exit code is 1.
     """
-    segmenter = make_segmenter(params_file, exact)
-    index = 0
-    reasons: dict[str, int] = {}
-    damaged = False
-    with ExitStack() as stack:
-        # All are opened, and so checked, before anything is written.
-        recordings = [
-            stack.enter_context(DepthBag(bag, depth_topic, camera_topic)) for bag in bags
-        ]
-        output.mkdir(parents=True, exist_ok=True)
-        table = stack.enter_context(PlaneTable(output / 'planes.csv', ('frame', 'stamp')))
-        for recording in recordings:
-            click.echo(f'{recording.path}: {recording.depth_topic}, {recording.camera_topic}')
-            try:
-                for frame in options.progress(recording, len(recording), 'frame'):
-                    image = RangeImage.from_depth(frame.depth, frame.camera)
-                    result = segmenter.segment(image)
-                    stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
-                    write_pictures(output, f'{index:06d}_{stamp}', image, result)
-                    table.write(result.planes, index, stamp)
-                    if not result.planes:
-                        reasons[result.reason] = reasons.get(result.reason, 0) + 1
-                    index += 1
-            except DamagedBagError as error:
-                click.echo(f'rangeseg: {error}', err=True)
-                damaged = True
-    for reason, count in reasons.items():
-        click.echo(f'{count} frames without a plane: {reason}')
-    click.echo(f'{output}: {index} frames')
-    if damaged:
+    config = read_config(params_file, **({'exact': True} if exact else {}))
+    folders = _folders(bags, output)
+    if scheduler:
+        # The workers have working directories of their own.
+        bags = tuple(bag.absolute() for bag in bags)
+        folders = [folder.absolute() for folder in folders]
+    topics = tuple(name for name in OUTPUTS if name in topics)
+    tasks = [
+        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy)
+        for bag, folder in zip(bags, folders, strict=True)
+    ]
+    # All are opened, and so checked, before anything is written.
+    found = [task.check() for task in tasks]
+    outcomes = []
+    for task, read, outcome in zip(tasks, found, _outcomes(tasks, jobs, scheduler), strict=True):
+        click.echo(f'{task.recording}: {read}')
+        _report(task, outcome)
+        outcomes.append(outcome)
+    if any(outcome.damage for outcome in outcomes):
         ctx.exit(1)
+
+
+def _folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
+    """Where the results of each recording go."""
+    if len(bags) == 1:
+        return [output]
+    names = [bag.stem if bag.suffix in ('.bag', '.mcap', '.db3') else bag.name for bag in bags]
+    name, count = Counter(names).most_common(1)[0]
+    if count > 1:
+        raise click.UsageError(f'{count} recordings named {name} would write the same results')
+    return [output / name for name in names]
+
+
+def _outcomes(tasks: list[Replay], jobs: int | None, scheduler: str | None) -> Iterable[Outcome]:
+    if scheduler:
+        try:
+            done: Iterator[Outcome] = run_on_cluster(tasks, scheduler)
+            return options.progress(done, len(tasks), 'bag')
+        except ImportError:
+            raise click.ClickException('--scheduler needs distributed: the extra dask') from None
+    if len(tasks) == 1:
+        return [tasks[0].run(lambda frames, total: options.progress(frames, total, 'frame'))]
+    return options.progress(run_all(tasks, jobs), len(tasks), 'bag')
+
+
+def _report(task: Replay, outcome: Outcome) -> None:
+    for reason, count in outcome.reasons.items():
+        click.echo(f'{count} frames without a plane: {reason}')
+    already = ', done before' if outcome.found_done else ''
+    click.echo(f'{task.folder}: {outcome.frames} frames{already}')
+    if outcome.damage:
+        click.echo(f'rangeseg: {outcome.damage}', err=True)

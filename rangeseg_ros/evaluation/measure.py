@@ -1,20 +1,13 @@
-"""Running the segmenter over a data set, on all cores, and what is kept of each image."""
+"""Running the segmenter over a data set, and what is kept of each image."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import multiprocessing
-import os
-import signal
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, fields
 from functools import cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 import rangeseg_ros.core
@@ -51,6 +44,8 @@ class Measurement:
         Of the labelling.
     timings : dict
         Milliseconds per stage.
+    reason : str
+        Why there is no plane; empty when there is one.
     """
 
     name: str
@@ -60,6 +55,7 @@ class Measurement:
     found_planes: dict[int, list[float]]
     energy: float
     timings: dict[str, float]
+    reason: str = ''
 
     def to_json(self) -> str:
         """All fields as JSON."""
@@ -129,6 +125,7 @@ class Task:
             {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
             float(result.energy),
             result.timings,
+            result.reason,
         )
 
     def _save(self, folder: Path, sample: Sample, result: Segmentation, overlap: Overlap) -> None:
@@ -158,33 +155,3 @@ def code_digest() -> bytes:
     for path in sorted(Path(rangeseg_ros.core.__path__[0]).glob('*.py')):
         digest.update(path.read_bytes())
     return digest.digest()
-
-
-def run_all(tasks: Sequence[Task], jobs: int | None = None) -> Iterator[Measurement]:
-    """Run tasks on all cores (or `jobs` processes); yields their measurements in order.
-
-    Raises
-    ------
-    ValueError, OSError
-        The first task's that fails; those that have not begun are dropped.
-    """
-    jobs = min(jobs or os.cpu_count() or 1, len(tasks))
-    if jobs <= 1:
-        yield from map(_run, tasks)
-        return
-    # Spawned, not forked: OpenCV's threads do not survive a fork.
-    context = multiprocessing.get_context('spawn')
-    with ExitStack() as stack:
-        pool = ProcessPoolExecutor(jobs, context, initializer=_begin)
-        stack.callback(pool.shutdown, cancel_futures=True)
-        yield from pool.map(_run, tasks)
-
-
-def _begin() -> None:
-    """Make a process one of many: a thread of its own, interrupted by its parent only."""
-    cv2.setNumThreads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _run(task: Task) -> Measurement:
-    return task.run()

@@ -46,6 +46,8 @@ class DepthFrame:
     ----------
     stamp : int
         Time of the measurement (header stamp), nanoseconds.
+    time : int
+        When it was recorded, nanoseconds.
     frame_id : str
         Optical frame of the camera.
     depth : (H, W) uint16 or float32
@@ -55,6 +57,7 @@ class DepthFrame:
     """
 
     stamp: int
+    time: int
     frame_id: str
     depth: NDArray[np.uint16] | NDArray[np.float32]
     camera: Camera
@@ -101,7 +104,7 @@ class DepthBag:
             self.camera_topic = camera_topic or self._find_camera_topic()
             self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
             self._first_camera = self._read_camera(self._first_message(self.camera_topic))
-            self._frame(self._first_message(self.depth_topic), self._first_camera)
+            self._frame(self._first_message(self.depth_topic), self._first_camera, time=0)
         except BaseException:
             self.close()
             raise
@@ -124,12 +127,13 @@ class DepthBag:
         camera = self._first_camera
         count = 0
         try:
-            for topic, message in self._recording.messages((self.depth_topic, self.camera_topic)):
+            topics = (self.depth_topic, self.camera_topic)
+            for topic, time, message in self._recording.messages(topics):
                 if topic == self.camera_topic:
                     latest = self._read_camera(message)
                     camera = camera if latest == camera else latest  # keeps its cached rays
                 else:
-                    yield self._frame(message, camera)
+                    yield self._frame(message, camera, time)
                     count += 1
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
@@ -138,7 +142,7 @@ class DepthBag:
                 f'{self.path}: damaged after {count} frames: {reason}'
             ) from error
 
-    def _frame(self, message: Any, camera: Camera) -> DepthFrame:
+    def _frame(self, message: Any, camera: Camera, time: int) -> DepthFrame:
         where = f'{self.path}: {self.depth_topic}'
         try:
             if hasattr(message, 'format'):
@@ -161,7 +165,7 @@ class DepthBag:
             )
         stamp = message.header.stamp
         return DepthFrame(
-            stamp.sec * 10**9 + stamp.nanosec, message.header.frame_id, depth, camera
+            stamp.sec * 10**9 + stamp.nanosec, time, message.header.frame_id, depth, camera
         )
 
     def _read_camera(self, message: Any) -> Camera:
@@ -181,7 +185,7 @@ class DepthBag:
 
     def _first_message(self, topic: str) -> Any:
         try:
-            for _, message in self._recording.messages((topic,)):
+            for _, _, message in self._recording.messages((topic,)):
                 return message
             reason = 'no message'
         except Exception as error:

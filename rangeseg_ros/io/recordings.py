@@ -58,12 +58,12 @@ class Recording:
             self.types[name] = connection.msgtype
             self.counts[name] = self.counts.get(name, 0) + connection.msgcount
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-        """Topic and content of the messages on `topics`, in the order of their times."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time and content of the messages on `topics`, in the order of their times."""
         wanted = [c for c in self._reader.connections if c.topic in topics]
         deserialize = _deserializer(self.path)
-        for connection, _, data in self._reader.messages(wanted):
-            yield connection.topic, deserialize(data, connection.msgtype)
+        for connection, time, data in self._reader.messages(wanted):
+            yield connection.topic, time, deserialize(data, connection.msgtype)
 
     def close(self) -> None:
         """Close the files."""
@@ -94,12 +94,12 @@ class DamagedRecording:
         except Exception as error:
             self.damage = str(error) or type(error).__name__
 
-    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, Any]]:
-        """Topic and content of the messages on `topics`; an exception where the damage is."""
+    def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time and content of the messages on `topics`; raises where the damage is."""
         deserialize = _deserializer(self.path)
         for record in _records(self.path):
             if record.topic in topics:
-                yield record.topic, deserialize(record.data, record.type)
+                yield record.topic, record.time, deserialize(record.data, record.type)
 
     def close(self) -> None:
         """Do nothing; no file stays open."""
@@ -147,6 +147,7 @@ def message_types(distribution: Stores) -> Typestore:
 class _Record(NamedTuple):
     topic: str
     type: str
+    time: int
     data: bytes
 
 
@@ -177,7 +178,8 @@ def _mcap_records(path: Path) -> Iterator[_Record]:
                     channels[record.id] = record
                 elif isinstance(record, Message):
                     channel = channels[record.channel_id]
-                    yield _Record(channel.topic, schemas[channel.schema_id], record.data)
+                    kind = schemas[channel.schema_id]
+                    yield _Record(channel.topic, kind, record.log_time, record.data)
         except EndOfFile:
             raise EOFError('file ends within a record') from None
 
@@ -189,9 +191,10 @@ def _sqlite_records(path: Path) -> Iterator[_Record]:
         database.execute('PRAGMA writable_schema = ON')
         topics = {row[0]: row[1:] for row in database.execute('SELECT id, name, type FROM topics')}
         # In the order of rowids the pages are read from the front, and no index is needed.
-        for topic, data in database.execute('SELECT topic_id, data FROM messages ORDER BY id'):
+        rows = database.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id')
+        for topic, time, data in rows:
             name, kind = topics[topic]
-            yield _Record(name, kind, data)
+            yield _Record(name, kind, time, data)
 
 
 def _rosbag1_records(
@@ -210,7 +213,9 @@ def _rosbag1_records(
                 package, _, name = dict(_rosbag1_fields(data))[b'type'].decode().partition('/')
                 connections[fields[b'conn']] = (fields[b'topic'].decode(), f'{package}/msg/{name}')
             case b'\x02':
-                yield _Record(*connections[fields[b'conn']], data)
+                seconds, nanoseconds = struct.unpack('<II', fields[b'time'])
+                time = seconds * 10**9 + nanoseconds
+                yield _Record(*connections[fields[b'conn']], time, data)
 
 
 def _rosbag1_fields(header: bytes) -> Iterator[tuple[bytes, bytes]]:

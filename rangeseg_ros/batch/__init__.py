@@ -1,0 +1,1 @@
+"""Whole recordings, one after the other or many at once."""

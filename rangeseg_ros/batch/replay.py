@@ -1,0 +1,177 @@
+"""A recording segmented: pictures, a table, a bag and a report, in a folder."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.drawing import overlay
+from rangeseg_ros.evaluation.measure import code_digest
+from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthFrame
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.report.replay import ReplayReport
+
+BAG = 'bag'
+"""Name of the bag among the results."""
+
+Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a recording.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames segmented.
+    reasons : dict
+        Why frames have no planes -> number of these frames.
+    damage : str
+        Why the recording was not read to its end; empty when it was.
+    found_done : bool
+        The results were there already.
+    """
+
+    frames: int
+    reasons: dict[str, int]
+    damage: str = ''
+    found_done: bool = False
+
+
+@dataclass(frozen=True)
+class Replay:
+    """Segmentation of one recording.
+
+    The bag among the results appears under its name when all else is there. It tells that the
+    recording is done, and a further `run` leaves it alone as long as recording, parameters and
+    code are the same; any other state is started anew, as ids depend on all frames before.
+
+    Attributes
+    ----------
+    recording, folder : Path
+        What to read, and where to leave the results.
+    config : Config
+    depth_topic, camera_topic : str or None
+        See `DepthBag`.
+    topics : tuple of str
+        Topics of the node to record, names of `OUTPUTS`.
+    copy : bool
+        Copy the topics of the recording into the bag.
+    """
+
+    recording: Path
+    folder: Path
+    config: Config
+    depth_topic: str | None = None
+    camera_topic: str | None = None
+    topics: tuple[str, ...] = ('labels', 'planes', 'markers')
+    copy: bool = False
+
+    def check(self) -> str:
+        """Topics that will be read; BagError when the recording or the folder will not do."""
+        found = self.folder / BAG
+        if found.exists() and not read_record(found):
+            raise BagError(f'{found}: exists already, not overwritten')
+        if self.copy:
+            open_source(self.recording).close()
+        with self._open() as source:
+            return f'{source.depth_topic}, {source.camera_topic}'
+
+    def run(self, progress: Progress | None = None) -> Outcome:
+        """Write the results, or find that they are there.
+
+        Raises
+        ------
+        ValueError
+            As `check`; a frame that is no range image.
+        """
+        key = self._key()
+        record = read_record(self.folder / BAG)
+        if record.get('key') == key:
+            return Outcome(**record['outcome'], found_done=True)
+        self.check()
+        self._clear()
+        with (
+            replacing(self.folder / BAG) as partial,
+            PlaneTable(self.folder / 'planes.csv', ('frame', 'stamp')) as table,
+            self._open() as source,
+            ResultBag(partial, self.topics) as bag,
+            ExitStack() as stack,
+        ):
+            report = ReplayReport(str(self.recording.name), self.config)
+            damage: list[str] = []
+            frames = progress(source, len(source)) if progress else source
+
+            def results() -> Iterator[Timed]:
+                try:
+                    for index, (frame, image, result) in enumerate(segmented(frames, self.config)):
+                        stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
+                        stem = f'{index:06d}_{stamp}'
+                        picture = overlay(image.inverse, result.labels, result.planes)
+                        write_image(self.folder / f'{stem}_labels.png', result.labels)
+                        write_image(self.folder / f'{stem}_overlay.png', picture)
+                        table.write(result.planes, index, stamp)
+                        report.add(frame.stamp, result, self.folder / f'{stem}_overlay.png')
+                        yield from bag.messages(frame, image, result)
+                except DamagedBagError as error:
+                    damage.append(str(error))
+
+            streams = [results()]
+            if self.copy:
+                originals = stack.enter_context(closing(open_source(self.recording)))
+                streams.append(bag.copies(originals))
+            bag.write(*streams)
+            outcome = Outcome(report.frames, report.reasons, ''.join(damage))
+            report.write(self.folder / 'report.html', outcome.damage)
+            kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
+            bag.record({'key': key, 'outcome': kept})
+        return outcome
+
+    def _open(self) -> DepthBag:
+        return DepthBag(self.recording, self.depth_topic, self.camera_topic)
+
+    def _clear(self) -> None:
+        """Remove what other or interrupted runs have left."""
+        own = re.compile(r'\d{6,}_\d+\.\d{9}_(labels|overlay)\.png|planes\.csv|report\.html')
+        partial = re.compile(rf'\.\d+\.({own.pattern}|{BAG})')
+        shutil.rmtree(self.folder / BAG, ignore_errors=True)
+        for path in self.folder.glob('*'):
+            if own.fullmatch(path.name):
+                path.unlink()
+            elif partial.fullmatch(path.name):
+                shutil.rmtree(path, ignore_errors=True)
+
+    def _key(self) -> str:
+        """Digest of all that the results depend on: code, parameters, the recording's files."""
+        digest = hashlib.sha256(code_digest())
+        settings = replace(self, recording=Path(), folder=Path())
+        digest.update(repr(settings).encode())
+        parts = self.recording.iterdir() if self.recording.is_dir() else [self.recording]
+        for path in sorted(parts):
+            state = path.stat()
+            digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())
+        return digest.hexdigest()[:16]
+
+
+def segmented(
+    frames: Iterable[DepthFrame], config: Config
+) -> Iterator[tuple[DepthFrame, RangeImage, Segmentation]]:
+    """Segment the frames of a recording, with persistent ids and roles."""
+    sequence = SequenceSegmenter(config)
+    sequence.warm_up()
+    for frame in frames:
+        image = RangeImage.from_depth(frame.depth, frame.camera)
+        yield frame, image, sequence.segment(image, frame.stamp)

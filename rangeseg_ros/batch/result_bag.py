@@ -1,0 +1,145 @@
+"""The bag that a replay writes: what the node would have published, and copied topics."""
+
+from __future__ import annotations
+
+import heapq
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import yaml
+from rosbags import rosbag2
+from rosbags.interfaces import Connection, MessageDefinitionFormat
+from rosbags.typesys import Stores
+
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.io.bags import BagError, DepthFrame
+from rangeseg_ros.io.recordings import message_types
+from rangeseg_ros.ros.outputs import OUTPUTS
+
+NAMESPACE = '/segment_planes'
+"""Name of the node that publishes the topics."""
+
+_KEY = 'rangeseg_replay'
+
+Timed = tuple[int, Connection, bytes]
+"""When, where and what is written."""
+
+
+def make_rosbags(kind: str, **fields: Any) -> Any:
+    """Make a message of `rosbags`' Jazzy types."""
+    return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
+
+
+class ResultBag:
+    """Writes a rosbag2 (mcap) of results; see `messages.Make` for why it equals the node's.
+
+    Parameters
+    ----------
+    path : Path
+        Directory to make.
+    topics : iterable of str
+        Which of `OUTPUTS`, by name.
+    """
+
+    def __init__(self, path: Path, topics: Iterable[str]) -> None:
+        self._store = message_types(Stores.ROS2_JAZZY)
+        self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        self._names = tuple(topics)
+        self._topics: dict[str, Connection] = {}
+
+    def __enter__(self) -> ResultBag:
+        self._writer.open()
+        for name in self._names:
+            self._topics[name] = self._writer.add_connection(
+                f'{NAMESPACE}/{name}', OUTPUTS[name].kind, typestore=self._store
+            )
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._writer.__exit__(kind, error, trace)
+
+    def record(self, facts: Mapping[str, Any]) -> None:
+        """Put `facts` into the metadata, for `read_record`."""
+        self._writer.set_custom_data(_KEY, json.dumps(facts, sort_keys=True))
+
+    def messages(
+        self, frame: DepthFrame, image: RangeImage, result: Segmentation
+    ) -> Iterator[Timed]:
+        """What is published of `result`, at the time of the frame's recording."""
+        sec, nanosec = divmod(frame.stamp, 10**9)
+        stamp = make_rosbags('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+        header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id=frame.frame_id)
+        for name, connection in self._topics.items():
+            message = OUTPUTS[name].message(make_rosbags, header, image, result)
+            data = self._store.serialize_cdr(message, connection.msgtype)
+            yield frame.time, connection, bytes(data)
+
+    def copies(self, source: rosbag2.Reader) -> Iterator[Timed]:
+        """All messages of `source`, as they are, but those on the topics of results."""
+        own = {connection.topic for connection in self._topics.values()}
+        here = {
+            connection.id: self._like(connection)
+            for connection in source.connections
+            if connection.topic not in own
+        }
+        chosen = [connection for connection in source.connections if connection.id in here]
+        for connection, time, data in source.messages(chosen):
+            yield time, here[connection.id], bytes(data)
+
+    def write(self, *streams: Iterable[Timed]) -> None:
+        """Write messages of several sources, each ordered by time, in the order of all times."""
+        for time, connection, data in heapq.merge(*streams, key=lambda timed: timed[0]):
+            self._writer.write(connection, time, data)
+
+    def _like(self, connection: Connection) -> Connection:
+        """A topic of this bag with the type and the quality of service of that one."""
+        definition: dict[str, Any] = {
+            'msgdef': connection.msgdef.data,
+            'rihs01': connection.digest,
+        }
+        # Recordings of ROS 2 before Iron do not define their types.
+        if connection.msgdef.format == MessageDefinitionFormat.NONE or not connection.digest:
+            if connection.msgtype not in self._store.fielddefs:
+                raise BagError(
+                    f'{connection.topic} cannot be copied: '
+                    f'the recording does not define {connection.msgtype}'
+                )
+            definition = {'typestore': self._store}
+        ext: Any = connection.ext
+        return self._writer.add_connection(
+            connection.topic,
+            connection.msgtype,
+            serialization_format=ext.serialization_format,
+            offered_qos_profiles=ext.offered_qos_profiles,
+            **definition,
+        )
+
+
+def open_source(path: Path) -> rosbag2.Reader:
+    """Open a recording to copy from; BagError unless it is a whole rosbag2."""
+    try:
+        reader = rosbag2.Reader(path)
+        reader.open()
+    # Readers meet damaged bytes with exceptions of every kind.
+    except Exception as error:
+        raise BagError(f'{path}: not a whole rosbag2 to copy from: {error}') from None
+    return reader
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """What `ResultBag.record` put into the bag; empty for any other folder."""
+    try:
+        metadata = yaml.safe_load((path / 'metadata.yaml').read_text())
+        record = json.loads(metadata['rosbag2_bagfile_information']['custom_data'][_KEY])
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        return {}
+    return record if isinstance(record, dict) else {}

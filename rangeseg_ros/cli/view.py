@@ -1,0 +1,114 @@
+"""`rangeseg view`: planes in 3D, as a Rerun recording."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+
+from rangeseg_ros.batch.replay import segmented
+from rangeseg_ros.cli import options
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.drawing import colours, grey
+from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.params import read_config
+
+ARROW_LENGTH = 0.2
+"""Length of the drawn normals, metres."""
+
+
+@click.command()
+@click.argument('bag', type=click.Path(path_type=Path))
+@click.option(
+    '--output',
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help='Rerun recording to write (.rrd); `rerun FILE` shows it.',
+)
+@click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
+@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.params
+@options.exact
+def command(
+    bag: Path,
+    output: Path,
+    depth_topic: str | None,
+    camera_topic: str | None,
+    params_file: Path | None,
+    exact: bool,
+) -> None:
+    """Segment a recording and log what is found, to look at in 3D.
+
+    Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image. Needs
+    the extra view (rerun-sdk), whose telemetry is off.
+    """
+    config = read_config(params_file, **({'exact': True} if exact else {}))
+    rerun = _rerun()
+    with DepthBag(bag, depth_topic, camera_topic) as source, replacing(output) as partial:
+        log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)
+        log.save(partial)
+        log.log('camera', rerun.ViewCoordinates.RDF, static=True)
+        frames = options.progress(source, len(source), 'frame')
+        count = 0
+        for frame, image, result in segmented(frames, config):
+            log.set_time('frame', sequence=count)
+            log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
+            _log_frame(rerun, log, image, result)
+            count += 1
+        log.flush()
+        log.disconnect()
+    click.echo(f'{output}: {count} frames')
+
+
+def _rerun() -> Any:
+    # Read when the library is loaded.
+    os.environ['TELEMETRY_ENABLED'] = 'false'
+    try:
+        import rerun
+    except ImportError:
+        raise click.ClickException('view needs rerun-sdk: install the extra view') from None
+    return rerun
+
+
+def _log_frame(rerun: Any, log: Any, image: RangeImage, result: Segmentation) -> None:
+    planes = result.planes
+    tints = colours([plane.id for plane in planes])
+    names = [f'{plane.id} {plane.role}' for plane in planes]
+    pixels = np.repeat(grey(image.inverse)[..., None], 3, axis=2)
+    for plane, tint in zip(planes, tints, strict=True):
+        pixels[result.labels == plane.label] = tint
+    log.log('camera/cloud', rerun.Points3D(image.points[image.valid], colors=pixels[image.valid]))
+    log.log(
+        'camera/hulls',
+        rerun.LineStrips3D(
+            [
+                np.vstack([ring, ring[:1]])
+                for plane in planes
+                for ring in (plane.hull, *plane.holes)
+            ],
+            colors=[
+                tint
+                for plane, tint in zip(planes, tints, strict=True)
+                for _ in range(1 + len(plane.holes))
+            ],
+        ),
+    )
+    log.log(
+        'camera/normals',
+        rerun.Arrows3D(
+            origins=[plane.centroid for plane in planes],
+            vectors=[ARROW_LENGTH * plane.normal for plane in planes],
+            colors=tints,
+            labels=names,
+        ),
+    )
+    classes = [
+        (plane.label, name, tint) for plane, name, tint in zip(planes, names, tints, strict=True)
+    ]
+    log.log('labels', rerun.AnnotationContext([(0, 'no plane', (0, 0, 0)), *classes]))
+    log.log('labels', rerun.SegmentationImage(result.labels))

@@ -1,0 +1,46 @@
+"""Frames of one camera, one after the other: planes with persistent ids and roles."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.roles import roles
+from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.core.tracking import Tracker
+
+
+class SequenceSegmenter:
+    """Segments the frames of a sequence, live or recorded: the same frames give the same ids.
+
+    Examples
+    --------
+    >>> sequence = SequenceSegmenter(config)
+    >>> results = [sequence.segment(image, stamp) for stamp, image in frames]
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self._segmenter = Segmenter(self.config)
+        self._tracker = Tracker(self.config)
+
+    def warm_up(self) -> None:
+        """Have the functions of the core compiled, or loaded, before the first frame."""
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+        wall = np.full(camera.shape, 1000, np.uint16)
+        self._segmenter.segment(RangeImage.from_depth(wall, camera))
+
+    def segment(self, image: RangeImage, stamp: int, up: ArrayLike | None = None) -> Segmentation:
+        """Label the next frame, taken at `stamp` nanoseconds; ids and roles of its planes are set.
+
+        `up` (3,) is the direction in the frame of the image, the configured one when not given.
+        """
+        result = self._segmenter.segment(image)
+        planes = self._tracker.track(result.labels, result.planes, stamp)
+        named = zip(planes, roles(planes, self.config, up), strict=True)
+        return replace(result, planes=[replace(plane, role=role) for plane, role in named])

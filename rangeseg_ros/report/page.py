@@ -1,0 +1,95 @@
+"""Self-contained HTML pages: pictures, charts and style are part of the file."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import jinja2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.files import replacing
+
+MAX_PICTURES = 48
+"""Pictures in a contact sheet; of longer sequences as many, evenly spaced."""
+
+
+class Picture(NamedTuple):
+    """A picture of a contact sheet: an image file and what to write below it."""
+
+    path: Path
+    title: str
+
+
+def write_page(path: Path, template: str, **values: Any) -> None:
+    """Write the page of a template of this package, whole or not at all."""
+    text = _environment().get_template(template).render(values)
+    with replacing(path) as partial:
+        partial.write_text(text, encoding='utf-8')
+
+
+def spread(pictures: Sequence[Picture]) -> list[Picture]:
+    """At most `MAX_PICTURES`, evenly spaced, the first and the last among them."""
+    count = min(len(pictures), MAX_PICTURES)
+    chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
+    return [pictures[index] for index in chosen]
+
+
+def stage_table(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
+    """Milliseconds (N,) of each stage in N frames, 0 where a frame has not come to the stage."""
+    names = dict.fromkeys(name for laps in timings for name in laps)
+    return {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
+
+
+def common(
+    config: Config, timings: Sequence[Mapping[str, float]], reasons: Mapping[str, int]
+) -> dict[str, Any]:
+    """What every page shows: stages with their statistics, reasons, parameters."""
+    stages = stage_table(timings)
+    total = {'total': np.sum(list(stages.values()), axis=0)} if stages else {}
+    return {
+        'stages': [
+            (name, np.median(times), np.percentile(times, 95), times.max())
+            for name, times in {**stages, **total}.items()
+        ],
+        'reasons': Counter(reasons).most_common(),
+        'parameters': [
+            (option.name, getattr(config, option.name), option.default, option.metadata)
+            for option in fields(Config)
+        ],
+    }
+
+
+@cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader('rangeseg_ros.report'),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {'svg': _svg, 'jpeg': _jpeg}
+    return environment
+
+
+def _svg(text: str) -> str:
+    return _data('image/svg+xml', text.encode())
+
+
+def _jpeg(path: Path) -> str:
+    picture = np.asarray(cv2.imread(str(path)))
+    _, jpeg = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    return _data('image/jpeg', jpeg.tobytes())
+
+
+def _data(kind: str, content: bytes) -> str:
+    return f'data:{kind};base64,{b64encode(content).decode()}'

@@ -1,0 +1,80 @@
+"""The report of a replay: what was found in a recording, frame by frame."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.report import charts
+from rangeseg_ros.report.page import Picture, common, spread, stage_table, write_page
+
+
+class ReplayReport:
+    """Collects the frames of a recording and writes their page.
+
+    Parameters
+    ----------
+    name : str
+        Of the recording.
+    config : Config
+        Parameters that were used.
+
+    Attributes
+    ----------
+    reasons : Counter
+        Why frames have no planes -> number of these frames.
+    """
+
+    def __init__(self, name: str, config: Config) -> None:
+        self.name = name
+        self.config = config
+        self.reasons: Counter[str] = Counter()
+        self._stamps: list[int] = []
+        self._sightings = [np.empty(0, charts.SIGHTING)]
+        self._timings: list[dict[str, float]] = []
+        self._pictures: list[Picture] = []
+
+    @property
+    def frames(self) -> int:
+        """Number of frames so far."""
+        return len(self._stamps)
+
+    def add(self, stamp: int, result: Segmentation, picture: Path) -> None:
+        """Take in the next frame, of `stamp` nanoseconds; `picture` is its overlay's file."""
+        rows = [(self.frames, p.id, p.area, p.distance, p.normal) for p in result.planes]
+        self._sightings.append(np.array(rows, charts.SIGHTING))
+        found = f'{len(result.planes)} planes' if result.planes else result.reason
+        self._pictures.append(Picture(picture, f'frame {self.frames}: {found}'))
+        self._stamps.append(stamp)
+        self._timings.append(result.timings)
+        if not result.planes:
+            self.reasons[result.reason] += 1
+
+    def write(self, path: Path, damage: str = '') -> None:
+        """Write the page; `damage` says why the recording was not read to its end."""
+        sightings = np.concatenate(self._sightings)
+        times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
+        per_frame = np.bincount(sightings['frame'], minlength=self.frames)
+        frames = np.arange(self.frames, dtype=float)
+        write_page(
+            path,
+            'replay.html',
+            name=self.name,
+            damage=damage,
+            frames=self.frames,
+            duration=times[-1] if self.frames else 0.0,
+            ids=len(np.unique(sightings['id'])),
+            planes_per_frame=np.median(per_frame) if self.frames else 0.0,
+            pictures=spread(self._pictures),
+            limits=(charts.MAX_BARS, charts.MAX_LINES),
+            id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
+            drifts=charts.drifts(sightings, times) if len(sightings) else '',
+            stage_times=charts.stage_times(stage_table(self._timings), frames, 'frame')
+            if self._timings
+            else '',
+            **common(self.config, self._timings, self.reasons),
+        )
