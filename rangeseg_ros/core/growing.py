@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, fit, fit_all
+from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, common_residual, fit, fit_all
 
 DISTORTION_PIXELS = 2000.0
 """Regions of this size meet half the variance of the distortion, large ones all of it."""
@@ -103,10 +103,12 @@ def _borders(pairs: NDArray[np.intp], count: int) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def _misfit(
-    extra: float, first: float, second: float, total: NDArray[np.float64], granted: float
+    extra: float, first: NDArray[np.float64], second: NDArray[np.float64], granted: float
 ) -> float:
     """Extra residual of a common plane, in what noise and distortion are granted; 1 is too far."""
-    return extra / (_NOISE + granted * total[RATIO] / total[COUNT] * first * second / total[COUNT])
+    pixels = first[COUNT] + second[COUNT]
+    ratio = (first[RATIO] + second[RATIO]) / pixels
+    return extra / (_NOISE + granted * ratio * first[COUNT] * second[COUNT] / pixels)
 
 
 @njit(cache=True)
@@ -159,7 +161,7 @@ def _grow(
     for a in range(count):
         if parent[a] != a:
             moments[parent[a]] += moments[a]
-    theta, total = np.zeros(3), np.zeros(SIZE)
+    theta = np.zeros(3)
     # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
     head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
     link = np.full(2 * len(pairs), -1, np.int32)
@@ -205,19 +207,15 @@ def _grow(
             else:
                 seen[b] = turn
                 before = e
-                total[:] = moments[a]
-                total += moments[b]
-                if total[COUNT] <= _PATCH_LARGEST:
-                    extra = fit(total, theta) - residual[a] - residual[b]
-                    misfit = _misfit(
-                        extra, moments[a, COUNT], moments[b, COUNT], total, _WITHIN_PATCH
-                    )
+                if moments[a, COUNT] + moments[b, COUNT] <= _PATCH_LARGEST:
+                    extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
+                    misfit = _misfit(extra, moments[a], moments[b], _WITHIN_PATCH)
                     if misfit < best:
                         best, partner = misfit, b
             e = following
         if partner >= 0:
+            residual[a] = common_residual(moments[a], moments[partner])
             moments[a] += moments[partner]
-            residual[a] = fit(moments[a], theta)
             parent[partner] = a
             if head[partner] >= 0:
                 link[tail[a]] = head[partner]
@@ -236,7 +234,7 @@ def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[
     """
     count = len(moments)
     moments, border = moments.copy(), border.copy()
-    theta, total = np.zeros(3), np.zeros(SIZE)
+    theta = np.zeros(3)
     residual = np.zeros(count)
     for a in range(count):
         residual[a] = fit(moments[a], theta)
@@ -246,12 +244,8 @@ def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[
     for a in range(count):
         for b in range(a + 1, count):
             if border[a, b] > 0:
-                total[:] = moments[a]
-                total += moments[b]
-                extra = fit(total, theta) - residual[a] - residual[b]
-                misfit = _misfit(
-                    extra, moments[a, COUNT], moments[b, COUNT], total, _BETWEEN_PATCHES
-                )
+                extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
+                misfit = _misfit(extra, moments[a], moments[b], _BETWEEN_PATCHES)
                 strain[a, b] = strain[b, a] = misfit * border[a, b]
                 heappush(heap, (strain[a, b] / border[a, b], a, b))
     parent = np.arange(count)
@@ -261,15 +255,14 @@ def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[
             break
         if parent[a] != a or parent[b] != b or strain[a, b] / border[a, b] != mean:
             continue
-        total[:] = moments[a]
-        total += moments[b]
-        chi2 = fit(total, theta)
+        chi2 = common_residual(moments[a], moments[b])
         extra = chi2 - residual[a] - residual[b]
-        granted = _WITHIN_SURFACE * total[COUNT] / (total[COUNT] + DISTORTION_PIXELS)
-        if _misfit(extra, moments[a, COUNT], moments[b, COUNT], total, granted) >= 1:
+        pixels = moments[a, COUNT] + moments[b, COUNT]
+        granted = _WITHIN_SURFACE * pixels / (pixels + DISTORTION_PIXELS)
+        if _misfit(extra, moments[a], moments[b], granted) >= 1:
             continue
         parent[b] = a
-        moments[a] = total
+        moments[a] += moments[b]
         residual[a] = chi2
         for c in range(count):
             if border[b, c] > 0 and c != a:
