@@ -13,14 +13,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.moments import COUNT, add_pixel
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
 
 MOST = 100
 """Cells of a region at most."""
 WEIGHTED_RAY, WEIGHT, POINT, SCATTER, RECORD = 12, 15, 16, 19, 25
-"""Entries of a cell after its moment vector: w r (3), w, p (3), p p^T (6); their number."""
+"""Entries of a cell after its moment vector, which lacks w y^2 and the variance ratio: w r (3), w,
+p (3), p p^T (6); their number."""
 # Standard deviations of random and systematic error beyond which a pixel is an outlier.
 _OUTLIER = 4.0
 
@@ -156,45 +156,55 @@ def _reach(box: NDArray[np.intp], row: int, after: int) -> None:
 
 
 @njit(cache=True)
-def _add(
-    record: NDArray[np.float64],
-    ray: NDArray[np.float32],
-    y: float,
-    variances: NDArray[np.float64],
-    central: bool,
-    sign: float,
-) -> None:
-    """Add a pixel to a cell, or take it out."""
-    # Seen from one centre, the error is in the inverse range; otherwise its direction is
-    # unknown, and the weights are those of plain distances from the plane (up to a constant).
-    squared = y * y
-    w = 1 / (variances[0] + variances[1] * squared * squared) if central else 1 / squared
-    w *= sign
-    add_pixel(record, ray, y, w)
-    record[COUNT] += sign - 1
-    x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
-    record[WEIGHTED_RAY] += w * x0
-    record[WEIGHTED_RAY + 1] += w * x1
-    record[WEIGHTED_RAY + 2] += w * x2
-    record[WEIGHT] += w
-    x0, x1, x2 = x0 / y, x1 / y, x2 / y
-    record[POINT] += sign * x0
-    record[POINT + 1] += sign * x1
-    record[POINT + 2] += sign * x2
-    record[SCATTER] += sign * x0 * x0
-    record[SCATTER + 1] += sign * x0 * x1
-    record[SCATTER + 2] += sign * x0 * x2
-    record[SCATTER + 3] += sign * x1 * x1
-    record[SCATTER + 4] += sign * x1 * x2
-    record[SCATTER + 5] += sign * x2 * x2
-
-
-@njit(cache=True)
 def _index(cells: Cells, label: int, i: int, j: int) -> int:
     """Cell of a pixel."""
     size = cells.size[label]
     row, column = (i - cells.box[label, 0]) // size, (j - cells.box[label, 1]) // size
     return int(cells.start[label] + row * cells.columns[label] + column)
+
+
+@njit(cache=True, inline='always')
+def _add(
+    record: NDArray[np.float64],
+    i: int,
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    variances: NDArray[np.float64],
+    central: bool,
+    sign: float,
+) -> None:
+    """Add pixels `first` to before `after` of row `i` to a cell, or take them out."""
+    # In variables of their own: sums in an array would go through memory for every pixel.
+    a = b = c = d = e = f = p = q = r = count = w0 = w1 = w2 = weight = 0.0
+    z0 = z1 = z2 = z00 = z01 = z02 = z11 = z12 = z22 = 0.0
+    for j in range(first, after):
+        y = float(inverse[i, j])
+        if y == 0:
+            continue
+        # Seen from one centre, the error is in the inverse range; otherwise its direction is
+        # unknown, and the weights are those of plain distances from the plane (up to a constant).
+        squared = y * y
+        w = 1 / (variances[0] + variances[1] * squared * squared) if central else 1 / squared
+        count += 1
+        weight += w
+        x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+        wx0, wx1, wx2 = w * x0, w * x1, w * x2
+        w0, w1, w2 = w0 + wx0, w1 + wx1, w2 + wx2
+        a, b, c = a + wx0 * x0, b + wx0 * x1, c + wx0 * x2
+        d, e, f = d + wx1 * x1, e + wx1 * x2, f + wx2 * x2
+        p, q, r = p + wx0 * y, q + wx1 * y, r + wx2 * y
+        z = 1 / y
+        x0, x1, x2 = z * x0, z * x1, z * x2
+        z0, z1, z2 = z0 + x0, z1 + x1, z2 + x2
+        z00, z01, z02 = z00 + x0 * x0, z01 + x0 * x1, z02 + x0 * x2
+        z11, z12, z22 = z11 + x1 * x1, z12 + x1 * x2, z22 + x2 * x2
+    moments = (a, b, c, d, e, f, p, q, r, 0.0, count, 0.0, w0, w1, w2, weight)
+    for entry, value in enumerate(moments):
+        record[entry] += sign * value
+    for entry, value in enumerate((z0, z1, z2, z00, z01, z02, z11, z12, z22)):
+        record[POINT + entry] += sign * value
 
 
 @njit(cache=True)
@@ -209,18 +219,16 @@ def _accumulate(
     """Add every measured pixel to its cell."""
     height, width = labels.shape
     for i in range(height):
-        last, end, cell = 0, 0, 0
-        for j in range(width):
-            label = int(labels[i, j])
-            y = float(inverse[i, j])
-            if label == 0 or y == 0:
-                continue
-            # Divisions only where another cell begins.
-            if label != last or j >= end:
-                last, size, left = label, cells.size[label], cells.box[label, 1]
-                end = left + ((j - left) // size + 1) * size
-                cell = _index(cells, label, i, j)
-            _add(cells.sums[cell], rays[i, j], y, variances, central, 1.0)
+        j = 0
+        while j < width:
+            first, label = j, labels[i, j]
+            left, size = cells.box[label, 1], cells.size[label]
+            end = left + ((j - left) // size + 1) * size if label > 0 else width
+            while j < min(end, width) and labels[i, j] == label:
+                j += 1
+            if label > 0:
+                record = cells.sums[_index(cells, label, i, first)]
+                _add(record, i, first, j, inverse, rays, variances, central, 1.0)
 
 
 @njit(cache=True)
@@ -260,5 +268,5 @@ def _subtract(
         label = int(labels[i, j])
         if 2 * outliers[label] <= counts[label]:
             record = cells.sums[_index(cells, label, i, j)]
-            _add(record, rays[i, j], float(inverse[i, j]), variances, central, -1.0)
+            _add(record, i, j, j + 1, inverse, rays, variances, central, -1.0)
     return outliers

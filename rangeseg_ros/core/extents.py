@@ -129,21 +129,30 @@ def _area_moments(
             y = inverse[i, j]
             if label == 0 or y == 0:
                 continue
-            ray, plane, tangent = rays[i, j], theta[label], tangents[label]
-            level = plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2]
+            x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+            level = theta[label, 0] * x0 + theta[label, 1] * x1 + theta[label, 2] * x2
             if level * _FAR < y:
                 continue
             z = 1 / level
-            u = z * (tangent[0, 0] * ray[0] + tangent[0, 1] * ray[1] + tangent[0, 2] * ray[2])
-            v = z * (tangent[1, 0] * ray[0] + tangent[1, 1] * ray[1] + tangent[1, 2] * ray[2])
+            x0, x1, x2 = z * x0, z * x1, z * x2
+            u = (
+                tangents[label, 0, 0] * x0
+                + tangents[label, 0, 1] * x1
+                + tangents[label, 0, 2] * x2
+            )
+            v = (
+                tangents[label, 1, 0] * x0
+                + tangents[label, 1, 1] * x1
+                + tangents[label, 1, 2] * x2
+            )
             area = footprints[i, j] * z * z * z
-            own = sums[label]
-            own[0] += area
-            own[1] += area * u
-            own[2] += area * v
-            own[3] += area * u * u
-            own[4] += area * u * v
-            own[5] += area * v * v
+            au, av = area * u, area * v
+            sums[label, 0] += area
+            sums[label, 1] += au
+            sums[label, 2] += av
+            sums[label, 3] += au * u
+            sums[label, 4] += au * v
+            sums[label, 5] += av * v
     return sums
 
 
