@@ -61,6 +61,13 @@ def test_impossible_focal_length(bench, focal):
     assert_segments(bench)
 
 
+def test_camera_info_of_another_frame_is_used_with_a_warning(bench):
+    info = bench.info()
+    info.header.frame_id = 'elsewhere'
+    assert bench.segment(info=info).any()
+    assert "its camera_info in 'elsewhere'" in bench.log()
+
+
 def test_camera_info_of_another_size(bench):
     assert_segments(bench)
     bench.camera_info.publish(bench.info(kinect_camera(320, 240)))

@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 import traceback
+from contextlib import suppress
 from itertools import pairwise
 from threading import Thread
 
@@ -84,6 +85,7 @@ class SegmentPlanes(Node):
         if listeners and self._input is None:
             lost = self._statistics.lost.add
             self._input = DepthInput(self, self._config.input, self._accept, lost)
+            self._statistics.problem = ''
         elif not listeners and self._input:
             self._input.destroy()
             self._input = None
@@ -111,7 +113,10 @@ class SegmentPlanes(Node):
     def _warm_up(self) -> None:
         """Have the core's functions compiled, or loaded, before the first frame needs them."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        self._segmenter.segment(RangeImage.from_depth(np.full((48, 64), 1000, np.uint16), camera))
+        wall = RangeImage.from_depth(np.full(camera.shape, 1000, np.uint16), camera)
+        # What goes wrong here will again on the first frame, which is where it is reported.
+        with suppress(Exception):
+            self._segmenter.segment(wall)
 
     def _segment(self, frame: DepthFrame) -> None:
         ticks = [time.perf_counter()]

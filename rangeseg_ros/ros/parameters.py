@@ -43,7 +43,7 @@ def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
     ----------
     node : rclpy.node.Node
     apply : callable
-        Gets the new configuration after every successful change.
+        Gets the new configuration after every change.
 
     Returns
     -------
@@ -72,8 +72,9 @@ def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
 
     def keep(parameters: list[Parameter]) -> None:
         nonlocal config
-        config = changed(parameters)
-        apply(config)
+        if (new := changed(parameters)) != config:
+            config = new
+            apply(new)
 
     node.add_on_set_parameters_callback(check)
     node.add_post_set_parameters_callback(keep)
