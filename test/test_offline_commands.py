@@ -256,7 +256,7 @@ def test_an_interrupted_replay_leaves_whole_files(folder):
     )
     try:
         deadline = time.monotonic() + 120
-        while len(list(folder.glob('out/*_labels.png'))) < 3:
+        while len(list(folder.glob('out/[0-9]*_labels.png'))) < 3:
             assert replay.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.02)
@@ -266,7 +266,7 @@ def test_an_interrupted_replay_leaves_whole_files(folder):
         replay.kill()
     assert replay.returncode == 130
     assert b'Traceback' not in error
-    labels = sorted(folder.glob('out/*_labels.png'))
+    labels = sorted(folder.glob('out/[0-9]*_labels.png'))
     assert 3 <= len(labels) < 1000
     for path in labels:
         assert read_labels(path).shape == (48, 64)

@@ -120,11 +120,9 @@ class Replay:
                     for index, (frame, image, result) in enumerate(segmented(frames, self.config)):
                         stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                         stem = f'{index:06d}_{stamp}'
-                        picture = overlay(image.inverse, result.labels, result.planes)
-                        write_image(self.folder / f'{stem}_labels.png', result.labels)
-                        write_image(self.folder / f'{stem}_overlay.png', picture)
+                        picture = write_pictures(self.folder, stem, image, result)
                         table.write(result.planes, index, stamp)
-                        report.add(frame.stamp, result, self.folder / f'{stem}_overlay.png')
+                        report.add(frame.stamp, result, picture)
                         yield from bag.messages(frame, image, result)
                 except DamagedBagError as error:
                     damage.append(str(error))
@@ -134,7 +132,7 @@ class Replay:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
-            outcome = Outcome(report.frames, report.reasons, ''.join(damage))
+            outcome = Outcome(report.frames, dict(report.reasons), ''.join(damage))
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
             bag.record({'key': key, 'outcome': kept})
@@ -175,3 +173,11 @@ def segmented(
     for frame in frames:
         image = RangeImage.from_depth(frame.depth, frame.camera)
         yield frame, image, sequence.segment(image, frame.stamp)
+
+
+def write_pictures(folder: Path, stem: str, image: RangeImage, result: Segmentation) -> Path:
+    """Write <stem>_labels.png and <stem>_overlay.png; the path of the latter."""
+    path = folder / f'{stem}_overlay.png'
+    write_image(folder / f'{stem}_labels.png', result.labels)
+    write_image(path, overlay(image.inverse, result.labels, result.planes))
+    return path

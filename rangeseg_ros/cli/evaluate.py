@@ -12,6 +12,7 @@ from rangeseg_ros.evaluation.figures import evaluated, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.parallel import run_all
+from rangeseg_ros.report.evaluation import write_evaluation
 
 
 @click.command(cls=measures.ToleranceCommand)
@@ -31,8 +32,9 @@ from rangeseg_ros.parallel import run_all
 @click.option(
     '--output',
     type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for each image's labels and a picture of truth and segmentation at tolerance "
-    '0.8: correct white, over-segmented green, under-segmented blue, missed orange, noise red.',
+    help="Folder for report.html, each image's labels and a picture of truth and segmentation at "
+    'tolerance 0.8: correct white, over-segmented green, under-segmented blue, missed orange, '
+    'noise red.',
 )
 @measures.json_file
 def command(
@@ -71,5 +73,7 @@ def command(
     figures = evaluated(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')
     click.echo(table(figures))
+    if output:
+        write_evaluation(output, folder.resolve().name, config, found, figures)
     if json_file:
         measures.write_json(json_file, figures)

@@ -10,6 +10,7 @@ import click
 from tqdm import tqdm
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
 
@@ -50,3 +51,8 @@ def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
     """Show the progress through `items` on a terminal, and nothing elsewhere."""
     bar: Iterable[T] = tqdm(items, total=total, unit=unit, disable=None)
     return bar
+
+
+def read_parameters(params_file: Path | None, exact: bool) -> Config:
+    """Config of the options `params` and `exact`; the latter wins over the file."""
+    return read_config(params_file, **({'exact': True} if exact else {}))

@@ -10,7 +10,6 @@ import click
 
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import measures, options
-from rangeseg_ros.io.params import read_config
 from rangeseg_ros.parallel import run_all, run_on_cluster
 from rangeseg_ros.ros.outputs import OUTPUTS
 
@@ -71,7 +70,7 @@ def command(
     A recording that is done is not done again, one that was interrupted starts anew. A damaged
     one is read up to the damage, and the exit code is 1.
     """
-    config = read_config(params_file, **({'exact': True} if exact else {}))
+    config = options.read_parameters(params_file, exact)
     folders = _folders(bags, output)
     if scheduler:
         # The workers have working directories of their own.

@@ -7,9 +7,11 @@ from pathlib import Path
 
 import click
 
+from rangeseg_ros.batch.replay import write_pictures
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli.results import make_segmenter, write_pictures
 from rangeseg_ros.core.range_image import RangeImage, RangeImageError
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
@@ -45,7 +47,7 @@ def command(
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
     camera = read_camera(camera_file)
-    segmenter = make_segmenter(params_file, exact)
+    segmenter = Segmenter(options.read_parameters(params_file, exact))
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path), camera, depth_scale)
@@ -57,6 +59,6 @@ def command(
             replacing(output / f'{path.stem}_planes.csv') as partial,
             PlaneTable(partial) as table,
         ):
-            table.write(result.planes)
+            table.write(with_roles(result.planes, segmenter.config))
         found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
         click.echo(f'{path}: {found}')

@@ -16,7 +16,6 @@ from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.drawing import colours, grey
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.params import read_config
 
 ARROW_LENGTH = 0.2
 """Length of the drawn normals, metres."""
@@ -47,7 +46,7 @@ def command(
     Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image. Needs
     the extra view (rerun-sdk), whose telemetry is off.
     """
-    config = read_config(params_file, **({'exact': True} if exact else {}))
+    config = options.read_parameters(params_file, exact)
     rerun = _rerun()
     with DepthBag(bag, depth_topic, camera_topic) as source, replacing(output) as partial:
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)

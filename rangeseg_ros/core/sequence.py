@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.roles import roles
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
@@ -42,5 +44,12 @@ class SequenceSegmenter:
         """
         result = self._segmenter.segment(image)
         planes = self._tracker.track(result.labels, result.planes, stamp)
-        named = zip(planes, roles(planes, self.config, up), strict=True)
-        return replace(result, planes=[replace(plane, role=role) for plane, role in named])
+        return replace(result, planes=with_roles(planes, self.config, up))
+
+
+def with_roles(
+    planes: Sequence[Plane], config: Config, up: ArrayLike | None = None
+) -> list[Plane]:
+    """`planes` with their `roles`."""
+    named = zip(planes, roles(planes, config, up), strict=True)
+    return [replace(plane, role=role) for plane, role in named]

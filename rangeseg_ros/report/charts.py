@@ -10,12 +10,16 @@ from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from rangeseg_ros.drawing import colours
 
 MAX_BARS, MAX_LINES = 40, 8
 """Planes in the chart of ids, and in those of drift, at most."""
+
+CUT = 5
+"""Times of more than so many medians reach out of their chart."""
 
 # One row per plane and frame.
 SIGHTING = np.dtype(
@@ -83,6 +87,10 @@ def stage_times(
     shades = colormaps['Set2'](range(len(stages)))
     axes.stackplot(x, *stages.values(), labels=list(stages), colors=shades)
     axes.set_ylabel('milliseconds')
+    total = np.sum(list(stages.values()), axis=0)
+    # The time of a compiler or of a busy machine would hide the others.
+    axes.set_ylim(0, 1.05 * min(total.max(), CUT * np.median(total)))
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if len(x) > 1:
         axes.set_xlim(x[0], x[-1])
     handles, labels = axes.get_legend_handles_labels()

@@ -73,6 +73,7 @@ class ReplayReport:
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
             drifts=charts.drifts(sightings, times) if len(sightings) else '',
+            cut=charts.CUT,
             stage_times=charts.stage_times(stage_table(self._timings), frames, 'frame')
             if self._timings
             else '',

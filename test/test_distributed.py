@@ -1,0 +1,89 @@
+"""Replays on a Dask cluster."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from test_replay_bags import record_walls, replay, results
+
+from rangeseg_ros.cli.main import main
+
+COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
+
+
+def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
+    distributed = pytest.importorskip('distributed')
+    names = ['a', 'b', 'c']
+    for name, count in zip(names, (40, 41, 42), strict=True):
+        record_walls(tmp_path / name, count)
+        replay(tmp_path / name, tmp_path / 'local' / name)
+    with (
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            local_directory=tmp_path / 'dask',
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+        command = subprocess.Popen(
+            [
+                *COMMAND,
+                'replay',
+                *names,
+                '--output',
+                'out',
+                '--scheduler',
+                cluster.scheduler_address,
+            ],
+            cwd=tmp_path,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            # Each process has its name on the bag that it has begun.
+            deadline = time.monotonic() + 120
+            half_way = f'out/*/.{victim}.bag'
+            while not (
+                any(
+                    len(list(folder.parent.glob('*_labels.png'))) > 5
+                    for folder in tmp_path.glob(half_way)
+                )
+            ):
+                assert command.poll() is None
+                assert time.monotonic() < deadline
+                time.sleep(0.005)
+            os.kill(victim, signal.SIGKILL)
+            output, error = command.communicate(timeout=240)
+        finally:
+            command.kill()
+    assert command.returncode == 0, error
+    assert [f'{count} frames' in output for count in (40, 41, 42)] == [True] * 3
+    for name in names:
+        assert results(tmp_path / 'out' / name) == results(tmp_path / 'local' / name)
+        assert not list((tmp_path / 'out' / name).glob('.*'))
+
+
+def test_no_scheduler(tmp_path, monkeypatch, capsys):
+    pytest.importorskip('distributed')
+    import dask
+
+    record_walls(tmp_path / 'a', 1)
+    monkeypatch.chdir(tmp_path)
+    arguments = ['replay', 'a', '--output', 'out', '--scheduler', 'tcp://127.0.0.1:1']
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
+    with (
+        dask.config.set({'distributed.comm.timeouts.connect': '1s'}),
+        pytest.raises(SystemExit) as end,
+    ):
+        main()
+    error = capsys.readouterr().err
+    assert end.value.code == 2
+    assert error.splitlines()[-1].startswith('rangeseg: ')
+    assert not (tmp_path / 'out').exists()

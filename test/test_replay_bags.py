@@ -1,0 +1,268 @@
+"""The bags that `rangeseg replay` writes, and when it starts a recording again."""
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from recordings import ROS2, Recording, record
+from rosbags import rosbag2
+
+from rangeseg_ros.batch.replay import Replay, segmented
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.bags import BagError, DepthBag
+from rangeseg_ros.io.images import read_labels
+from rangeseg_ros.ros.clouds import planes_from_message
+from rangeseg_ros.ros.outputs import OUTPUTS
+
+DELAY = 5_000_000
+"""Nanoseconds from the stamp of a message to its recording."""
+
+
+def walls(count, height=48, width=64):
+    """A near wall on the left, a far one on the right: (count, H, W) uint16 millimetres."""
+    depth = np.full((count, height, width), 2500, np.uint16)
+    depth[:, :, : width // 2] = 1500
+    return depth + np.arange(count, dtype=np.uint16)[:, None, None]
+
+
+def record_walls(path, count=4):
+    """Record walls with their camera and a topic of another kind."""
+    recording = Recording()
+    types = recording.store.types
+    for index, image in enumerate(walls(count)):
+        stamp = 10**18 + index * 33_333_333
+        recording.add_camera(stamp)
+        recording.add_image(stamp, image)
+        text = types['std_msgs/msg/String'](f'frame {index}')
+        recording.messages.append((stamp, '/notes', 'std_msgs/msg/String', text))
+    recording.messages = [(time + DELAY, *rest) for time, *rest in recording.messages]
+    recording.write(path)
+    return path
+
+
+def read(path):
+    """Messages of a bag in their order: time, topic, content, bytes."""
+    with rosbag2.Reader(path) as reader:
+        return [
+            (time, c.topic, ROS2.deserialize_cdr(data, c.msgtype), bytes(data))
+            for c, time, data in reader.messages()
+        ]
+
+
+def results(folder):
+    """Contents of the files that must not depend on who made them, or when."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob('*'))
+        if path.is_file() and path.suffix in ('.png', '.csv', '.mcap')
+    }
+
+
+def replay(recording, folder, **options):
+    return Replay(recording, folder, Config(), **options).run()
+
+
+@pytest.fixture(scope='module')
+def done(tmp_path_factory):
+    """Folder with a recording and its replay, and with a copy of its topics."""
+    folder = tmp_path_factory.mktemp('replay')
+    record_walls(folder / 'recording')
+    replay(folder / 'recording', folder / 'plain')
+    replay(folder / 'recording', folder / 'copy', copy=True)
+    return folder
+
+
+def test_messages_have_the_stamps_and_times_of_the_recording(done):
+    messages = read(done / 'plain/bag')
+    stamps = [10**18 + index * 33_333_333 for index in range(4)]
+    names = ['/segment_planes/labels', '/segment_planes/planes', '/segment_planes/markers']
+    assert [(time, topic) for time, topic, *_ in messages] == [
+        (stamp + DELAY, name) for stamp in stamps for name in names
+    ]
+    for recorded, topic, message, _ in messages:
+        headers = [m.header for m in getattr(message, 'markers', [message])]
+        for header in headers:
+            assert header.stamp.sec * 10**9 + header.stamp.nanosec == recorded - DELAY
+            assert header.frame_id == 'optical'
+        assert len(headers) > (4 if topic.endswith('markers') else 0)
+
+
+def test_messages_agree_with_the_files(done):
+    messages = read(done / 'plain/bag')
+    images = [m for _, topic, m, _ in messages if topic.endswith('labels')]
+    pictures = sorted((done / 'plain').glob('*_labels.png'))
+    for image, picture in zip(images, pictures, strict=True):
+        assert image.encoding == 'mono16'
+        pixels = image.data.view('<u2').reshape(image.height, image.width)
+        np.testing.assert_array_equal(pixels, read_labels(picture))
+    tables = [planes_from_message(m) for _, topic, m, _ in messages if topic.endswith('planes')]
+    with (done / 'plain/planes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    ids = [[int(row['id']) for row in rows if row['frame'] == str(n)] for n in range(4)]
+    assert [table['id'].tolist() for table in tables] == ids
+    # Two walls, two ids, in every frame.
+    assert ids == [ids[0]] * 4
+    assert len(set(ids[0])) == 2
+
+
+def test_the_bag_is_readable_by_mcap(done):
+    with (done / 'plain/bag/bag.mcap').open('rb') as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert {c.topic for c in summary.channels.values()} == {
+            f'/segment_planes/{name}' for name in ('labels', 'planes', 'markers')
+        }
+        assert sum(1 for _ in reader.iter_messages()) == 12
+
+
+def test_messages_are_those_of_the_node(done):
+    serialization = pytest.importorskip('rclpy.serialization')
+    from rangeseg_ros.ros.messages import make_rclpy
+
+    written = [data for *_, data in read(done / 'plain/bag')]
+    published = []
+    with DepthBag(done / 'recording') as source:
+        for frame, image, result in segmented(source, Config()):
+            sec, nanosec = divmod(frame.stamp, 10**9)
+            stamp = make_rclpy('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+            header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id='optical')
+            for name in Replay.topics:
+                message = OUTPUTS[name].message(make_rclpy, header, image, result)
+                published.append(serialization.serialize_message(message))
+    assert written == published
+
+
+def test_copied_topics_are_as_they_were(done):
+    originals = read(done / 'recording')
+    both = read(done / 'copy/bag')
+    assert [m[0] for m in both] == sorted(m[0] for m in both)
+    copied = [m for m in both if not m[1].startswith('/segment_planes')]
+    assert sorted((t, topic, data) for t, topic, _, data in copied) == sorted(
+        (t, topic, data) for t, topic, _, data in originals
+    )
+    written = [m[3] for m in both if m[1].startswith('/segment_planes')]
+    assert written == [m[3] for m in read(done / 'plain/bag')]
+    with (
+        rosbag2.Reader(done / 'recording') as before,
+        rosbag2.Reader(done / 'copy/bag') as after,
+    ):
+        for topic, info in before.topics.items():
+            assert after.topics[topic].msgtype == info.msgtype
+            assert after.topics[topic].msgdef == info.msgdef
+
+
+def test_a_replay_of_a_replay_replaces_the_results(done, tmp_path):
+    replay(done / 'copy/bag', tmp_path, copy=True)
+    again, before = read(tmp_path / 'bag'), read(done / 'copy/bag')
+    assert sorted(m[3] for m in again) == sorted(m[3] for m in before)
+
+
+def test_types_that_nobody_knows_are_copied(tmp_path):
+    path = tmp_path / 'recording'
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        secret = writer.add_connection(
+            '/secret', 'robot_msgs/msg/Secret', msgdef='uint8 x', rihs01='RIHS01_' + '0' * 64
+        )
+        writer.write(secret, 1, b'\x00\x01\x00\x00\x07')
+        recording = Recording()
+        recording.add_camera(10)
+        recording.add_image(10, walls(1)[0])
+        for stamp, topic, kind, message in recording.messages:
+            connection = writer.add_connection(topic, kind, typestore=ROS2)
+            writer.write(connection, stamp, ROS2.serialize_cdr(message, kind))
+    replay(path, tmp_path / 'out', copy=True)
+    with rosbag2.Reader(tmp_path / 'out/bag') as reader:
+        (connection,) = [c for c in reader.connections if c.topic == '/secret']
+        assert (connection.msgtype, connection.msgdef.data) == ('robot_msgs/msg/Secret', 'uint8 x')
+        assert [bytes(d) for _, _, d in reader.messages([connection])] == [b'\x00\x01\0\0\x07']
+
+
+def test_topics_are_chosen(done, tmp_path):
+    replay(done / 'recording', tmp_path, topics=('planes', 'overlay'))
+    topics = {topic for _, topic, *_ in read(tmp_path / 'bag')}
+    assert topics == {'/segment_planes/planes', '/segment_planes/overlay'}
+
+
+@pytest.mark.parametrize('storage', ['rosbag1', 'damaged'])
+def test_copies_need_a_whole_rosbag2(tmp_path, storage):
+    path = tmp_path / ('a.bag' if storage == 'rosbag1' else 'a')
+    file = record(path, 'rosbag1' if storage == 'rosbag1' else 'mcap', walls(3))
+    if storage == 'damaged':
+        with file.open('r+b') as stream:
+            stream.truncate(file.stat().st_size - 100)
+    with pytest.raises(BagError, match='not a whole rosbag2 to copy from'):
+        replay(path, tmp_path / 'out', copy=True)
+    assert not (tmp_path / 'out').exists()
+    assert replay(path, tmp_path / 'out').frames == 3
+
+
+def test_a_finished_recording_is_not_done_again(done, tmp_path):
+    path = record_walls(tmp_path / 'recording', 2)
+    out = tmp_path / 'out'
+    first = replay(path, out)
+    assert (first.frames, first.found_done) == (2, False)
+    bag = (out / 'bag').stat()
+    again = replay(path, out)
+    assert (again.frames, again.reasons, again.found_done) == (2, first.reasons, True)
+    assert (out / 'bag').stat() == bag
+    # Other parameters, other topics and another recording are other results.
+    assert not Replay(path, out, Config(min_pixels=499)).run().found_done
+    assert not replay(path, out).found_done
+    assert not replay(path, out, topics=('planes',)).found_done
+    os.utime(next(path.glob('*.mcap')), ns=(0, 0))
+    assert not replay(path, out, topics=('planes',)).found_done
+    # Frames of a longer recording do not stay behind.
+    assert replay(done / 'recording', out).frames == 4
+    assert replay(path, out).frames == 2
+    assert len(list(out.glob('*.png'))) == 4
+
+
+def test_folders_of_others_stay(tmp_path):
+    path = record_walls(tmp_path / 'bag', 1)
+    before = next(path.glob('*.mcap')).read_bytes()
+    with pytest.raises(BagError, match='bag: exists already, not overwritten'):
+        replay(path, tmp_path)
+    assert next(path.glob('*.mcap')).read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_killed_replay_is_started_again(done, tmp_path):
+    path = record_walls(tmp_path / 'recording', 200)
+    code = 'import sys; from rangeseg_ros.cli.main import main; main()'
+    process = subprocess.Popen(
+        [sys.executable, '-c', code, 'replay', path, '--output', 'out'],
+        cwd=tmp_path,
+        stdout=subprocess.DEVNULL,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while len(list(tmp_path.glob('out/*_labels.png'))) < 3:
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    finally:
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    assert not (tmp_path / 'out/bag').exists()
+    replay(done / 'recording', tmp_path / 'out')
+    assert results(tmp_path / 'out') == results(done / 'plain')
+    assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
+
+
+def test_processes_give_the_same_results(tmp_path, monkeypatch):
+    for name in ('a', 'b'):
+        replay(record_walls(tmp_path / name, 2), tmp_path / 'local' / name)
+    monkeypatch.chdir(tmp_path)
+    arguments = ['replay', 'a', 'b', '--output', 'out', '--jobs', '2']
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    assert results(tmp_path / 'out') == results(tmp_path / 'local')
