@@ -1,0 +1,87 @@
+"""Curved regions are told from planes that the sensor bends."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.curvature import curved
+from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.refinement import Problem
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.simulation.kinect import QUANTUM, simulate_kinect, smooth_field
+from rangeseg_ros.simulation.scenes import curved_scene
+from rangeseg_ros.simulation.truth import NOT_PLANAR
+
+CAMERA = Camera(320, 240, 292.0, 292.0, 159.5, 119.5)
+SENSOR = SensorModel.from_config(Config())
+
+
+def cylinder(radius, distance=2.0):
+    """Inverse depth of a standing cylinder, 0 beside it."""
+    x = CAMERA.rays[..., 0].astype(float)
+    # Nearer root of (z x)^2 + (z - c)^2 = r^2.
+    centre = distance + radius
+    root = centre**2 - (1 + x**2) * (centre**2 - radius**2)
+    depth = (centre - np.sqrt(np.maximum(root, 0))) / (1 + x**2)
+    return np.where(root > 0, 1 / depth, 0)
+
+
+def verdict(inverse, regions, distortion=0.0, seed=0):
+    random = np.random.default_rng(seed)
+    field = smooth_field(CAMERA.shape, (2.0, 2.0), random)
+    bent = smooth_field(CAMERA.shape, (13.0, 22.0), random)
+    inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    problem = Problem.of(image, SENSOR, *weights(image))
+    return curved(problem, regions.astype(np.uint16), SENSOR)
+
+
+def test_planes_are_not_curved():
+    """Nor is what the sensor's own distortion bends."""
+    regions = np.repeat([[1], [2]], [100, 140], axis=0) * np.ones((1, 320), int)
+    inverse = np.where(
+        regions == 1, CAMERA.rays @ np.array([0.1, 0, 0.5]), CAMERA.rays @ np.array([0, 0.4, 0.6])
+    )
+    for seed in range(3):
+        assert verdict(inverse, regions, 0.5, seed).tolist() == [False] * 3
+
+
+@pytest.mark.parametrize('radius', [0.15, 0.3])
+def test_cylinders_are_curved(radius):
+    inverse = cylinder(radius)
+    assert verdict(inverse, inverse > 0, 0.5).tolist() == [False, True]
+
+
+def test_only_the_curved_region_is():
+    inverse = cylinder(0.25)
+    regions = np.where(inverse > 0, 2, 1)
+    inverse[regions == 1] = (CAMERA.rays @ np.array([0.05, 0, 0.3]))[regions == 1]
+    assert verdict(inverse, regions).tolist() == [False, False, True]
+
+
+def test_the_background_never_is():
+    inverse = cylinder(0.25)
+    assert verdict(inverse, np.zeros(CAMERA.shape)).tolist() == [False]
+
+
+def test_ball_and_cylinder_make_no_planes_and_planes_survive():
+    """The targets: of curved surfaces at most 35 % in planes of 3000 pixels or more."""
+    shares, overlaps = [], []
+    for seed in (900, 901, 902):
+        frame = simulate_kinect(curved_scene(seed), seed=seed, sensor_seed=seed)
+        image = RangeImage.from_depth(frame.depth, frame.camera)
+        labels = Segmenter().segment(image).labels
+        large = np.flatnonzero(np.bincount(labels.ravel()) >= 3000)
+        curve = frame.labels == NOT_PLANAR
+        shares.append(np.isin(labels[curve], large[large > 0]).mean())
+        size = np.bincount(frame.labels.ravel(), minlength=NOT_PLANAR + 1)
+        overlap = Overlap.between(frame.labels, labels, frame.labels > 0)
+        counts = (overlap.truth != NOT_PLANAR) & (size[overlap.truth] >= 1000)
+        overlaps.extend(overlap.best_iou[counts])
+    assert np.mean(shares) <= 0.35
+    assert len(overlaps) >= 15
+    assert np.mean(overlaps) >= 0.9

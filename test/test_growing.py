@@ -1,0 +1,132 @@
+"""Surfaces grown from the blocks of simple images."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.growing import surfaces
+from rangeseg_ros.core.jump_edges import plane_deviation
+from rangeseg_ros.core.moments import COUNT, block_links, block_moments, fit_all, weighted
+from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+
+CAMERA = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
+ROWS, COLUMNS = np.indices(CAMERA.shape)
+QUANTUM = 0.0029
+"""Of the disparity of a Kinect, 1/m."""
+NOISE = 0.45 * QUANTUM
+WALL = np.array([0.05, 0.02, 0.5])
+
+
+def plane(theta):
+    return CAMERA.rays @ np.asarray(theta)
+
+
+def grown(inverse, noise=NOISE, seed=0, **sensor):
+    """Surfaces of the blocks of an image with white noise, and their moments."""
+    inverse = inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape)
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    edges = weights(image, plane_deviation(image, Config().edge_step))
+    model = SensorModel.from_config(Config(**sensor))
+    blocks = weighted(block_moments(image.inverse, image.rays, *edges, 4), model)
+    return surfaces(blocks, block_links(*edges, 4))
+
+
+def covered(labels, label):
+    """Share of some blocks that a surface has; none may have another.
+
+    Single blocks may be left over where the patches around them have grown to their full size:
+    their pixels find the surface later.
+    """
+    assert np.isin(labels, [0, label]).all()
+    return (labels == label).mean()
+
+
+@pytest.mark.parametrize('noise', [0.0, NOISE])
+def test_a_plane_is_one_surface(noise):
+    labels, moments = grown(plane(WALL), noise)
+    assert labels.shape == (30, 40) and covered(labels, 1) > 0.95
+    assert moments.shape == (2, 12)
+    assert not moments[0].any()
+    np.testing.assert_allclose(fit_all(moments)[0][1], WALL, atol=3e-4)
+
+
+def test_moments_are_those_of_the_blocks_of_a_surface():
+    inverse = np.where(COLUMNS < 80, plane(WALL), plane([0, 0, 0.7]))
+    labels, moments = grown(inverse, noise=0.0)
+    assert len(moments) == 3
+    for label in (1, 2):
+        assert moments[label, COUNT] == 16 * (labels == label).sum()
+
+
+@pytest.mark.parametrize('turn', [0.4, -0.4, 0.15])
+def test_planes_that_meet_at_a_crease_are_two_surfaces(turn):
+    """The inverse range is continuous: nothing but the slopes tells them apart."""
+    column = 80
+    at = (column - 0.5 - CAMERA.cx) / CAMERA.fx
+    right = WALL + np.array([turn, 0, -turn * at])
+    left_side = np.arange(CAMERA.width) < column
+    labels, moments = grown(np.where(left_side, plane(WALL), plane(right)))
+    assert len(moments) == 3
+    middle = column // 4
+    left, other = labels[:, :middle].max(), labels[:, middle + 2 :].max()
+    assert covered(labels[:, : middle - 2], left) > 0.9
+    assert covered(labels[:, middle + 2 :], other) > 0.9
+    planes = fit_all(moments)[0]
+    np.testing.assert_allclose(planes[left], WALL, atol=3e-3)
+    np.testing.assert_allclose(planes[other], right, atol=5e-3)
+
+
+@pytest.mark.parametrize('step', [5 * QUANTUM, 0.1])
+def test_parallel_planes_behind_each_other_are_two_surfaces(step):
+    labels, moments = grown(
+        np.where(ROWS >= 60, plane(WALL + np.array([0, 0, step])), plane(WALL))
+    )
+    assert len(moments) == 3
+    upper, lower = labels[:14].max(), labels[16:].max()
+    assert upper != lower
+    assert covered(labels[:14], upper) > 0.9 and covered(labels[16:], lower) > 0.9
+
+
+def test_parts_that_do_not_touch_are_surfaces_of_their_own():
+    """A pillar hides a stripe of one wall."""
+    pillar = (COLUMNS >= 70) & (COLUMNS < 90)
+    labels, moments = grown(np.where(pillar, plane([0, 0, 1.0]), plane(WALL)))
+    left, front, right = labels[15, [0, 20, 39]]
+    assert len({left, front, right, 0}) == 4 and len(moments) == 4
+
+
+def distorted():
+    """A wall with the smooth distortion of a Kinect of twice the usual strength."""
+    waves = np.sin(COLUMNS / 26) * np.cos(ROWS / 45) + np.sin(ROWS / 30 + 1)
+    return plane(WALL) + 0.7 * QUANTUM * waves
+
+
+def test_distortion_does_not_split_a_wall():
+    labels, moments = grown(distorted())
+    assert len(moments) == 2 and covered(labels, 1) > 0.95
+
+
+def test_without_distortion_in_the_model_it_does():
+    """So that the test before this one can fail."""
+    _, moments = grown(distorted(), distortion=0.0)
+    assert len(moments) > 3
+
+
+def test_clutter_is_no_surface():
+    clutter = (ROWS >= 40) & (ROWS < 80)
+    random = np.random.default_rng(5)
+    inverse = plane(WALL) + clutter * random.normal(0, 20 * QUANTUM, CAMERA.shape)
+    labels, _ = grown(inverse)
+    assert not labels[11:19].any()
+    assert (labels[:9] > 0).mean() > 0.9 and (labels[21:] > 0).mean() > 0.9
+
+
+def test_nothing_to_grow_from():
+    labels, moments = surfaces(
+        np.zeros((5, 7, 12)), (np.ones((5, 6), bool), np.ones((4, 7), bool))
+    )
+    assert not labels.any() and labels.shape == (5, 7)
+    assert moments.shape == (1, 12) and not moments.any()

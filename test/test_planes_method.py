@@ -1,0 +1,169 @@
+"""Method planes as a whole: accuracy, determinism, any size, whatever there is not."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.evaluation.hoover import classify, overlap_figures
+from rangeseg_ros.evaluation.label_files import as_truth
+from rangeseg_ros.io.images import read_depth, write_image
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
+
+ANNOTATED = Path(__file__).parents[2] / 'shared' / 'data' / 'annotated'
+SEEDS = (900, 901, 902)
+
+
+def segmented(depth, camera, **config):
+    return Segmenter(Config(**config)).segment(RangeImage.from_depth(depth, camera))
+
+
+def room(seed, noise='measured', width=640, height=480):
+    camera = kinect_camera(width, height)
+    return simulate_kinect(kinect_room(seed), camera, noise=noise, seed=seed, sensor_seed=seed)
+
+
+@pytest.mark.parametrize(
+    ('noise', 'mean_iou', 'share'), [('measured', 0.95, 0.93), ('independent', 0.96, 0.95)]
+)
+def test_accuracy_on_simulated_rooms(noise, mean_iou, share):
+    """Well above the best peer on such rooms (0.926 and 94 %; independent 0.910 and 91 %).
+
+    A little below the targets over many rooms (0.96 and 97 %; 0.97 and 98 %): these are 37
+    regions of at least 1000 pixels, correct when they overlap by 80 %.
+    """
+    overlaps, normals = [], []
+    for seed in SEEDS:
+        frame = room(seed, noise)
+        result = segmented(frame.depth, frame.camera)
+        assert not result.labels[frame.depth == 0].any()
+        overlap = as_truth(frame.labels, 1000).compare(result.labels)
+        found = {plane.label: plane.normal for plane in result.planes}
+        truth = {plane.label: plane.normal for plane in frame.planes}
+        overlaps.append(overlap)
+        for g, m in classify(overlap, 0.8).matches.items():
+            normals.append(np.degrees(np.arccos(min(truth[g] @ found[m], 1.0))))
+    assert sum(len(overlap.truth) for overlap in overlaps) >= 35
+    assert overlap_figures(overlaps)['mean_iou'] >= mean_iou
+    correct = sum(classify(overlap, 0.8).counts()['correct'] for overlap in overlaps)
+    assert correct >= share * sum(len(overlap.truth) for overlap in overlaps)
+    if noise == 'independent':
+        # The targets; the distortion of real sensors turns planes by more.
+        assert np.median(normals) <= 0.1
+        assert np.max(normals) <= 2.0
+
+
+def annotated_frames():
+    return sorted(ANNOTATED.glob('*/truth.png'))
+
+
+@pytest.mark.skipif(not annotated_frames(), reason='needs the annotated frames')
+def test_accuracy_on_real_frames(tmp_path):
+    """At least that of the best peer: 0.933, 0.911, 1.07 and 0.51 of what is curved."""
+    scores = []
+    for truth in annotated_frames():
+        depth = read_depth(truth.with_name('depth.png'))
+        intrinsics = map(float, truth.with_name('camera.txt').read_text().split())
+        result = segmented(depth, Camera(depth.shape[1], depth.shape[0], *intrinsics))
+        assert not result.labels[depth == 0].any()
+        path = tmp_path / f'{truth.parent.name}.png'
+        write_image(path, result.labels)
+        run = [sys.executable, ANNOTATED / 'score.py', truth, path, '--json']
+        scores.append(json.loads(subprocess.check_output(run)))
+
+    def mean(name):
+        return np.mean([score[name] for score in scores if score[name] is not None])
+
+    assert len(scores) >= 6
+    assert mean('iou') >= 0.933
+    assert mean('correct80') >= 0.911
+    assert mean('segments') <= 1.1
+    assert mean('curved_as_plane') <= 0.51
+
+
+def small_fingerprint():
+    """Labels and planes of a small room, bit for bit."""
+    frame = room(903, 'measured', 160, 120)
+    result = segmented(frame.depth, frame.camera, min_pixels=100)
+    planes = [(p.label, p.count, *map(float, p.normal), float(p.distance)) for p in result.planes]
+    return json.loads(json.dumps([result.labels.tolist(), planes]))
+
+
+@pytest.fixture(scope='module')
+def fingerprint():
+    labels, planes = small_fingerprint()
+    assert len(planes) >= 5
+    return labels, planes
+
+
+def in_another_process(**environment):
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **environment}
+    text = subprocess.check_output([sys.executable, __file__], env=environment, text=True)
+    return json.loads(text)
+
+
+def test_two_runs_agree_bit_for_bit(fingerprint):
+    assert small_fingerprint() == [*fingerprint]
+
+
+def test_two_processes_agree_bit_for_bit(fingerprint):
+    assert in_another_process(PYTHONHASHSEED='7') == [*fingerprint]
+
+
+def test_compiled_code_gives_the_labels_of_the_plain_python(fingerprint):
+    """The planes are the same but for the order in which floating-point sums are taken."""
+    labels, planes = in_another_process(NUMBA_DISABLE_JIT='1')
+    assert labels == fingerprint[0]
+    np.testing.assert_allclose(planes, fingerprint[1], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize('size', [(424, 240), (212, 120), (101, 67), (37, 61)])
+def test_any_size(size):
+    """Also those that blocks do not divide."""
+    camera = kinect_camera(*size)
+    inverse = camera.rays @ np.array([0.1, 0.2, 0.5])
+    result = segmented((1 / inverse).astype(np.float32), camera)
+    assert result.labels.shape == camera.shape
+    assert (result.labels == 1).all()
+    assert [plane.count for plane in result.planes] == [size[0] * size[1]]
+
+
+@pytest.mark.parametrize('size', [(1, 1), (1, 9), (3, 5), (4, 4), (640, 1), (1, 480)])
+def test_tiny_images_may_have_tiny_planes(size):
+    camera = kinect_camera(*size)
+    result = segmented(np.full(camera.shape, 1500, np.uint16), camera, min_pixels=1)
+    assert result.labels.shape == camera.shape
+    assert bool(result.reason) == (not result.planes)
+    assert np.isfinite(result.energy)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('value', [1e-38, 1e-20, 1e-6, 1e6, 1e20, 1e38])
+@pytest.mark.parametrize('where', ['part', 'all'])
+def test_absurd_depths_disturb_nothing(value, where):
+    frame = room(900, 'none', 160, 120)
+    depth = frame.depth.copy()
+    part = (slice(30, 60), slice(40, 90)) if where == 'part' else ...
+    depth[part] = value
+    result = segmented(depth, frame.camera)
+    assert np.isfinite(result.energy)
+    for plane in result.planes:
+        assert np.isfinite([*plane.normal, plane.distance]).all()
+    if where == 'part':
+        expected = segmented(frame.depth, frame.camera)
+        away = np.ones(depth.shape, bool)
+        away[20:70, 30:100] = False
+        assert ((result.labels > 0) == (expected.labels > 0))[away].mean() > 0.9
+
+
+if __name__ == '__main__':
+    print(json.dumps(small_fingerprint()))

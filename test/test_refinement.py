@@ -1,0 +1,222 @@
+"""Planes as labels: energy, descent and expansions against literal sums and exhaustive search."""
+
+from itertools import product
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.core import refinement
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.growing import surfaces
+from rangeseg_ros.core.moments import block_links, block_moments, weighted
+from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.refinement import BLOCK, Models, Problem, energy, refine, region_moments
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
+
+NOISE = 0.002
+SENSOR = SensorModel.from_config(Config(noise=NOISE, distortion=0.003))
+
+
+def random_case(seed, height, width, count=3):
+    """Problem with holes and cut edges whose pixels lie near one of `count` random planes."""
+    random = np.random.default_rng(seed)
+    rays = np.ones((height, width, 3), np.float32)
+    rays[..., 0] = (np.arange(width) - width / 2) / 20
+    rays[..., 1] = ((np.arange(height) - height / 2) / 20)[:, None]
+    theta = random.normal([0, 0, 0.5], [0.02, 0.02, 0.006], (count + 1, 3))
+    theta[0] = 0
+    nearest = random.integers(1, count + 1, (height, width))
+    inverse = (theta[nearest] * rays).sum(axis=2) + random.normal(0, 4 * NOISE, (height, width))
+    inverse[random.random((height, width)) < 0.1] = 0
+    image = RangeImage(rays, inverse.astype(np.float32))
+    edges = weights(image)
+    for edge in edges:
+        edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
+    models = Models(theta, np.concatenate([[1.0], random.uniform(1, 4, count)]))
+    labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
+    return Problem.of(image, SENSOR, *edges), models, labels.astype(np.int32)
+
+
+def unary(problem, models):
+    """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
+    residual = problem.inverse - np.einsum('ijk,lk->lij', problem.rays, models.theta)
+    chi2 = residual**2 * problem.weight / models.tolerance[:, None, None]
+    # Three pixels count as one measurement.
+    cost = np.minimum(chi2 / 2, 8.0) / 3
+    cost[0] = 6.0 / 3
+    return np.where(problem.weight > 0, cost, 0)
+
+
+def literal_energy(labels, problem, models):
+    cost, total = unary(problem, models), 0.0
+    for i, j in np.ndindex(labels.shape):
+        total += cost[labels[i, j], i, j]
+        if j + 1 < labels.shape[1] and labels[i, j] != labels[i, j + 1]:
+            total += 1.2 * problem.horizontal[i, j]
+        if i + 1 < labels.shape[0] and labels[i, j] != labels[i + 1, j]:
+            total += 1.2 * problem.vertical[i, j]
+    return total
+
+
+def cost_of(labels, problem, models):
+    cost = np.take_along_axis(unary(problem, models), labels[None].astype(int), 0)[0]
+    return cost.astype(np.float32)
+
+
+def energies(many, problem, models):
+    """Energies (n,) of labellings (n, H, W)."""
+    rows, columns = np.indices(many.shape[1:])
+    total = unary(problem, models)[many, rows, columns].sum(axis=(1, 2))
+    total += 1.2 * ((many[:, :, 1:] != many[:, :, :-1]) * problem.horizontal).sum(axis=(1, 2))
+    return total + 1.2 * ((many[:, 1:] != many[:, :-1]) * problem.vertical).sum(axis=(1, 2))
+
+
+def expand(alpha, labels, cost, problem, models, reach=4):
+    rows, columns = np.nonzero(labels == alpha)
+    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
+    return refinement._expand(alpha, box, labels, cost, problem, models, reach)
+
+
+def test_weights_are_inverse_variances():
+    problem, _, _ = random_case(0, 9, 11)
+    measured = problem.inverse > 0
+    np.testing.assert_allclose(problem.weight[measured], 1 / NOISE**2, rtol=1e-5)
+    assert not problem.weight[~measured].any()
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_energy_is_what_it_is_defined_to_be(seed):
+    problem, models, labels = random_case(seed, 13, 9)
+    expected = literal_energy(labels, problem, models)
+    assert energy(labels, problem, models) == pytest.approx(expected, rel=1e-5)
+    assert energies(labels[None], problem, models)[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_an_expansion_is_the_best_there_is(seed):
+    """Of all subsets of the pixels that may switch; it never switches those without data."""
+    problem, models, labels = random_case(seed, 3, 4)
+    labels[0, 0], problem.inverse[0, 0] = 1, models.theta[1] @ problem.rays[0, 0]
+    problem.weight[0, 0] = problem.weight.max()
+    cost = cost_of(labels, problem, models)
+    free = np.flatnonzero((labels != 1) & (problem.weight > 0))
+    chosen = np.array(list(product([False, True], repeat=len(free))))
+    every = np.repeat(labels.reshape(1, -1), len(chosen), axis=0)
+    every[:, free] = np.where(chosen, 1, every[:, free])
+    least = energies(every.reshape(-1, 3, 4), problem, models).min()
+    before = labels.copy()
+    helped = expand(1, labels, cost, problem, models)
+    assert helped == (labels != before).any()
+    assert energies(labels[None], problem, models)[0] == pytest.approx(least, abs=1e-4)
+    assert ((labels == before) | (labels == 1)).all()
+    assert not labels[problem.weight == 0].any()
+    np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_expansions_in_larger_images_never_raise_the_energy(seed):
+    problem, models, labels = random_case(seed, 30, 40, 5)
+    cost = cost_of(labels, problem, models)
+    values = [energies(labels[None], problem, models)[0]]
+    for alpha, reach in ((3, 4), (1, 4), (5, 1), (2, 12), (4, 4), (3, 12)):
+        if (labels == alpha).any():
+            before = labels.copy()
+            helped = expand(alpha, labels, cost, problem, models, reach)
+            values.append(energies(labels[None], problem, models)[0])
+            assert helped == (values[-1] < values[-2])
+            own = cv2.dilate((before == alpha).astype(np.uint8), np.ones(2 * [2 * reach + 1]))
+            assert ((labels == before) | (own > 0)).all()
+    assert (np.diff(values) <= 0).all()
+    assert values[-1] < values[0] - 100
+
+
+@pytest.mark.parametrize('seed', range(8))
+def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
+    """Nor by none: the labels of the neighbours it is connected with are what it may take."""
+    problem, models, _ = random_case(seed, 20, 24, 4)
+    blocks = np.random.default_rng(seed).integers(0, 5, (5, 6)).astype(np.int32)
+    labels, cost = refinement._descended(problem, blocks, models)
+    assert not labels[problem.weight == 0].any()
+    np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
+    beside = np.zeros((5, *labels.shape), bool)
+    beside[0] = True
+    for label in range(1, 5):
+        here = labels == label
+        beside[label, :, 1:] |= here[:, :-1] & (problem.horizontal > 0)
+        beside[label, :, :-1] |= here[:, 1:] & (problem.horizontal > 0)
+        beside[label, 1:] |= here[:-1] & (problem.vertical > 0)
+        beside[label, :-1] |= here[1:] & (problem.vertical > 0)
+    value = energies(labels[None], problem, models)[0]
+    for label in range(5):
+        pixels = np.flatnonzero(beside[label] & (problem.weight > 0))
+        changed = np.repeat(labels.reshape(1, -1), len(pixels), axis=0)
+        changed[np.arange(len(pixels)), pixels] = label
+        assert energies(changed.reshape(-1, *labels.shape), problem, models).min() > value - 1e-4
+
+
+def small_room(seed=900):
+    frame = simulate_kinect(kinect_room(seed), kinect_camera(160, 120), seed=seed)
+    image = RangeImage.from_depth(frame.depth, frame.camera)
+    sensor = SensorModel.from_config(Config())
+    edges = weights(image)
+    blocks = block_moments(image.inverse, image.rays, *edges, BLOCK)
+    found = surfaces(weighted(blocks, sensor), block_links(*edges, BLOCK))
+    return Problem.of(image, sensor, *edges), found, sensor
+
+
+def test_each_stage_lowers_the_energy(monkeypatch):
+    """From no plane at all over the descent through every expansion."""
+    problem, (surface, moments), sensor = small_room()
+    values = []
+
+    def watched(name, labels_and_models):
+        original = getattr(refinement, name)
+
+        def run(*arguments):
+            result = original(*arguments)
+            labels, models = labels_and_models(arguments, result)
+            if not values:
+                values.append(energies(np.zeros((1, *labels.shape), int), problem, models)[0])
+            values.append(energies(labels[None], problem, models)[0])
+            return result
+
+        monkeypatch.setattr(refinement, name, run)
+
+    watched('_descended', lambda arguments, result: (result[0], arguments[2]))
+    watched('_expand', lambda arguments, result: (arguments[2], arguments[5]))
+    labels, models = refine(problem, surface, moments, sensor)
+    assert len(values) >= 5
+    assert (np.diff(values) <= 1e-3).all()
+    assert values[1] < 0.5 * values[0]
+    assert values[-1] < values[1]
+    assert energy(labels, problem, models) == pytest.approx(values[-1], rel=1e-5)
+
+
+def test_no_expansion_helps_after_the_exact_minimisation():
+    problem, (surface, moments), sensor = small_room()
+    labels, models = refine(problem, surface, moments, sensor, exact=True)
+    value = energies(labels[None], problem, models)[0]
+    for alpha in range(1, len(models.theta)):
+        if (labels == alpha).any():
+            changed = labels.copy()
+            expand(alpha, changed, cost_of(labels, problem, models), problem, models, 12)
+            assert energies(changed[None], problem, models)[0] > value - 1e-2
+
+
+def test_moments_of_regions_are_sums_over_their_pixels():
+    problem, _, labels = random_case(3, 17, 13)
+    moments = region_moments(problem, labels, 4, SENSOR)
+    assert not moments[0].any()
+    for label in range(1, 4):
+        mask = labels == label
+        rays, y, w = problem.rays[mask], problem.inverse[mask], problem.weight[mask]
+        rays, y, w = (part.astype(np.float64) for part in (rays, y, w))
+        square = np.einsum('n,ni,nj->ij', w, rays, rays)[np.triu_indices(3)]
+        expected = [*square, *(w * y) @ rays, w @ y**2, mask.sum(), w.sum() * 0.003**2]
+        np.testing.assert_allclose(moments[label], expected, rtol=1e-9)
+    theta = Models.of(moments).theta
+    assert not theta[0].any() and theta[1:].any(axis=1).all()
