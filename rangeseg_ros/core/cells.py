@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.sensor import FLOOR, SensorModel
 
 MOST = 100
 """Cells of a region at most."""
@@ -113,8 +113,7 @@ def variances(sensor: SensorModel) -> NDArray[np.float64]:
     (4,): random and systematic, each a + b y^4 at the inverse range y, as a, b.
     """
     parts = sensor.noise, sensor.range_noise, sensor.distortion, sensor.range_distortion
-    # Not quite 0: weights are reciprocals.
-    return np.maximum(np.square(parts), (1e-24, 0, 0, 0))
+    return np.square(parts) + np.array([FLOOR, 0, 0, 0])
 
 
 @njit(cache=True)

@@ -1,0 +1,165 @@
+"""Planes: fit, place, shape and common surfaces, on exact planes and simulated errors."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.confidence import confidence
+from rangeseg_ros.core.planes import fit_planes
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.simulation.kinect import QUANTUM, kinect_camera
+
+KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)
+CAMERA = kinect_camera()
+NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0
+
+
+def plane_image(normal=NORMAL, distance=DISTANCE, camera=CAMERA, error=0.0):
+    """Range image of one plane, and the inverse range exactly."""
+    exact = -(camera.rays.astype(float) @ (np.asarray(normal) / distance))
+    return RangeImage(camera.rays, (exact + error).astype(np.float32), camera)
+
+
+def boxes(*corners):
+    labels = np.zeros(CAMERA.shape, np.uint16)
+    for label, (top, left, bottom, right) in enumerate(corners, 1):
+        labels[top:bottom, left:right] = label
+    return labels
+
+
+def as_cloud(image):
+    return RangeImage.from_points(image.points)
+
+
+def polygon_area(ring, normal):
+    """Signed area, positive counter-clockwise seen from the side the normal points to."""
+    return np.cross(ring, np.roll(ring, -1, axis=0)).sum(axis=0) @ normal / 2
+
+
+def rotation(quaternion):
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+@pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
+def test_exact_planes_come_back(form):
+    labels = boxes((50, 60, 250, 300), (300, 400, 316, 420))
+    labels[100:140, 100:150] = 0
+    image = form(plane_image())
+    for plane in fit_planes(labels, image, KINECT):
+        np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-6)
+        assert plane.distance == pytest.approx(DISTANCE, abs=1e-6)
+        assert plane.rms < 1e-6 and plane.confidence == pytest.approx(1)
+        assert plane.count == np.count_nonzero(labels == plane.label)
+        points = image.points[labels == plane.label]
+        np.testing.assert_allclose(plane.centroid, points.mean(axis=0, dtype=float), atol=1e-5)
+        for ring in (plane.hull, *plane.holes, plane.centre[None], plane.centroid[None]):
+            np.testing.assert_allclose(ring @ NORMAL + DISTANCE, 0, atol=1e-5)
+        frame = rotation(plane.orientation)
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(frame[:, 2], plane.normal, atol=1e-9)
+
+
+def test_outline_and_area_agree_and_run_counter_clockwise():
+    labels = boxes((50, 60, 250, 300))
+    labels[100:140, 100:150] = 0
+    labels[50:120, 200:300] = 0  # concave
+    labels[200, 80] = 0  # a pixel is no hole
+    (plane,) = fit_planes(labels, plane_image(), KINECT)
+    outer = polygon_area(plane.hull, plane.normal)
+    holes = [polygon_area(hole, plane.normal) for hole in plane.holes]
+    assert len(plane.hull) == 6 and len(holes) == 1
+    assert outer > 0 > holes[0]
+    # Within a quarter of a pixel along the border of 1060 pixels, of 39000.
+    assert outer + sum(holes) == pytest.approx(plane.area, rel=0.25 * 1060 / 39000)
+
+
+def test_extents_of_a_turned_rectangle():
+    # 1.2 m by 0.5 m on an oblique plane, its long side turned by 30 degrees in it.
+    across = np.cross(NORMAL, [0, 1, 0])
+    across /= np.linalg.norm(across)
+    long = np.cos(np.pi / 6) * across + np.sin(np.pi / 6) * np.cross(NORMAL, across)
+    long *= np.sign(long[0])
+    centre = np.array([0.0, 0.1, 0.0])
+    centre[2] = -(DISTANCE + NORMAL @ centre) / NORMAL[2]
+    image = plane_image()
+    points = image.points.astype(float) - centre
+    inside = (np.abs(points @ long) < 0.6) & (np.abs(points @ np.cross(NORMAL, long)) < 0.25)
+    (plane,) = fit_planes(inside.astype(np.uint16), image, KINECT)
+    pixel = np.linalg.norm(centre) / CAMERA.fx / 0.5  # on the oblique plane
+    np.testing.assert_allclose(plane.extents, (1.2, 0.5), atol=2 * pixel)
+    np.testing.assert_allclose(plane.centre, centre, atol=2 * pixel)
+    assert plane.area == pytest.approx(0.6, rel=0.01)
+    assert rotation(plane.orientation)[:, 0] @ long > np.cos(np.radians(0.5))
+
+
+@pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
+def test_pixels_of_a_neighbour_at_the_border_do_not_turn_the_plane(form):
+    labels = boxes((100, 100, 200, 300))
+    image = plane_image()
+    inverse = image.inverse.copy()
+    inverse[100:200, 296:300] += 10 * QUANTUM
+    (plane,) = fit_planes(labels, form(RangeImage(CAMERA.rays, inverse, CAMERA)), KINECT)
+    np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-6)
+    assert plane.confidence == pytest.approx(0.98, abs=1e-6)
+    assert plane.count == 20000
+
+
+def test_rough_surfaces_inspire_less_confidence():
+    labels = boxes((100, 100, 300, 300))
+    noise = np.random.default_rng(1).normal(0, 4 * QUANTUM, CAMERA.shape)
+    (plane,) = fit_planes(labels, plane_image(error=noise), KINECT)
+    # Three quarters within 4 deviations of 0.67 quanta each, of a distribution six times as wide.
+    assert 0.05 < plane.confidence < 0.25
+
+
+def test_what_determines_no_plane_is_left_out():
+    labels = boxes((100, 100, 101, 300), (200, 200, 220, 220), (300, 300, 320, 320))
+    image = plane_image()
+    image.inverse[200:220, 200:220] = 0
+    assert [plane.label for plane in fit_planes(labels, image, KINECT)] == [3]
+    assert fit_planes(np.zeros(CAMERA.shape, np.uint16), image, KINECT) == []
+
+
+def test_parts_of_one_plane_share_a_surface_and_steps_do_not():
+    labels = boxes((100, 100, 200, 200), (100, 300, 200, 400), (100, 210, 200, 290))
+    random = np.random.default_rng(2)
+    noise = 0.37 * QUANTUM * cv2.GaussianBlur(random.standard_normal(CAMERA.shape), (0, 0), 2)
+    noise *= np.sqrt(16 * np.pi)
+    image = plane_image(error=noise)
+    assert [p.surface for p in fit_planes(labels, image, KINECT)] == [1, 1, 1]
+    step = plane_image(distance=DISTANCE - 0.04, error=noise).inverse
+    inverse = np.where(labels == 3, step, image.inverse)
+    planes = fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
+    assert [p.surface for p in planes] == [1, 1, 3]
+
+
+def test_confidence_is_low_at_creases_and_off_the_plane():
+    left, right = plane_image((0.6, 0, -0.8), 2.0), plane_image((-0.6, 0, -0.8), 2.0)
+    image = RangeImage(CAMERA.rays, np.maximum(left.inverse, right.inverse), CAMERA)
+    middle = CAMERA.width // 2
+    labels = boxes((0, 0, CAMERA.height, middle), (0, middle, CAMERA.height, CAMERA.width))
+    image.inverse[100, 100] += 20 * QUANTUM
+    image.inverse[100, 110] = 0
+    planes = fit_planes(labels, image, KINECT)
+    result = confidence(labels, image, planes, KINECT)
+    assert result[240, 200] == 252
+    assert result[100, 100] == 0 and result[100, 110] == 0
+    assert 120 <= result[240, middle] <= 135
+    assert confidence(np.zeros_like(labels), image, [], KINECT).max() == 0
+
+
+def test_camera_of_another_size():
+    camera = Camera(64, 48, 60.0, 50.0, 20.0, 30.0)
+    labels = np.ones(camera.shape, np.uint16)
+    (plane,) = fit_planes(labels, plane_image(camera=camera), KINECT)
+    np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-6)
+    assert polygon_area(plane.hull, NORMAL) == pytest.approx(plane.area, rel=5e-3)

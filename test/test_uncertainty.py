@@ -1,0 +1,149 @@
+"""Covariances of planes: against the exact sum over pairs of pixels, and against errors made."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.planes import fit_planes
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.uncertainty import plane_jacobians
+from rangeseg_ros.simulation.kinect import QUANTUM, smooth_field
+
+NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0
+# A region of 16 pixels tells its normal to ten degrees, where normal and distance are no longer
+# linear in the errors: a twentieth of a Kinect's.
+SMALL = 0.05
+
+
+def part(x, y, width, height):
+    """Camera that sees a part of a Kinect's image."""
+    return Camera(width, height, 585.0, 585.0, 319.5 - x, 239.5 - y)
+
+
+def inverse_range(camera):
+    return -(camera.rays.astype(float) @ (NORMAL / DISTANCE))
+
+
+def models(unit):
+    """Sensors with errors of one kind, and of all."""
+    return {
+        'white': SensorModel(0.45 * unit, 0, 1.0, 2, 0, 0, 35),
+        'correlated': SensorModel(0.45 * unit, 0, 0.0, 2, 0, 0, 35),
+        'systematic': SensorModel(0.01 * unit, 0, 1.0, 2, 0.5 * unit, 0, 35),
+        'all': SensorModel(0.45 * unit, 0, 0.33, 2, 0.5 * unit, 0, 35),
+        'laser': SensorModel(0, 2 * unit, 0.2, 2, 0, 2 * unit, 20),
+    }
+
+
+def disc(height, width):
+    return np.hypot(*np.ogrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]) < 1
+
+
+def full(height, width):
+    return np.ones((height, width), bool)
+
+
+@pytest.mark.parametrize('kind', models(1))
+@pytest.mark.parametrize(
+    ('view', 'shape'),
+    [
+        ((400, 100, 16, 16), full),
+        ((100, 300, 50, 8), full),
+        ((300, 200, 60, 60), full),
+        ((200, 200, 70, 50), disc),
+    ],
+    ids=['16x16', '50x8', '60x60', 'disc'],
+)
+def test_sums_over_cells_are_those_over_pixels(kind, view, shape):
+    camera, sensor = part(*view), models(SMALL * QUANTUM)[kind]
+    exact = inverse_range(camera)
+    mask = shape(*camera.shape)
+    image = RangeImage(camera.rays, exact.astype(np.float32), camera)
+    (plane,) = fit_planes(mask.astype(np.uint16), image, sensor)
+
+    rows, columns = np.nonzero(mask)
+    squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
+    level = exact[mask] ** 4
+    random = sensor.noise**2 + sensor.range_noise**2 * level
+    systematic = sensor.distortion**2 + sensor.range_distortion**2 * level
+    field = np.exp(-squared / 4 / sensor.correlation**2)
+    field = sensor.white * np.eye(len(rows)) + (1 - sensor.white) * field
+    errors = np.sqrt(np.outer(random, random)) * field
+    field = np.exp(-squared / 4 / sensor.distortion_length**2)
+    errors += np.sqrt(np.outer(systematic, systematic)) * field
+    weighted = camera.rays[mask].astype(float) / random[:, None]
+    inverse = np.linalg.inv(weighted.T @ camera.rays[mask])
+    jacobian = plane_jacobians(NORMAL[None], np.array([DISTANCE]))[0]
+    spread = jacobian @ inverse @ weighted.T
+    truth = spread @ errors @ spread.T
+    # In every direction, as a ratio of variances.
+    directions = np.linalg.svd(jacobian)[0][:, :3]
+    ratio = np.linalg.eigvals(
+        np.linalg.solve(
+            directions.T @ plane.covariance @ directions, directions.T @ truth @ directions
+        )
+    )
+    np.testing.assert_allclose(ratio.real, 1, atol=0.15)
+    assert np.linalg.matrix_rank(plane.covariance, tol=1e-9 * np.trace(plane.covariance)) <= 3
+
+
+def made(kind, shape, unit, random):
+    """Errors of the inverse range in units of `unit`, of one kind or all."""
+    error = np.zeros(shape)
+    if kind == 'white':
+        error = random.normal(0, 0.45, shape)
+    if kind == 'correlated':
+        error = 0.45 * smooth_field(shape, (2, 2), random)
+    if kind == 'all':
+        error = 0.37 * smooth_field(shape, (2, 2), random) + random.uniform(-0.5, 0.5, shape)
+    if kind in ('systematic', 'all'):
+        error += 0.5 * smooth_field(shape, (35, 35), random)
+    return unit * error
+
+
+def kinect(kind, shape, unit, random):
+    """Errors of the simulated Kinect: correlated noise and distortion wider than high."""
+    error = 0.37 * smooth_field(shape, (2, 2), random)
+    return unit * (error + 0.5 * smooth_field(shape, (26, 45), random))
+
+
+def normalised_square(camera, sensor, errors, quantum=0.0):
+    """Mean over 200 renderings of error^T covariance^+ error per degree of freedom."""
+    exact = inverse_range(camera)
+    labels = np.ones(camera.shape, np.uint16)
+    squares = []
+    for _ in range(200):
+        inverse = exact + errors()
+        if quantum:
+            inverse = np.rint(inverse / quantum) * quantum
+        image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+        (plane,) = fit_planes(labels, image, sensor)
+        error = np.append(plane.normal - NORMAL, plane.distance - DISTANCE)
+        precision = np.linalg.pinv(plane.covariance, rcond=1e-10, hermitian=True)
+        squares.append(error @ precision @ error / 3)
+    return np.mean(squares)
+
+
+@pytest.mark.parametrize('kind', ['white', 'correlated', 'systematic', 'all'])
+@pytest.mark.parametrize(
+    ('view', 'scale'), [((400, 100, 16, 16), SMALL), ((200, 150, 100, 80), 0.3)]
+)
+def test_covariance_tells_the_errors(kind, view, scale):
+    camera, random = part(*view), np.random.default_rng([3, view[2]])
+    unit = scale * QUANTUM
+    value = normalised_square(
+        camera, models(unit)[kind], lambda: made(kind, camera.shape, unit, random)
+    )
+    assert value == pytest.approx(1, abs=0.2)
+
+
+def test_covariance_tells_the_errors_of_the_simulated_kinect():
+    camera, random = part(200, 150, 100, 80), np.random.default_rng(4)
+    value = normalised_square(
+        camera,
+        models(QUANTUM)['all'],
+        lambda: kinect('all', camera.shape, QUANTUM, random),
+        QUANTUM,
+    )
+    assert value == pytest.approx(1, abs=0.2)
