@@ -17,7 +17,7 @@ COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()
 def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
     distributed = pytest.importorskip('distributed')
     names = ['a', 'b', 'c']
-    for name, count in zip(names, (40, 41, 42), strict=True):
+    for name, count in zip(names, (20, 21, 22), strict=True):
         record_walls(tmp_path / name, count)
         replay(tmp_path / name, tmp_path / 'local' / name)
     with (
@@ -64,7 +64,7 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
         finally:
             command.kill()
     assert command.returncode == 0, error
-    assert [f'{count} frames' in output for count in (40, 41, 42)] == [True] * 3
+    assert [f'{count} frames' in output for count in (20, 21, 22)] == [True] * 3
     for name in names:
         assert results(tmp_path / 'out' / name) == results(tmp_path / 'local' / name)
         assert not list((tmp_path / 'out' / name).glob('.*'))

@@ -35,6 +35,12 @@ def longest_seen(sightings: NDArray[np.void], count: int) -> NDArray[np.int64]:
     return chosen
 
 
+def runs(frames: NDArray[np.integer]) -> list[tuple[int, int]]:
+    """First and last of each unbroken run of frames, which are given in order."""
+    parts = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    return [(int(part[0]), int(part[-1])) for part in parts]
+
+
 def id_bars(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
     """When each plane was in sight: a row for each id, `times` (N,) in seconds of the frames."""
     ids = np.sort(longest_seen(sightings, MAX_BARS))
@@ -42,9 +48,8 @@ def id_bars(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
     axes = figure.subplots()
     step = np.median(np.diff(times)) if len(times) > 1 else 1.0
     for row, (number, colour) in enumerate(zip(ids, colours(ids) / 255, strict=True)):
-        frames = np.unique(sightings['frame'][sightings['id'] == number])
-        runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-        spans = [(times[run[0]], times[run[-1]] - times[run[0]] + step) for run in runs]
+        seen = runs(sightings['frame'][sightings['id'] == number])
+        spans = [(times[first], times[last] - times[first] + step) for first, last in seen]
         axes.broken_barh(spans, (row - 0.4, 0.8), color=colour)
     axes.set_yticks(range(len(ids)), [str(number) for number in ids], fontsize=8)
     axes.invert_yaxis()

@@ -1,0 +1,194 @@
+"""The pages of replay and evaluate: what they say, and what a browser makes of them."""
+
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from test_replay_bags import record_walls, replay, walls
+
+from rangeseg_ros import Camera, Config, RangeImage
+from rangeseg_ros.batch.replay import write_pictures
+from rangeseg_ros.cli.main import main
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.report import charts
+from rangeseg_ros.report.page import MAX_PICTURES, Picture, spread
+from rangeseg_ros.report.replay import ReplayReport
+
+CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser')
+
+
+class Page(HTMLParser):
+    """Sources, links and text of a page."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.sources, self.titles, self.text, self.tags = [], [], '', []
+        self.feed(path.read_text(encoding='utf-8'))
+        self.close()
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        values = dict(attributes)
+        self.sources += [values[key] for key in ('src', 'href') if key in values]
+        self.titles += [values['alt']] if 'alt' in values else []
+
+    def handle_data(self, data):
+        self.text += data
+
+
+@pytest.fixture
+def report(tmp_path):
+    """Page of three frames of walls and one without a measurement."""
+    config = Config(min_pixels=499)
+    sequence = SequenceSegmenter(config)
+    page = ReplayReport('<script>alert(1)</script>', config)
+    for index, depth in enumerate([*walls(3), np.zeros((48, 64), np.uint16)]):
+        image = RangeImage.from_depth(depth, CAMERA)
+        stamp = 10**18 + index * 500_000_000
+        result = sequence.segment(image, stamp)
+        page.add(stamp, result, write_pictures(tmp_path, f'{index}', image, result))
+    page.write(tmp_path / 'report.html', 'file ends within a record')
+    return tmp_path / 'report.html'
+
+
+def test_a_page_is_self_contained(report):
+    page = Page(report)
+    assert len(page.sources) == 4 + 3
+    assert all(source.startswith('data:image/') for source in page.sources)
+    assert not re.search(r'url\(|@import|<link', report.read_text())
+
+
+def test_a_page_says_what_was_found(report):
+    page = Page(report)
+    assert '4 frames in 1.5 s, 2 planes in the median frame, 2 ids in all' in page.text
+    assert 'file ends within a record' in page.text
+    assert 'frame 2: 2 planes' in page.text
+    assert 'frame 3: no valid depth' in page.text
+    assert re.search(r'without planes\s*number\s*reason\s*1\s*no valid depth', page.text)
+    for stage in ('edges', 'labels', 'planes', 'total'):
+        assert re.search(rf'\n{stage}(\d+\.\d){{3}}\n', page.text)
+
+
+def test_parameters_that_were_changed_are_marked(report):
+    rows = re.findall(r'<tr class="changed"><td>(\w+)</td><td>(.*?)</td>', report.read_text())
+    assert rows == [('min_pixels', '499')]
+    for name in Config.__dataclass_fields__:
+        assert f'<td>{name}</td>' in report.read_text()
+
+
+def test_names_are_text(report):
+    page = Page(report)
+    assert page.tags.count('script') == 1
+    assert '<script>alert(1)</script>' in page.text
+
+
+def test_a_page_of_nothing(tmp_path):
+    ReplayReport('nothing', Config()).write(tmp_path / 'report.html')
+    page = Page(tmp_path / 'report.html')
+    assert '0 frames' in page.text
+    assert not page.sources
+
+
+def test_long_sequences_are_shown_from_first_to_last(tmp_path):
+    pictures = [Picture(tmp_path, str(n)) for n in range(1000)]
+    chosen = [int(picture.title) for picture in spread(pictures)]
+    assert len(chosen) == MAX_PICTURES
+    assert (chosen[0], chosen[-1]) == (0, 999)
+    assert set(np.diff(chosen)) <= {21, 22}
+    assert spread(pictures[:3]) == pictures[:3]
+
+
+def sightings(*rows):
+    return np.array([(*row, (0.0, 0.0, -1.0)) for row in rows], charts.SIGHTING)
+
+
+def test_planes_of_most_area_over_time_are_charted():
+    seen = sightings((0, 5, 1.0, 2.0), (0, 9, 4.0, 2.0), (1, 5, 1.0, 2.0), (1, 7, 3.0, 2.0))
+    assert charts.longest_seen(seen, 2).tolist() == [9, 7]
+    assert charts.longest_seen(seen, 9).tolist() == [9, 7, 5]
+
+
+def test_bars_break_where_a_plane_is_out_of_sight():
+    assert charts.runs(np.array([0, 1, 4, 5, 9])) == [(0, 1), (4, 5), (9, 9)]
+    assert charts.runs(np.arange(10)) == [(0, 9)]
+
+
+def test_charts_are_the_same_for_the_same_figures():
+    seen = sightings((0, 1, 1.0, 2.0), (1, 1, 1.0, 2.1))
+    times = np.arange(2.0)
+    assert charts.drifts(seen, times) == charts.drifts(seen, times)
+
+
+def test_replay_of_a_damaged_recording_says_so(tmp_path):
+    file = next(record_walls(tmp_path / 'bag', 16).glob('*.mcap'))
+    with file.open('r+b') as stream:
+        stream.truncate(file.stat().st_size - 100)
+    outcome = replay(tmp_path / 'bag', tmp_path / 'out')
+    page = Page(tmp_path / 'out/report.html')
+    assert outcome.damage
+    assert f'Not read to its end: {outcome.damage}' in page.text
+    assert f'{outcome.frames} frames in' in page.text
+
+
+def test_report_of_evaluate(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert not end.value.code
+
+    small = ('--width', '160', '--height', '120', '--noise', 'none')
+    run('simulate', 'kinect', '--scenes', '2', *small, '--output', 'set')
+    run('evaluate', 'set', '--jobs', '1', '--output', 'out', '--tolerance', '0.7', '0.8')
+    page = Page(tmp_path / 'out/report.html')
+    assert '2 images, method planes' in page.text
+    assert [title.split(':')[0] for title in page.titles if ' correct' in title] == [
+        '000000',
+        '000001',
+    ]
+    assert all(source.startswith('data:image/') for source in page.sources)
+    assert 'Images at tolerance 0.8' in page.text
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
+def test_a_browser_shows_the_pictures_and_enlarges_them(report, tmp_path):
+    probe = """
+    <script>
+    window.addEventListener('load', () => {
+      const press = (key) => document.dispatchEvent(new KeyboardEvent('keydown', { key }));
+      const large = () => sheet.findIndex((one) => one.classList.contains('large'));
+      const seen = [[...document.images].every((one) => one.naturalWidth > 0), large()];
+      const before = sheet[0].getBoundingClientRect().width;
+      sheet[0].click();
+      seen.push(large(), sheet[0].getBoundingClientRect().width > 3 * before);
+      press('ArrowLeft'); seen.push(large());
+      press('ArrowRight'); seen.push(large());
+      press('Escape'); seen.push(large());
+      sheet[2].click(); sheet[2].click(); seen.push(large());
+      document.title = 'seen ' + seen.join(' ');
+    });
+    </script>"""
+    copy = tmp_path / 'probe.html'
+    copy.write_text(report.read_text().replace('</body>', probe + '</body>'))
+    shown = subprocess.run(
+        [
+            CHROMIUM,
+            *('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run'),
+            *('--disable-background-networking', '--disable-component-update', '--disable-sync'),
+            f'--user-data-dir={tmp_path / "profile"}',
+            '--window-size=1200,900',
+            '--dump-dom',
+            copy.as_uri(),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert '<title>seen true -1 0 true 3 0 -1 -1</title>' in shown.stdout, shown.stderr
