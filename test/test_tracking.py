@@ -166,6 +166,15 @@ def test_surfaces_taken_for_one_come_apart_with_their_ids():
     assert surfaces(1, 2, 3) == [1, 2, 3]
 
 
+def test_two_bad_pairs_are_not_worth_more_than_a_sure_one():
+    # On one surface everything may be everything. The large part could take the id of the scrap
+    # that is gone, and leave its own to the scrap that is new.
+    tracker = Tracker()
+    left, right = (slice(0, 80), slice(0, 15)), (slice(0, 80), slice(145, 160))
+    assert ids(tracker, frame((*left, WALL), (slice(0, 80), slice(20, 140), WALL))) == [1, 2]
+    assert ids(tracker, frame((*right, WALL), (slice(0, 80), slice(26, 140), WALL))) == [3, 2]
+
+
 def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
     tracker = Tracker()
     sliver = (slice(0, 80), slice(0, 10), WALL)

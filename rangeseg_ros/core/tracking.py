@@ -32,6 +32,8 @@ _LARGEST_OFFSET, _LARGEST_ANGLE = 0.03, np.radians(5.0)
 _SMALLEST = 1e-4
 # Largest squared distance in standard deviations, of two degrees of freedom, that may match.
 _GATE = 20.0
+# Overlap that planes in reach of each other count with, beside what they have.
+_UNSEEN_OVERLAP = 0.1
 # Standard deviations of the camera's motion between two frames: radians, metres.
 _TURN, _SHIFT = np.radians(2.0), 0.03
 # Least intersection over union, and largest changes, of planes the motion is estimated from.
@@ -316,7 +318,8 @@ def _assign(
     """(N,) number of the known plane that each plane is, -1 for none."""
     between = np.linalg.norm(known.centroid[:, None] - seen.centroid, axis=2)
     near = (shared > 0) | (between < known.radius[:, None] + seen.radius)
-    affinity = _overlap(known, seen, shared) + np.exp(-distance / 8)
+    # Little without overlap, or two bad pairs would be worth more than one that is sure.
+    affinity = (_overlap(known, seen, shared) + _UNSEEN_OVERLAP) * np.exp(-distance / 8)
     affinity[~near | (distance > _GATE)] = 0
     rows, columns = linear_sum_assignment(affinity, maximize=True)
     match = np.full(len(seen.id), -1)
