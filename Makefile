@@ -14,7 +14,7 @@ demo: $(VENV)/installed
 	rm -rf demo
 	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 15 --seed 1 --output demo/simulated
 	$(BIN)/rangeseg replay demo/simulated/bag --output demo/planes
-	@echo 'Labels, overlays and planes.csv are in $(CURDIR)/demo/planes'
+	@echo 'Labels, planes, a bag and report.html are in $(CURDIR)/demo/planes'
 
 # A simulated camera at 10 Hz, the node, and a node that prints its planes, for 20 s.
 demo-ros: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST

@@ -46,8 +46,9 @@ def run_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R]:
 def run_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R]:
     """Run tasks on the workers of a Dask cluster; yields their results in order.
 
-    A task whose worker is lost is run again on another one, by Dask's `allowed-failures` up to
-    three times. Workers need this package, and the same files under the same names.
+    A task whose worker is lost is run again on another one, up to as many times as Dask's
+    `distributed.scheduler.allowed-failures` says. Workers need this package, and the same files
+    under the same names.
 
     Parameters
     ----------
@@ -60,11 +61,11 @@ def run_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R]:
     ImportError
         `distributed` is not installed.
     OSError
-        No scheduler at that address.
-    ValueError, OSError, distributed.KilledWorker
+        No scheduler at that address, or a task that has lost too many workers.
+    ValueError, OSError
         The first task's that fails; those that have not begun are dropped.
     """
-    from distributed import Client
+    from distributed import Client, KilledWorker
 
     with Client(scheduler, set_as_default=False) as client:
         # Not pure: tasks write files, so they run even where Dask knows a result of equal ones.
@@ -72,6 +73,8 @@ def run_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R]:
         try:
             for future in futures:
                 yield future.result()
+        except KilledWorker as error:
+            raise OSError(str(error)) from None
         finally:
             client.cancel(futures)
 

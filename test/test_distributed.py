@@ -10,6 +10,7 @@ import pytest
 from test_replay_bags import record_walls, replay, results
 
 from rangeseg_ros.cli.main import main
+from rangeseg_ros.parallel import run_on_cluster
 
 COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 
@@ -87,3 +88,40 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
     assert end.value.code == 2
     assert error.splitlines()[-1].startswith('rangeseg: ')
     assert not (tmp_path / 'out').exists()
+
+
+def test_without_distributed_replay_says_what_is_missing(tmp_path, monkeypatch, capsys):
+    record_walls(tmp_path / 'a', 1)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr('rangeseg_ros.cli.replay.find_spec', lambda name: None)
+    arguments = ['replay', 'a', '--output', 'out', '--scheduler', 'tcp://127.0.0.1:1']
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert capsys.readouterr().err == (
+        'rangeseg: --scheduler needs distributed: install the extra dask\n'
+    )
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_recording_that_kills_every_worker_ends_the_command(tmp_path):
+    distributed = pytest.importorskip('distributed')
+    with (
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=None,
+            local_directory=tmp_path,
+        ) as cluster,
+        pytest.raises(OSError, match='Attempted to run task'),
+    ):
+        list(run_on_cluster([Deadly()], cluster.scheduler_address))
+
+
+class Deadly:
+    """A task that no worker survives."""
+
+    def run(self):
+        os.kill(os.getpid(), signal.SIGKILL)

@@ -135,7 +135,11 @@ def test_messages_are_those_of_the_node(done):
             header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id='optical')
             for name in Replay.topics:
                 message = OUTPUTS[name].message(make_rclpy, header, image, result)
-                published.append(serialization.serialize_message(message))
+                sent = serialization.serialize_message(message)
+                # Fast CDR leaves the bytes between aligned fields undefined: write them again.
+                kind = OUTPUTS[name].kind
+                again = ROS2.serialize_cdr(ROS2.deserialize_cdr(sent, kind), kind)
+                published.append(bytes(again))
     assert written == published
 
 

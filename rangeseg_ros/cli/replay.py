@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -105,11 +106,9 @@ def _folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
 
 def _outcomes(tasks: list[Replay], jobs: int | None, scheduler: str | None) -> Iterable[Outcome]:
     if scheduler:
-        try:
-            done: Iterator[Outcome] = run_on_cluster(tasks, scheduler)
-            return options.progress(done, len(tasks), 'bag')
-        except ImportError:
-            raise click.ClickException('--scheduler needs distributed: the extra dask') from None
+        if find_spec('distributed') is None:
+            raise click.ClickException('--scheduler needs distributed: install the extra dask')
+        return options.progress(run_on_cluster(tasks, scheduler), len(tasks), 'bag')
     if len(tasks) == 1:
         return [tasks[0].run(lambda frames, total: options.progress(frames, total, 'frame'))]
     return options.progress(run_all(tasks, jobs), len(tasks), 'bag')
