@@ -222,11 +222,12 @@ def table(figures: dict[str, Any]) -> str:
 
 def scaling_table(series: dict[str, dict[str, Any]]) -> str:
     """Text of `measured` figures of several sizes of image, each with its `ratio`."""
-    lines = [f'{"size":<12}{"median ms":>12}{"p95 ms":>12}{"ratio":>8}{"peak MB":>10}']
+    head = ('median ms', 'p95 ms', 'ratio', 'cpu ms', 'peak MB')
+    lines = [f'{"size":<12}' + ''.join(f'{title:>11}' for title in head)]
     for size, figures in series.items():
         total = figures['total']
         lines.append(
-            f'{size:<12}{total["median_ms"]:>12.1f}{total["p95_ms"]:>12.1f}'
-            f'{figures["ratio"]:>8.2f}{figures["peak_memory_mb"]:>10.0f}'
+            f'{size:<12}{total["median_ms"]:>11.1f}{total["p95_ms"]:>11.1f}'
+            f'{figures["ratio"]:>11.2f}{figures["cpu_ms"]:>11.1f}{figures["peak_memory_mb"]:>11.0f}'
         )
     return '\n'.join(lines)
