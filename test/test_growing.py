@@ -7,7 +7,7 @@ from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import plane_deviation
-from rangeseg_ros.core.moments import COUNT, block_links, block_moments, fit_all, weighted
+from rangeseg_ros.core.moments import COUNT, SIZE, block_links, block_moments, fit_all, weighted
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
@@ -48,7 +48,7 @@ def covered(labels, label):
 def test_a_plane_is_one_surface(noise):
     labels, moments = grown(plane(WALL), noise)
     assert labels.shape == (30, 40) and covered(labels, 1) > 0.95
-    assert moments.shape == (2, 12)
+    assert moments.shape == (2, 13)
     assert not moments[0].any()
     np.testing.assert_allclose(fit_all(moments)[0][1], WALL, atol=3e-4)
 
@@ -126,7 +126,7 @@ def test_clutter_is_no_surface():
 
 def test_nothing_to_grow_from():
     labels, moments = surfaces(
-        np.zeros((5, 7, 12)), (np.ones((5, 6), bool), np.ones((4, 7), bool))
+        np.zeros((5, 7, 13)), (np.ones((5, 6), bool), np.ones((4, 7), bool))
     )
     assert not labels.any() and labels.shape == (5, 7)
-    assert moments.shape == (1, 12) and not moments.any()
+    assert moments.shape == (1, 13) and not moments.any()

@@ -129,6 +129,13 @@ class Config:
     range_noise: float = option(
         0.0, 'random error of the range, metres, for sensors like lasers', low=0.0, high=10.0
     )
+    pixel_noise: float = option(
+        0.6,
+        'random error of the direction of a pixel, pixels, by which surfaces seen at a grazing '
+        'angle are noisier',
+        low=0.0,
+        high=100.0,
+    )
     white_noise: float = option(
         0.33,
         'share of the random variance that is new in every pixel; the default is the '

@@ -46,7 +46,7 @@ def surfaces(
 
     Parameters
     ----------
-    moments : (rows, columns, 12) float64
+    moments : (rows, columns, 13) float64
         Of blocks, weighted; zeros for blocks to leave out.
     links : Links
         Which neighbouring blocks are connected.
@@ -55,7 +55,7 @@ def surfaces(
     -------
     labels : (rows, columns) int
         0 where no surface is, otherwise 1...K.
-    moments : (K + 1, 12) float64
+    moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
     shape = moments.shape[:2]

@@ -1,10 +1,11 @@
 """Moments that add up over pixels, blocks and regions, and the planes they determine.
 
 A plane is linear in inverse range, theta . ray = inverse with theta = -normal / distance, so its
-weighted least-squares fit needs only sums over the pixels. A moment vector holds twelve of them:
-w r r^T (upper triangle, 6), w r y (3), w y^2, the number of pixels, and the sum of the ratio of
-systematic to random variance, for rays r, inverse range y and weights w = 1 / random variance,
-so that residual sums of squares count random variances.
+weighted least-squares fit needs only sums over the pixels. A moment vector holds thirteen of
+them, for rays r, inverse range y and weights w = 1 / random variance: w r r^T (upper triangle,
+6), w r y (3), w y^2, the number of pixels, the ratio of systematic to random variance, and that
+of the variance which the slope of the surface adds to the rest of the random variance. Residual
+sums of squares thus count random variances.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensor import SensorModel
 
-SIZE = 12
-CHI2, COUNT, RATIO = 9, 10, 11
-"""Entries of a moment vector: w y^2, number of pixels, sum of the variance ratio."""
+SIZE = 13
+CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
+"""Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
 
 
 @njit(cache=True)
@@ -26,7 +27,7 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
 
     Parameters
     ----------
-    moments : (12,) float64
+    moments : (13,) float64
     theta : (3,) float64
         Receives the plane; zeros where the pixels do not determine one.
 
@@ -52,7 +53,7 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
 
 @njit(cache=True)
 def common_residual(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Weighted sum of the squared residuals of one plane for two moment vectors (12,).
+    """Weighted sum of the squared residuals of one plane for two moment vectors (13,).
 
     What `fit` returns for their sum, without memory traffic: growing spends its time here.
     """
@@ -71,7 +72,7 @@ def common_residual(first: NDArray[np.float64], second: NDArray[np.float64]) -> 
 
 @njit(cache=True)
 def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Planes (N, 3) and residual sums (N,) of moment vectors (N, 12)."""
+    """Planes (N, 3) and residual sums (N,) of moment vectors (N, 13)."""
     theta = np.zeros((len(moments), 3))
     residual = np.zeros(len(moments))
     for i in range(len(moments)):
@@ -81,7 +82,7 @@ def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
 
 @njit(cache=True)
 def add_pixel(moments: NDArray[np.float64], ray: NDArray[np.float32], y: float, w: float) -> None:
-    """Add a pixel of weight `w` to all entries of a moment vector but the variance ratio."""
+    """Add a pixel of weight `w` to all entries of a moment vector but the variance ratios."""
     x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
     moments[0] += w * x0 * x0
     moments[1] += w * x0 * x1
@@ -117,7 +118,7 @@ def block_moments(
 
     Returns
     -------
-    (ceil(H / size), ceil(W / size), 12) float64
+    (ceil(H / size), ceil(W / size), 13) float64
         Zeros for blocks that a jump edge crosses or that lack measurements in over 30 %.
     """
     height, width = inverse.shape
@@ -174,7 +175,7 @@ def residual_noise(
 
     Parameters
     ----------
-    blocks : (rows, columns, 12) float64
+    blocks : (rows, columns, 13) float64
         With unit weights.
     size : int
         Rows and columns of a block.
@@ -184,18 +185,41 @@ def residual_noise(
     return np.sqrt(complete[:, CHI2]) / size, residual / (size * size - 3)
 
 
-def weighted(blocks: NDArray[np.float64], sensor: SensorModel) -> NDArray[np.float64]:
-    """Blocks with weights according to the sensor, and the ratio of its variances.
+def slopes(blocks: NDArray[np.float64], rays: NDArray[np.float32], size: int) -> NDArray:
+    """Change of the inverse range from pixel to pixel in each block, (rows, columns), 1/m."""
+    theta, _ = fit_all(blocks.reshape(-1, SIZE))
+    rows, columns = blocks.shape[:2]
+    if min(rays.shape[:2]) < 2:
+        return np.zeros((rows, columns))
+    # The pixel in the middle of a block and its neighbours; the last block may be cut off.
+    i = np.minimum(np.arange(rows) * size + size // 2, len(rays) - 2)
+    j = np.minimum(np.arange(columns) * size + size // 2, rays.shape[1] - 2)
+    middle = rays[np.ix_(i, j)]
+    theta = theta.reshape(rows, columns, 3)
+    across = np.einsum('ijk,ijk->ij', rays[np.ix_(i, j + 1)] - middle, theta)
+    down = np.einsum('ijk,ijk->ij', rays[np.ix_(i + 1, j)] - middle, theta)
+    return np.hypot(across, down)
+
+
+def weighted(
+    blocks: NDArray[np.float64], sensor: SensorModel, slope: NDArray | float = 0.0
+) -> NDArray[np.float64]:
+    """Blocks with weights according to the sensor, and the ratios of its variances.
 
     Parameters
     ----------
-    blocks : (rows, columns, 12) float64
+    blocks : (rows, columns, 13) float64
         With unit weights.
     sensor : SensorModel
+    slope : (rows, columns) float64
+        See `slopes`.
     """
     result = blocks.copy()
     inverse = np.sqrt(blocks[..., CHI2] / np.maximum(blocks[..., COUNT], 1))
-    weight = 1 / sensor.variance(inverse)
+    level = sensor.variance(inverse)
+    tilt = (sensor.pixel_noise * slope) ** 2 / level
+    weight = 1 / (level * (1 + tilt))
     result[..., :COUNT] *= weight[..., None]
     result[..., RATIO] = blocks[..., COUNT] * sensor.systematic_variance(inverse) * weight
+    result[..., SLOPE] = blocks[..., COUNT] * tilt
     return result

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
 from rangeseg_ros.core.growing import DISTORTION_PIXELS
-from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, add_pixel, fit_all
+from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.moves import minimum_cut
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import FLOOR, SensorModel
@@ -57,7 +57,7 @@ def refine(
     problem : Problem
     surfaces : (rows, columns) int
         Surface of each block of `BLOCK` x `BLOCK` pixels, 0...K, 0 for none.
-    moments : (K + 1, 12) float64
+    moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
     exact : bool
@@ -87,7 +87,11 @@ def refine(
             pass
         if np.array_equal(labels, before):
             break
-        models = Models.of(region_moments(problem, labels, len(moments), sensor))
+        refitted = region_moments(problem, labels, len(moments), sensor)
+        refitted[:, SLOPE] = (
+            moments[:, SLOPE] * refitted[:, COUNT] / np.maximum(moments[:, COUNT], 1)
+        )
+        models = Models.of(refitted)
         cost = _costs(
             labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
         )
@@ -157,11 +161,11 @@ class Models:
 
     @classmethod
     def of(cls, moments: NDArray[np.float64]) -> Models:
-        """Planes of moment vectors (K + 1, 12)."""
+        """Planes of moment vectors (K + 1, 13)."""
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
         ratio = moments[:, RATIO] / (count + DISTORTION_PIXELS)
-        return cls(theta, 1 + _GRANTED * ratio)
+        return cls(theta, 1 + moments[:, SLOPE] / count + _GRANTED * ratio)
 
 
 def _descended(
@@ -512,7 +516,7 @@ def _expansion(
 def region_moments(
     problem: Problem, labels: NDArray[np.integer], count: int, sensor: SensorModel
 ) -> NDArray[np.float64]:
-    """Moments (count, 12) of the pixels of each label."""
+    """Moments (count, 13) of the pixels of each label."""
     return _sum_moments(
         labels,
         count,

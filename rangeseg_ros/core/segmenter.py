@@ -17,7 +17,7 @@ from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle, energy
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
-from rangeseg_ros.core.moments import block_links, block_moments, residual_noise, weighted
+from rangeseg_ros.core.moments import block_links, block_moments, residual_noise, slopes, weighted
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.planes import Plane, fit_planes
@@ -97,7 +97,9 @@ class Segmenter:
         sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, BLOCK))
         watch.lap('blocks')
         links = block_links(horizontal, vertical, BLOCK)
-        surface, moments = surfaces(weighted(blocks, sensor), links)
+        surface, moments = surfaces(
+            weighted(blocks, sensor, slopes(blocks, image.rays, BLOCK)), links
+        )
         watch.lap('surfaces')
         problem = Problem.of(image, sensor, horizontal, vertical)
         labels, models = refine(problem, surface, moments, sensor, self.config.exact)

@@ -39,6 +39,9 @@ class SensorModel:
         Smooth systematic error of the range, metres.
     distortion_length : float
         Width of the Gaussian kernel the distortion looks smoothed with, pixels.
+    pixel_noise : float
+        Random error of a pixel's direction, pixels: what surfaces seen at a grazing angle are
+        noisier by.
     """
 
     noise: float
@@ -48,6 +51,7 @@ class SensorModel:
     distortion: float
     range_distortion: float
     distortion_length: float
+    pixel_noise: float = 0.0
 
     @classmethod
     def from_config(cls, config: Config) -> SensorModel:
@@ -60,6 +64,7 @@ class SensorModel:
             config.distortion,
             config.range_distortion,
             config.distortion_length,
+            config.pixel_noise,
         )
 
     def variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
