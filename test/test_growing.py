@@ -7,7 +7,7 @@ from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import plane_deviation
-from rangeseg_ros.core.moments import COUNT, SIZE, block_links, block_moments, fit_all, weighted
+from rangeseg_ros.core.moments import COUNT, block_links, block_moments, fit_all, weighted
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
