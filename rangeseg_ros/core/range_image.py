@@ -135,14 +135,17 @@ class RangeImage:
         return points
 
 
+# Metres; what lies outside was not measured by any sensor, and its squares leave float32.
+_NEAREST, _FARTHEST = 1e-6, 1e6
+
+
 def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
-    """1 / (scale * distance) in 1/m, 0 where the distance is not finite and positive."""
+    """1 / (scale * distance) in 1/m, 0 where that is no distance from 1 um to 1000 km."""
     if distance.dtype == np.uint16:
         # One division for each of the 65536 depths there can be, not for each pixel.
-        table = np.arange(65536) * scale
-        table[0] = np.inf
-        return (1.0 / table).astype(np.float32)[distance]
+        return _reciprocal(np.arange(65536, dtype=np.float64), scale)[distance]
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
-        inverse = (1.0 / (distance.astype(np.float64) * scale)).astype(np.float32)
-    inverse[~(np.isfinite(inverse) & np.isfinite(distance) & (distance > 0))] = 0
+        metres = distance.astype(np.float64) * scale
+        inverse = (1.0 / metres).astype(np.float32)
+    inverse[~((metres >= _NEAREST) & (metres <= _FARTHEST))] = 0
     return inverse
