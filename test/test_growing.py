@@ -31,7 +31,7 @@ def grown(inverse, noise=NOISE, seed=0, **sensor):
     edges = weights(image, plane_deviation(image, Config().edge_step))
     model = SensorModel.from_config(Config(**sensor))
     blocks = weighted(block_moments(image.inverse, image.rays, *edges, 4), model)
-    return surfaces(blocks, block_links(*edges, 4))
+    return surfaces(blocks, block_links(*edges, 4), 4)
 
 
 def covered(labels, label):
@@ -126,7 +126,7 @@ def test_clutter_is_no_surface():
 
 def test_nothing_to_grow_from():
     labels, moments = surfaces(
-        np.zeros((5, 7, 13)), (np.ones((5, 6), bool), np.ones((4, 7), bool))
+        np.zeros((5, 7, 13)), (np.ones((5, 6), bool), np.ones((4, 7), bool)), 4
     )
     assert not labels.any() and labels.shape == (5, 7)
     assert moments.shape == (1, 13) and not moments.any()

@@ -12,12 +12,13 @@ from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.moments import RATIO, block_links, block_moments, weighted
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import BLOCK, Models, Problem, energy, refine, region_moments
+from rangeseg_ros.core.refinement import Models, Problem, energy, refine, region_moments
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
 NOISE = 0.002
+BLOCK = 4
 SENSOR = SensorModel.from_config(Config(noise=NOISE, distortion=0.003))
 
 
@@ -38,7 +39,7 @@ def random_case(seed, height, width, count=3):
         edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
     models = Models(theta, np.concatenate([[1.0], random.uniform(1, 4, count)]))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
-    return Problem.of(image, SENSOR, *edges), models, labels.astype(np.int32)
+    return Problem.of(image, SENSOR, *edges, BLOCK), models, labels.astype(np.int32)
 
 
 def unary(problem, models):
@@ -164,8 +165,8 @@ def small_room(seed=900):
     sensor = SensorModel.from_config(Config())
     edges = weights(image)
     blocks = block_moments(image.inverse, image.rays, *edges, BLOCK)
-    found = surfaces(weighted(blocks, sensor), block_links(*edges, BLOCK))
-    return Problem.of(image, sensor, *edges), found, sensor
+    found = surfaces(weighted(blocks, sensor), block_links(*edges, BLOCK), BLOCK)
+    return Problem.of(image, sensor, *edges, BLOCK), found, sensor
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):

@@ -66,7 +66,7 @@ class Cells(NamedTuple):
         variances : (4,) float64
             See `variances`.
         """
-        box, border = _boxes(labels, int(labels.max(initial=0)) + 1)
+        box, border = bounding_boxes(labels, int(labels.max(initial=0)) + 1)
         rows, columns = box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]
         size = np.maximum(np.ceil(np.sqrt(rows * columns / MOST)).astype(np.intp), 1)
         while (large := -(-rows // size) * -(-columns // size) > MOST).any():
@@ -117,7 +117,9 @@ def variances(sensor: SensorModel) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _boxes(labels: NDArray[np.uint16], count: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def bounding_boxes(
+    labels: NDArray[np.uint16], count: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Bounding box of each label and the number of pixel sides along its border."""
     height, width = labels.shape
     box = np.zeros((count, 4), np.intp)

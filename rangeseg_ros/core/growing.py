@@ -30,8 +30,8 @@ _CLEAR = 24.0
 # Systematic variances granted between blocks of a patch, between neighbouring patches, and
 # within a surface (4 standard deviations).
 _WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 2.0, 10.0, 30.0
-# Pixels of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels.
-_PATCH_MINIMUM, _PATCH_LARGEST = 80, 1500
+# Blocks of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
+_PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = 10.0
 
@@ -40,7 +40,7 @@ Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 def surfaces(
-    moments: NDArray[np.float64], links: Links
+    moments: NDArray[np.float64], links: Links, block: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
@@ -50,6 +50,8 @@ def surfaces(
         Of blocks, weighted; zeros for blocks to leave out.
     links : Links
         Which neighbouring blocks are connected.
+    block : int
+        Rows and columns of a block.
 
     Returns
     -------
@@ -71,8 +73,12 @@ def surfaces(
     )
     pairs = pairs[smooth[pairs].all(axis=1)]
     parent = _quads(blocks, smooth.reshape(shape), *links)
-    patch, moments = _renumbered(_grow(blocks, smooth, pairs, parent), blocks, _PATCH_MINIMUM)
-    border = _borders(patch[pairs], len(moments))
+    patch, moments = _renumbered(
+        _grow(blocks, smooth, pairs, parent, _PATCH_LARGEST * block**2),
+        blocks,
+        _PATCH_MINIMUM * block**2,
+    )
+    border = _borders(pairs, patch, len(moments))
     surface, moments = _renumbered(_join(moments, border), moments, 1)
     return surface[patch].reshape(shape), moments
 
@@ -93,12 +99,16 @@ def _renumbered(
     return labels, total
 
 
-def _borders(pairs: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+@njit(cache=True)
+def _borders(pairs: NDArray[np.intp], patch: NDArray[np.intp], count: int) -> NDArray[np.float64]:
     """Length of the border between every two patches, in blocks: (count, count), symmetric."""
-    pairs = pairs[(pairs[:, 0] != pairs[:, 1]) & (pairs > 0).all(axis=1)]
-    border = np.bincount(pairs[:, 0] * count + pairs[:, 1], minlength=count * count)
-    square: NDArray[np.float64] = border.reshape(count, count).astype(np.float64)
-    return square + square.T
+    border = np.zeros((count, count))
+    for k in range(len(pairs)):
+        a, b = patch[pairs[k, 0]], patch[pairs[k, 1]]
+        if a != b and a > 0 and b > 0:
+            border[a, b] += 1
+            border[b, a] += 1
+    return border
 
 
 @njit(cache=True)
@@ -151,8 +161,10 @@ def _grow(
     nodes: NDArray[np.bool_],
     pairs: NDArray[np.intp],
     parent: NDArray[np.intp],
+    largest: float,
 ) -> NDArray[np.intp]:
-    """Merge blocks to patches, the flattest first, each with the neighbour it fits best.
+    """Merge blocks to patches of at most `largest` pixels, the flattest first, each with the
+    neighbour it fits best.
 
     Returns the root of each block's patch, itself for a block that is no node.
     """
@@ -207,7 +219,7 @@ def _grow(
             else:
                 seen[b] = turn
                 before = e
-                if moments[a, COUNT] + moments[b, COUNT] <= _PATCH_LARGEST:
+                if moments[a, COUNT] + moments[b, COUNT] <= largest:
                     extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
                     misfit = _misfit(extra, moments[a], moments[b], _WITHIN_PATCH)
                     if misfit < best:

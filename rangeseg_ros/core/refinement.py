@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
 
+from rangeseg_ros.core.cells import bounding_boxes
 from rangeseg_ros.core.growing import DISTORTION_PIXELS
 from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.moves import minimum_cut
@@ -36,8 +36,6 @@ _STEP = 1e-6
 _REACH, _BAND = 3, 4
 
 
-BLOCK = 4
-"""Rows and columns of the blocks that surfaces are grown from."""
 _SEED = 250
 """Pixels of the smallest surface whose plane is tried."""
 _ROUNDS = 10
@@ -56,7 +54,7 @@ def refine(
     ----------
     problem : Problem
     surfaces : (rows, columns) int
-        Surface of each block of `BLOCK` x `BLOCK` pixels, 0...K, 0 for none.
+        Surface of each block, 0...K, 0 for none.
     moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
@@ -83,7 +81,7 @@ def refine(
         return labels, models
     for _ in range(_ROUNDS):
         before = labels.copy()
-        while _expand_each(labels, cost, problem, models, _REACH * BLOCK):
+        while _expand_each(labels, cost, problem, models, _REACH * problem.block):
             pass
         if np.array_equal(labels, before):
             break
@@ -110,6 +108,8 @@ class Problem:
         1 / random variance of the inverse range; 0 where nothing was measured.
     horizontal, vertical : (H, W-1), (H-1, W) float32
         Neighbourhood weights.
+    block : int
+        Rows and columns of the blocks that surfaces are grown from.
     """
 
     inverse: NDArray[np.float32]
@@ -117,6 +117,7 @@ class Problem:
     weight: NDArray[np.float32]
     horizontal: NDArray[np.float32]
     vertical: NDArray[np.float32]
+    block: int
 
     @classmethod
     def of(
@@ -125,10 +126,11 @@ class Problem:
         sensor: SensorModel,
         horizontal: NDArray[np.float32],
         vertical: NDArray[np.float32],
+        block: int,
     ) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor."""
         weight = _weights(image.inverse, sensor.noise, sensor.range_noise)
-        return cls(image.inverse, image.rays, weight, horizontal, vertical)
+        return cls(image.inverse, image.rays, weight, horizontal, vertical, block)
 
 
 @njit(cache=True)
@@ -171,12 +173,13 @@ class Models:
 def _descended(
     problem: Problem, surfaces: NDArray[np.int32], models: Models
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """A labelling that no change of a single pixel improves, and what its labels cost.
+    """A labelling that no pixel improves by a linked neighbour's label or none, and its costs.
 
     Costs in the interior of surfaces, where no label competes, are left at 0.
     """
     labels, cost = _nearest(
         surfaces,
+        problem.block,
         problem.inverse,
         problem.rays,
         problem.weight,
@@ -247,6 +250,7 @@ def _costs(
 @njit(cache=True)
 def _nearest(
     surfaces: NDArray[np.int32],
+    block: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     weight: NDArray[np.float32],
@@ -274,8 +278,8 @@ def _nearest(
                         candidates[count] = label
                         count += 1
             settled &= count == 1
-            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
-                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
+            for i in range(bi * block, min((bi + 1) * block, height)):
+                for j in range(bj * block, min((bj + 1) * block, width)):
                     if weight[i, j] == 0:
                         continue
                     if settled:
@@ -362,7 +366,7 @@ def _descend(
             if label == here or (k < 4 and links[k] == 0):
                 continue
             data = np.float32(
-                _data_cost(label, rays[i, j], inverse[i, j], weight[i, j], theta, tolerance)
+                _data_cost(int(label), rays[i, j], inverse[i, j], weight[i, j], theta, tolerance)
             )
             total = data
             for m in range(4):
@@ -391,8 +395,10 @@ def _expand_each(
 ) -> bool:
     """Expand every label once, by at most `reach` pixels; in place. Whether that helped."""
     helped = False
-    for alpha, box in enumerate(find_objects(labels, len(models.theta) - 1), 1):
-        if box is not None:
+    boxes, _ = bounding_boxes(labels, len(models.theta))
+    for alpha, (top, left, bottom, right) in enumerate(boxes[1:].tolist(), 1):
+        if bottom > top:
+            box = slice(top, bottom), slice(left, right)
             helped |= _expand(alpha, box, labels, cost, problem, models, reach)
     return helped
 

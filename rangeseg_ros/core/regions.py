@@ -43,7 +43,7 @@ def plane_regions(
             area = np.bincount(regions.ravel(), minlength=len(area))
         area = np.where(noise, 0, area)
     area[0] = 0
-    return relabel(regions, area >= config.min_pixels)
+    return _translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
 
 
 def connected_components(
@@ -199,7 +199,21 @@ def relabel(regions: NDArray[np.integer], keep: NDArray[np.bool_]) -> NDArray[np
     """Number the regions to keep 1...M by falling size, the rest 0; at most 65535 are kept."""
     area = np.where(keep, np.bincount(regions.ravel(), minlength=len(keep)), 0)
     area[0] = 0
+    return _translated(regions, by_falling_size(area))
+
+
+def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
+    """New number of each region: 1...M by falling size, 0 for size 0; at most 65535."""
     order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]
-    table = np.zeros(len(keep), np.uint16)
+    table = np.zeros(len(area), np.uint16)
     table[order] = np.arange(1, len(order) + 1)
-    return table[regions]
+    return table
+
+
+@njit(cache=True)
+def _translated(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    result = np.empty(regions.shape, np.uint16)
+    for i in range(regions.shape[0]):
+        for j in range(regions.shape[1]):
+            result[i, j] = table[regions[i, j]]
+    return result

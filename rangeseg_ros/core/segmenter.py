@@ -17,12 +17,19 @@ from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle, energy
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
-from rangeseg_ros.core.moments import block_links, block_moments, residual_noise, slopes, weighted
+from rangeseg_ros.core.moments import (
+    block_links,
+    block_moments,
+    block_size,
+    residual_noise,
+    slopes,
+    weighted,
+)
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import BLOCK, Problem, refine
+from rangeseg_ros.core.refinement import Problem, refine
 from rangeseg_ros.core.refinement import energy as plane_energy
 from rangeseg_ros.core.regions import plane_regions, relabel
 from rangeseg_ros.core.sensor import SensorModel
@@ -93,15 +100,15 @@ class Segmenter:
         watch: Stopwatch,
     ) -> tuple[NDArray[np.uint16], SensorModel, Callable[[], float]]:
         """Regions, the sensor and the energy, with planes as labels."""
-        blocks = block_moments(image.inverse, image.rays, horizontal, vertical, BLOCK)
-        sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, BLOCK))
+        size = block_size(image.shape)
+        blocks = block_moments(image.inverse, image.rays, horizontal, vertical, size)
+        sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, size))
+        slope = slopes(blocks, image.rays, size)
         watch.lap('blocks')
-        links = block_links(horizontal, vertical, BLOCK)
-        surface, moments = surfaces(
-            weighted(blocks, sensor, slopes(blocks, image.rays, BLOCK)), links
-        )
+        links = block_links(horizontal, vertical, size)
+        surface, moments = surfaces(weighted(blocks, sensor, slope), links, size)
         watch.lap('surfaces')
-        problem = Problem.of(image, sensor, horizontal, vertical)
+        problem = Problem.of(image, sensor, horizontal, vertical, size)
         labels, models = refine(problem, surface, moments, sensor, self.config.exact)
         watch.lap('labels')
         regions = plane_regions(
