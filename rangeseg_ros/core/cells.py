@@ -118,7 +118,7 @@ def variances(sensor: SensorModel) -> NDArray[np.float64]:
 
 @njit(cache=True)
 def bounding_boxes(
-    labels: NDArray[np.uint16], count: int
+    labels: NDArray[np.integer], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Bounding box of each label and the number of pixel sides along its border."""
     height, width = labels.shape
