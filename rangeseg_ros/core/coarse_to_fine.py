@@ -1,18 +1,31 @@
-"""Fast minimiser: few labels, blocks of pixels, then bands around the label boundaries."""
+"""Fast minimiser: blocks of pixels vote for few labels, then bands around the boundaries.
+
+On the coarsest level the energy of labellings that are constant on blocks is minimised (data
+costs summed over the block, weights over its borders). Finer levels start from the labelling
+above and expand each label by a few blocks, in the end pixels, around the boundaries of its
+regions, and where the normals of a block ask for a label far better than its own. On every
+level regions then move to the direction that suits all of their normals.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.energy import AngularCost
-from rangeseg_ros.core.moves import Cost, Labelling
+from rangeseg_ros.core.bands import BandLabelling, Grid
+from rangeseg_ros.core.energy import angles, mixed_angles
+from rangeseg_ros.core.moves import ROUNDING
+from rangeseg_ros.core.regions import connected_components
 
-# Width of the blocks of each level, pixels; each divides the one before.
-LEVELS = (8, 4, 1)
+# Width of the blocks of each level, pixels, each a divisor of the one before; how many blocks a
+# label may advance in a sweep; sweeps at most.
+LEVELS = ((8, 8, 2), (4, 4, 1), (2, 3, 1), (1, 2, 1))
+_TILE, _ODD, _SAVING = 8, 20.0, 400.0
+# Directions among which votes for the less popular pass to the most popular.
+_CLUSTER = 7
+# Directions around the mean normal of a region that are tried for it, and its size at most.
+_TRIED, _LARGE = 19, 3000
 
 
 def minimise(
@@ -21,15 +34,8 @@ def minimise(
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
     smoothness: float,
-    cycles: int,
 ) -> NDArray[np.intp]:
-    """Labelling of low energy, eq. 5.3 with the data cost `AngularCost`, by alpha-expansion.
-
-    Blocks vote for the directions worth trying. On the coarsest level the energy of labellings
-    that are constant on blocks is minimised (data costs summed over the block, weights over its
-    borders). Finer levels start from the labelling above, and a label is tried only where it may
-    gain: around the boundaries of its regions, and where it suits a block far better than the
-    block's label does.
+    """Labelling of low energy, eq. 5.3 with the angle to the normals as data cost (eq. 5.5).
 
     Parameters
     ----------
@@ -40,8 +46,6 @@ def minimise(
         Neighbourhood weights.
     smoothness : float
         Lambda.
-    cycles : int
-        At most so many rounds of moves on the coarsest level.
 
     Returns
     -------
@@ -50,121 +54,209 @@ def minimise(
     """
     height, width = normals.shape[:2]
     # Whole blocks only: beyond the image nothing is measured and nothing connected.
-    rows, columns = -height % LEVELS[0], -width % LEVELS[0]
+    rows, columns = -height % LEVELS[0][0], -width % LEVELS[0][0]
     normals = np.pad(normals, ((0, rows), (0, columns), (0, 0)), constant_values=np.nan)
     horizontal = np.pad(horizontal, ((0, rows), (0, columns)))
     vertical = np.pad(vertical, ((0, rows), (0, columns)))
+    labelled = directions.astype(np.float32)
 
-    candidates = _voted(normals, directions)
-    cost = AngularCost(normals, directions[candidates])
-    tables = _block_costs(cost, normals.shape[:2])
-    labels = tables[LEVELS[0]].argmin(axis=0)
-    above = None
-    for size in LEVELS:
-        table = tables.get(size)
-        labelling = Labelling(
-            labels if above is None else _enlarged(labels, above // size),
-            cost if table is None else _lookup(table),
-            *_block_weights(horizontal, vertical, size),
-            smoothness,
+    image = wanted = None
+    above = size = LEVELS[0][0]
+    for size, reach, sweeps in LEVELS:
+        grid = Grid(
+            _blocks(normals, size),
+            *_block_weights(horizontal, vertical, size, smoothness),
+            normals.shape[1] // size,
         )
-        if above is None:
-            labelling.minimise(len(candidates), cycles)
+        shape = -1, grid.width
+        if image is None:
+            image, wanted = _votes(grid.normals, labelled).reshape(shape), None
         else:
-            threshold = 2 * smoothness * size
-            for label, blocks in _windows(labelling, labels, tables[above], threshold):
-                labelling.expand(label, np.flatnonzero(_enlarged(blocks, above // size)))
-        labels, above = labelling.image, size
-    return candidates[labels[:height, :width]]
+            image = image.repeat(above // size, axis=0).repeat(above // size, axis=1)
+        labelling = BandLabelling(image.ravel(), grid, labelled)
+        if size < above:
+            wanted = _wanted(
+                labelling.data, grid.normals, grid.width, labelled, _TILE // size, _ODD, _SAVING
+            )
+        for _ in range(sweeps):
+            helped = labelling.sweep(reach, wanted)
+            _turn(labelling, labelled, max(1, _LARGE // size**2))
+            if not helped:
+                break
+        image = labelling.labels.reshape(shape)
+        above = size
+    return image[:height, :width].astype(np.intp)
 
 
-def _voted(normals: NDArray[np.float32], directions: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Directions nearest to the mean normal of some block, at least one."""
-    total = _block_sum(np.nan_to_num(normals), LEVELS[0]).reshape(-1, 3)
-    nearest = np.argmax(total @ directions.astype(np.float32).T, axis=1)
-    voted = np.unique(nearest[total.any(axis=1)])
-    return voted if voted.size else np.zeros(1, np.intp)
+def _votes(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
+    """Direction nearest to the mean normal of each block (n,), or the most popular beside it."""
+    total = _sum(normals)
+    nearest = np.argmax(total @ directions.T, axis=1)
+    counts = np.bincount(nearest[total.any(axis=1)], minlength=len(directions))
+    beside = directions @ directions.T >= 1 - _CLUSTER / len(directions)
+    np.fill_diagonal(beside, True)
+    return np.where(beside, counts, -1).argmax(axis=1).astype(np.int32)[nearest]
 
 
-def _block_costs(cost: AngularCost, shape: tuple[int, int]) -> dict[int, NDArray[np.float32]]:
-    """Data costs of all labels summed over the blocks, (K, h, w), for every level but the last."""
-    tables = {
-        size: np.empty((cost.count, shape[0] // size, shape[1] // size), np.float32)
-        for size in LEVELS[:-1]
-    }
-    for label in range(cost.count):
-        image, width = cost(label).reshape(shape), 1
-        for size in reversed(LEVELS[:-1]):
-            image, width = _block_sum(image, size // width), size
-            tables[size][label] = image
-    return tables
+@njit(cache=True)
+def _wanted(
+    data: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    width: int,
+    directions: NDArray[np.float32],
+    tile: int,
+    odd: float,
+    saving: float,
+) -> NDArray[np.int32]:
+    """Direction of the sites of a tile that their label suits badly, where all save much by it.
 
-
-def _lookup(table: NDArray[np.float32]) -> Cost:
-    """Data cost of blocks from their table (K, h, w)."""
-
-    def cost(label: int, blocks: NDArray[np.intp] | None = None) -> NDArray[np.float32]:
-        costs = table[label].ravel()
-        return costs if blocks is None else costs.take(blocks)
-
-    return cost
-
-
-def _block_sum(image: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Sums over blocks of size x size pixels of an image (H, W) or (H, W, C)."""
-    shape = image.shape[1] // size, image.shape[0] // size
-    return cv2.resize(image, shape, interpolation=cv2.INTER_AREA) * np.float32(size * size)
-
-
-def _block_weights(
-    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], size: int
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Weights between neighbouring blocks: sums over the edges that cross their border."""
-    height, width = len(horizontal), vertical.shape[1]
-    across = np.add.reduceat(horizontal[:, size - 1 :: size], np.arange(0, height, size), axis=0)
-    down = np.add.reduceat(vertical[size - 1 :: size], np.arange(0, width, size), axis=1)
-    return across, down
-
-
-def _enlarged(blocks: NDArray, ratio: int) -> NDArray:
-    """Image of which every pixel becomes ratio x ratio pixels."""
-    return blocks.repeat(ratio, axis=0).repeat(ratio, axis=1)
-
-
-def _windows(
-    labelling: Labelling,
-    above: NDArray[np.integer],
-    table: NDArray[np.float32],
-    threshold: float,
-) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """Labels with the blocks where they may lower the energy of the next finer level.
-
-    Parameters
-    ----------
-    labelling : Labelling
-        Of the finer level.
-    above : (h, w) int
-        Labelling of the blocks.
-    table : (K, h, w) float32
-        Data costs of the blocks.
-    threshold : float
-        What the sites of a block that suit a label better must save together.
-
-    Yields
-    ------
-    label : int
-    blocks : (h, w) bool
-        At the boundaries of the label's regions, and wherever it would save more than the
-        threshold, a block around included.
+    -1 elsewhere.
     """
-    kernel = np.ones((3, 3), np.uint8)
-    drawn = above.astype(np.float32)
-    boundary = cv2.dilate(drawn, kernel) != cv2.erode(drawn, kernel)
-    saved = np.take_along_axis(table, above[None], 0)[0] - table.min(axis=0)
-    best = table.argmin(axis=0)[saved > threshold]
-    ratio = len(labelling.image) // len(above)
-    for label in np.unique(np.append(above, best)):
-        around = cv2.dilate((above == label).astype(np.uint8), kernel) > 0
-        gain = np.maximum(labelling.data - labelling.cost(int(label)), 0)
-        suited = _block_sum(gain.reshape(labelling.image.shape), ratio) > threshold
-        yield int(label), (around & boundary) | (cv2.dilate(suited.astype(np.uint8), kernel) > 0)
+    pixels = normals.shape[2]
+    wanted = np.full(len(data), -1, np.int32)
+    sites = np.empty(tile * tile, np.int32)
+    for i0 in range(0, len(data) // width, tile):
+        for j0 in range(0, width, tile):
+            count = 0
+            x, y, z = np.float32(0), np.float32(0), np.float32(0)
+            for i in range(i0, i0 + tile):
+                for j in range(j0, j0 + tile):
+                    p = i * width + j
+                    if data[p] > odd * pixels:
+                        sites[count] = p
+                        count += 1
+                        for k in range(pixels):
+                            if normals[p, 0, k] == normals[p, 0, k]:
+                                x += normals[p, 0, k]
+                                y += normals[p, 1, k]
+                                z += normals[p, 2, k]
+            total = np.float32(0)
+            for k in range(count):
+                total += data[sites[k]]
+            if total <= saving:
+                continue
+            best, most = 0, np.float32(-1e30)
+            for d in range(len(directions)):
+                along = x * directions[d, 0] + y * directions[d, 1] + z * directions[d, 2]
+                if along > most:
+                    best, most = d, along
+            each = angles(sites[:count], normals, directions[best])
+            saved = np.float32(0)
+            for k in range(count):
+                saved += max(data[sites[k]] - each[k], np.float32(0))
+            if saved > saving:
+                for k in range(count):
+                    if data[sites[k]] > each[k]:
+                        wanted[sites[k]] = best
+    return wanted
+
+
+@njit(cache=True)
+def _blocks(normals: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Normals (H, W, 3) by blocks (n, 3, size * size)."""
+    rows, columns = normals.shape[0] // size, normals.shape[1] // size
+    blocks = np.empty((rows * columns, 3, size * size), np.float32)
+    for i in range(rows * size):
+        for j in range(columns * size):
+            block = blocks[i // size * columns + j // size]
+            for c in range(3):
+                block[c, i % size * size + j % size] = normals[i, j, c]
+    return blocks
+
+
+@njit(cache=True)
+def _sum(normals: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums (n, 3) of the normals of each block."""
+    total = np.zeros((len(normals), 3), np.float32)
+    for p in range(len(normals)):
+        for c in range(3):
+            for k in range(normals.shape[2]):
+                x = normals[p, c, k]
+                if x == x:
+                    total[p, c] += x
+    return total
+
+
+@njit(cache=True)
+def _block_weights(
+    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], size: int, smoothness: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Prior between each block and the next in its row, its column: sums over their border."""
+    rows, columns = len(horizontal) // size, vertical.shape[1] // size
+    right = np.zeros(rows * columns, np.float32)
+    down = np.zeros(rows * columns, np.float32)
+    for i in range(rows * size):
+        for j in range(columns - 1):
+            right[i // size * columns + j] += smoothness * horizontal[i, (j + 1) * size - 1]
+    for i in range(rows - 1):
+        for j in range(columns * size):
+            down[i * columns + j // size] += smoothness * vertical[(i + 1) * size - 1, j]
+    return right, down
+
+
+def _turn(labelling: BandLabelling, directions: NDArray[np.float32], largest: int) -> None:
+    """Give every region up to a size the direction that suits its normals best."""
+    grid = labelling.grid
+    shape = -1, grid.width
+    regions = connected_components(
+        labelling.labels.reshape(shape),
+        grid.right.reshape(shape)[:, :-1],
+        grid.down.reshape(shape)[:-1],
+    )
+    _turn_regions(
+        regions.ravel(),
+        labelling.labels,
+        labelling.data,
+        grid.normals,
+        directions,
+        1 - _TRIED / len(directions),
+        largest,
+    )
+
+
+@njit(cache=True)
+def _turn_regions(
+    regions: NDArray[np.int32],
+    labels: NDArray[np.int32],
+    data: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    cosine: float,
+    largest: int,
+) -> None:
+    """In place; directions within the angle of the cosine to the mean normal are tried."""
+    start = np.zeros(regions.max() + 2, np.int64)
+    for p in range(len(regions)):
+        start[regions[p] + 1] += 1
+    start = np.cumsum(start)
+    last = start[:-1].copy()
+    order = np.empty(len(regions), np.int32)
+    for p in range(len(regions)):
+        order[last[regions[p]]] = p
+        last[regions[p]] += 1
+    for r in range(len(start) - 1):
+        sites = order[start[r] : start[r + 1]]
+        if len(sites) == 0:
+            continue
+        sample = sites[:: 1 + len(sites) // largest]
+        x, y, z, cost = 0.0, 0.0, 0.0, 0.0
+        for p in sample:
+            cost += data[p]
+            for k in range(normals.shape[2]):
+                if normals[p, 0, k] == normals[p, 0, k]:
+                    x += normals[p, 0, k]
+                    y += normals[p, 1, k]
+                    z += normals[p, 2, k]
+        limit = cosine * np.sqrt(x * x + y * y + z * z)
+        best = label = labels[sites[0]]
+        for d in range(len(directions)):
+            along = x * directions[d, 0] + y * directions[d, 1] + z * directions[d, 2]
+            if d == label or along <= limit:
+                continue
+            total = 0.0
+            for value in angles(sample, normals, directions[d]):
+                total += value
+            if total < cost - ROUNDING:
+                best, cost = d, total
+        if best != label:
+            labels[sites], data[sites] = best, angles(sites, normals, directions[best])

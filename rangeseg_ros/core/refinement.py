@@ -33,7 +33,7 @@ _GRANTED = 2.0
 # An improvement smaller than this is rounding.
 _STEP = 1e-6
 # Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
-_REACH, _BAND = 3, 4
+_REACH, _BAND = 2, 3
 
 
 _SEED = 250

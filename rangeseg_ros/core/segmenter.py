@@ -133,7 +133,7 @@ class Segmenter:
         if config.exact:
             labels = moves.minimise(*problem, config.cycles, config.moves)
         else:
-            labels = coarse_to_fine.minimise(*problem, config.cycles)
+            labels = coarse_to_fine.minimise(*problem)
         watch.lap('labels')
         regions = plane_regions(labels, image.valid, horizontal, vertical, config)
         watch.lap('regions')

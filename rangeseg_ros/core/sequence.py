@@ -27,9 +27,18 @@ class SequenceSegmenter:
     """
 
     def __init__(self, config: Config | None = None) -> None:
-        self.config = config or Config()
-        self._segmenter = Segmenter(self.config)
-        self._tracker = Tracker(self.config)
+        self._segmenter = Segmenter(config)
+        self._tracker = Tracker(config)
+
+    @property
+    def config(self) -> Config:
+        """Parameters; new ones count from the next frame on, and the planes keep their ids."""
+        return self._segmenter.config
+
+    @config.setter
+    def config(self, config: Config) -> None:
+        self._segmenter = Segmenter(config)
+        self._tracker.config = config
 
     def warm_up(self) -> None:
         """Have the functions of the core compiled, or loaded, before the first frame."""
