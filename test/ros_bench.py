@@ -20,7 +20,14 @@ from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros.simulation.kinect import kinect_camera
 
-TYPES = {'labels': Image, 'planes': PointCloud2, 'markers': MarkerArray, 'overlay': Image}
+TYPES = {
+    'labels': Image,
+    'planes': PointCloud2,
+    'markers': MarkerArray,
+    'overlay': Image,
+    'ground': PointCloud2,
+    'obstacles': PointCloud2,
+}
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
 from rangeseg_ros import CameraError, RangeImage, Segmentation, planes_from_message
+from rangeseg_ros.core.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.ros.clouds import CloudError, planes_message, points_from_message
 from rangeseg_ros.ros.markers import ARROW_LENGTH, markers_message
@@ -48,6 +49,7 @@ def plane(label, hull=SQUARE, holes=()):
         label=label,
         id=label + 100,
         surface=label,
+        role=('other', 'floor', 'wall')[label % 3],
         normal=np.array([0.0, 0.0, -1.0]),
         distance=2.0,
         covariance=np.arange(16.0).reshape(4, 4),
@@ -148,8 +150,14 @@ def test_planes_read_back_as_they_were():
     np.testing.assert_array_equal(planes['x'], [0.25, 0.5])
     np.testing.assert_array_equal(planes['normal_z'], [-1, -1])
     np.testing.assert_array_equal(planes['distance'], [2, 2])
-    np.testing.assert_array_equal(planes['covariance'], [np.arange(16)] * 2)
+    covariance = {
+        f'covariance_{row}{column}': 4 * i + j
+        for i, row in enumerate('xyzd')
+        for j, column in enumerate('xyzd')
+        if i <= j
+    }
     np.testing.assert_array_equal(planes['surface'], [1, 2])
+    assert [ROLES[number] for number in planes['role']] == ['floor', 'wall']
     np.testing.assert_array_equal(planes['confidence'], np.float32([0.9, 0.9]))
     for column, value in {
         'length': 2,
@@ -157,6 +165,7 @@ def test_planes_read_back_as_they_were():
         'centre_y': 0.25,
         'orientation_x': 1,
         'orientation_w': 0,
+        **covariance,
     }.items():
         np.testing.assert_array_equal(planes[column], [value, value])
 
@@ -217,7 +226,7 @@ def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
     assert no_hull.points == []
     start, tip = ((p.x, p.y, p.z) for p in normal.points)
     np.testing.assert_allclose(np.subtract(tip, start), (0, 0, -ARROW_LENGTH), atol=1e-12)
-    assert number.text == '101'
+    assert number.text == '101 floor'
     rgb = np.array([hull.color.r, hull.color.g, hull.color.b]) * 255
     np.testing.assert_allclose(rgb, colours([101])[0])
 
@@ -231,6 +240,9 @@ def test_concave_hull_with_a_hole_is_filled_and_no_more():
     triangles = corners_of(message.markers[1])
     assert area_of(triangles) == pytest.approx(9 - 2 - 0.25)
     np.testing.assert_allclose(triangles[..., 2], 2.0, atol=1e-12)
+    # Counter-clockwise seen from the sensor, so that normals point towards it.
+    first, second, third = np.moveaxis(triangles, 1, 0)
+    assert (np.cross(second - first, third - first)[:, 2] < 0).all()
     centres = triangles.mean(axis=1)
     notch = (centres[:, 0] > 1) & (centres[:, 0] < 2) & (centres[:, 1] < 2)
     inside = (abs(centres[:, 0] - 0.5) < 0.25) & (abs(centres[:, 1] - 1.25) < 0.25)

@@ -1,14 +1,16 @@
-"""Point clouds of messages: organised clouds in, `~/planes` out and back."""
+"""Point clouds of messages: organised clouds in, points out, `~/planes` out and back."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.core.roles import ROLES
 from rangeseg_ros.ros.messages import Make
 
 # One row of `~/planes`: the fields of a Plane.
@@ -24,6 +26,7 @@ PLANE_TYPE = np.dtype(
         ('label', '<u4'),
         ('id', '<u4'),
         ('surface', '<u4'),
+        ('role', '<u4'),
         ('count', '<u4'),
         ('rms', '<f4'),
         ('confidence', '<f4'),
@@ -37,9 +40,11 @@ PLANE_TYPE = np.dtype(
         ('orientation_y', '<f4'),
         ('orientation_z', '<f4'),
         ('orientation_w', '<f4'),
-        ('covariance', '<f4', 16),
+        *((f'covariance_{i}{j}', '<f4') for i, j in combinations_with_replacement('xyzd', 2)),
     ]
 )
+
+_POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
 
 # sensor_msgs/PointField: datatype -> numpy.
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -80,11 +85,12 @@ def planes_from_message(cloud: Any) -> NDArray[np.void]:
     (N,) structured array, one row per plane, with the columns of `PLANE_TYPE`: `x`, `y`, `z`
     (centroid, metres), `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance`
     (metres: normal . p + distance = 0), `label`, `id`, `surface` (the same for parts of one plane
-    seen apart), `count` (pixels), `rms` (metres), `confidence` (0...1), `area` (square metres),
-    `length`, `width`, `centre_x`, `centre_y`, `centre_z` (of the rectangle around the region,
-    metres), `orientation_x`, `orientation_y`, `orientation_z`, `orientation_w` (quaternion of the
-    frame with x along the length and z along the normal), `covariance` ((N, 16): of normal and
-    distance, 4x4 row by row).
+    seen apart), `role` (index in `roles.ROLES`, 1 is floor), `count` (pixels), `rms` (metres),
+    `confidence` (0...1), `area` (square metres), `length`, `width`, `centre_x`, `centre_y`,
+    `centre_z` (of the rectangle around the region, metres), `orientation_x`, `orientation_y`,
+    `orientation_z`, `orientation_w` (quaternion of the frame with x along the length and z along
+    the normal), `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of the 4x4
+    covariance of normal x, y, z and distance d).
 
     Raises
     ------
@@ -139,6 +145,7 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 plane.label,
                 plane.id,
                 plane.surface,
+                ROLES.index(plane.role or 'other'),
                 plane.count,
                 plane.rms,
                 plane.confidence,
@@ -146,23 +153,34 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 *plane.extents,
                 *plane.centre,
                 *plane.orientation,
-                plane.covariance.ravel(),
+                *plane.covariance[np.triu_indices(4)],
             )
             for plane in planes
         ],
         PLANE_TYPE,
     )
+    return _cloud(make, header, rows)
+
+
+def points_message(make: Make, header: Any, points: NDArray[np.floating]) -> Any:
+    """sensor_msgs/PointCloud2 of points (N, 3), metres."""
+    rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
+    return _cloud(make, header, rows)
+
+
+def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:
+    """sensor_msgs/PointCloud2 of one row, a point for each of the records (N,)."""
     datatypes = {kind: number for number, kind in _POINT_FIELD_TYPES.items()}
     fields = []
-    for name in PLANE_TYPE.names or ():
-        column, offset = PLANE_TYPE.fields[name][:2]  # type: ignore[index]
+    for name in rows.dtype.names or ():
+        column, offset = rows.dtype.fields[name][:2]  # type: ignore[index]
         fields.append(
             make(
                 'sensor_msgs/msg/PointField',
                 name=name,
                 offset=offset,
-                datatype=datatypes[column.base.str[1:]],
-                count=int(np.prod(column.shape)),
+                datatype=datatypes[column.str[1:]],
+                count=1,
             )
         )
     return make(
@@ -172,7 +190,7 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
         width=rows.size,
         fields=fields,
         is_bigendian=False,
-        point_step=PLANE_TYPE.itemsize,
+        point_step=rows.dtype.itemsize,
         row_step=rows.nbytes,
         data=rows.view(np.uint8),
         is_dense=True,

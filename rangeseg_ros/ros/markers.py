@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
+from shapely.geometry.polygon import orient
 
 from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.drawing import colours
@@ -23,10 +24,11 @@ ARROW_LENGTH = 0.2
 
 
 def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
-    """visualization_msgs/MarkerArray: the hulls, normals and ids of `planes`, and no older ones.
+    """visualization_msgs/MarkerArray: hulls, normals and names of `planes`, no older ones.
 
-    Namespaces `hulls`, `normals` and `ids`; a marker's id is the plane's, its colour that of
-    the overlay.
+    Namespaces `hulls`, `normals` and `ids`, whose texts are id and role; a marker's id is the
+    plane's, its colour that of the overlay. Every three points of a hull are a triangle,
+    counter-clockwise seen from the sensor.
     """
     markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
     for plane, colour in zip(planes, colours([plane.id for plane in planes]) / 255, strict=True):
@@ -65,7 +67,7 @@ def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 scale=(0.0, 0.0, 0.12),
                 colour=(1.0, 1.0, 1.0, 1.0),
                 position=_points(make, (tip,))[0],
-                text=str(plane.id),
+                text=f'{plane.id} {plane.role}'.strip(),
             )
         )
     return make('visualization_msgs/msg/MarkerArray', markers=markers)
@@ -80,12 +82,13 @@ def _triangles(plane: Plane) -> NDArray[np.float64]:
     """Corners (3 M, 3) of triangles that make up the hull of `plane` without its holes."""
     if len(plane.hull) < 3:
         return np.empty((0, 3))
-    axes = np.linalg.svd(plane.normal[None])[2][1:]
+    across = np.linalg.svd(plane.normal[None])[2][1]
+    axes = np.stack([across, np.cross(plane.normal, across)])
     outline, *holes = ((ring - plane.centroid) @ axes.T for ring in (plane.hull, *plane.holes))
     polygon = shapely.make_valid(shapely.Polygon(outline, holes))
     # No corner lies inside a Delaunay triangle, so sides only cut across: the parts are convex.
     parts = shapely.intersection(shapely.get_parts(shapely.delaunay_triangles(polygon)), polygon)
-    rings = [part.exterior.coords[:-1] for part in shapely.get_parts(parts) if part.area > 0]
+    rings = [orient(part).exterior.coords[:-1] for part in shapely.get_parts(parts) if part.area]
     corners = [
         corner
         for first, *others in rings

@@ -11,7 +11,6 @@ from contextlib import suppress
 from itertools import pairwise
 from threading import Thread
 
-import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.event_handler import PublisherEventCallbacks
@@ -21,12 +20,11 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.time import Time
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import ConfigError
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
+from rangeseg_ros.ros.gravity import Gravity
 from rangeseg_ros.ros.latest import Latest
 from rangeseg_ros.ros.messages import make_rclpy, message_class
 from rangeseg_ros.ros.outputs import OUTPUTS
@@ -43,8 +41,9 @@ class SegmentPlanes(Node):
     def __init__(self) -> None:
         super().__init__('segment_planes')
         self._config = bind(self, self._configure)
-        self._segmenter = Segmenter(self._config)
+        self._sequence = SequenceSegmenter(self._config)
         self._input: DepthInput | None = None
+        self._gravity: Gravity | None = None
         self._frames: Latest[DepthFrame] = Latest()
         self._statistics = FrameStatistics()
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
@@ -71,12 +70,10 @@ class SegmentPlanes(Node):
         return not self._worker.is_alive()
 
     def _configure(self, config: NodeConfig) -> None:
-        restart = config.input != self._config.input
+        restart = (config.input, config.use_imu) != (self._config.input, self._config.use_imu)
         self._config = config
-        self._segmenter = Segmenter(config)
         if restart and self._input:
-            self._input.destroy()
-            self._input = None
+            self._unsubscribe()
             self._follow_demand()
 
     def _follow_demand(self) -> None:
@@ -85,10 +82,16 @@ class SegmentPlanes(Node):
         if listeners and self._input is None:
             lost = self._statistics.lost.add
             self._input = DepthInput(self, self._config.input, self._accept, lost)
+            self._gravity = Gravity(self) if self._config.use_imu else None
             self._statistics.problem = ''
         elif not listeners and self._input:
-            self._input.destroy()
-            self._input = None
+            self._unsubscribe()
+
+    def _unsubscribe(self) -> None:
+        for subscribed in (self._input, self._gravity):
+            if subscribed:
+                subscribed.destroy()
+        self._input = self._gravity = None
 
     def _accept(self, frame: DepthFrame) -> None:
         self._statistics.received.add()
@@ -96,7 +99,9 @@ class SegmentPlanes(Node):
             self._statistics.dropped.add()
 
     def _work(self) -> None:
-        self._warm_up()
+        # What goes wrong here will again on the first frame, which is where it is reported.
+        with suppress(Exception):
+            self._sequence.warm_up()
         while frame := self._frames.take():
             try:
                 self._segment(frame)
@@ -110,22 +115,19 @@ class SegmentPlanes(Node):
                 self._refuse(f'{type(error).__name__}: {error}')
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
 
-    def _warm_up(self) -> None:
-        """Have the core's functions compiled, or loaded, before the first frame needs them."""
-        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        wall = RangeImage.from_depth(np.full(camera.shape, 1000, np.uint16), camera)
-        # What goes wrong here will again on the first frame, which is where it is reported.
-        with suppress(Exception):
-            self._segmenter.segment(wall)
-
     def _segment(self, frame: DepthFrame) -> None:
         ticks = [time.perf_counter()]
         start = self.get_clock().now().nanoseconds
+        header = frame.message.header
         image = frame.range_image()
         ticks.append(time.perf_counter())
-        result = self._segmenter.segment(image)
+        # Here and not where parameters change, so that one frame is of one configuration.
+        if (config := self._config) is not self._sequence.config:
+            self._sequence.config = config
+        gravity = self._gravity
+        up = gravity.up(header.frame_id) if gravity else None
+        result = self._sequence.segment(image, Time.from_msg(header.stamp).nanoseconds, up)
         ticks.append(time.perf_counter())
-        header = frame.message.header
         for name, output in OUTPUTS.items():
             publisher = self._outputs[name]
             if publisher.get_subscription_count():
@@ -153,6 +155,8 @@ class SegmentPlanes(Node):
         """Once a second: follow the publishers, report."""
         if self._input:
             self._input.follow_publishers()
+        if self._gravity:
+            self._gravity.follow_publishers()
         name = self.get_fully_qualified_name().lstrip('/')
         status = self._statistics.status(name, self._input, self._config.stall_timeout)
         report = DiagnosticArray(status=[status])

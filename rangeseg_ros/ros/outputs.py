@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.ros.clouds import planes_message
+from rangeseg_ros.ros.clouds import planes_message, points_message
 from rangeseg_ros.ros.markers import markers_message
 from rangeseg_ros.ros.messages import Make, image_message
 
@@ -47,9 +50,26 @@ def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -
     return image_message(make, header, picture, 'rgb8')
 
 
+def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return points_message(make, header, image.points[_on_floor(result)])
+
+
+def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return points_message(make, header, image.points[image.valid & ~_on_floor(result)])
+
+
+def _on_floor(result: Segmentation) -> NDArray[np.bool_]:
+    """(H, W) True where a plane is the floor, or a part of it."""
+    return np.isin(
+        result.labels, [plane.label for plane in result.planes if plane.role == 'floor']
+    )
+
+
 OUTPUTS = {
     'labels': Output('sensor_msgs/msg/Image', _labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
     'markers': Output('visualization_msgs/msg/MarkerArray', _markers),
     'overlay': Output('sensor_msgs/msg/Image', _overlay),
+    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
+    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
 }

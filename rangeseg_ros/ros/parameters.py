@@ -28,6 +28,11 @@ class NodeConfig(Config):
         'organised clouds (points)',
         choices=('image', 'compressed_depth', 'points'),
     )
+    use_imu: bool = option(
+        False,
+        'take up from the accelerometer on the topic imu, once there is one in the frame of the '
+        'images, instead of up_x, up_y, up_z',
+    )
     stall_timeout: float = option(
         2.0,
         'seconds without a depth image, while somebody listens, that /diagnostics calls an error',

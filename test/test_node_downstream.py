@@ -1,0 +1,218 @@
+"""What other nodes build on, over real DDS: ids, roles, ground and obstacles, gravity."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+
+from ros_bench import FRAME, Bench
+from sensor_msgs.msg import Imu
+
+from rangeseg_ros import RangeImage, planes_from_message
+from rangeseg_ros.core.roles import ROLES
+from rangeseg_ros.ros.clouds import points_from_message
+from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
+
+HEIGHT, WALL = 0.8, 3.0
+GRAVITY = 9.81
+
+
+@pytest.fixture(scope='module')
+def node():
+    with Bench() as bench:
+        yield bench
+
+
+@pytest.fixture
+def bench(node):
+    """The node with a listener for labels and planes and a reliable camera."""
+    with node.listening('labels', 'planes'), node.camera_on():
+        yield node
+
+
+def room(camera, wall=WALL):
+    """Depth, millimetres, of a floor 0.8 m below a level camera, and of a wall."""
+    down = camera.rays[..., 1]
+    with np.errstate(divide='ignore'):
+        floor = np.where(down > 0, HEIGHT / down, np.inf)
+    return np.round(1000 * np.minimum(floor, wall)).astype(np.uint16)
+
+
+def planes_of(bench, depth):
+    """Planes that the node finds in an image, by their roles, and the image's message."""
+    image = bench.image(depth)
+    bench.segment(image)
+    message = bench.until(lambda: bench.find('planes', image))
+    planes = planes_from_message(message)
+    roles = [ROLES[number] for number in planes['role']]
+    # One plane for each role that is found.
+    assert len(set(roles)) == len(roles)
+    return dict(zip(roles, planes, strict=True)), image
+
+
+def test_the_floor_is_named_and_ids_persist(bench):
+    first, _ = planes_of(bench, room(bench.camera))
+    assert set(first) == {'floor', 'wall'}
+    floor = first['floor']
+    np.testing.assert_allclose([floor[f'normal_{axis}'] for axis in 'xyz'], (0, -1, 0), atol=3e-3)
+    assert floor['distance'] == pytest.approx(HEIGHT, abs=3e-3)
+    ids = {role: plane['id'] for role, plane in first.items()}
+    # The camera approaches the wall; then somebody stands in front of it all; then leaves.
+    for wall in (2.98, 2.96):
+        moved, _ = planes_of(bench, room(bench.camera, wall))
+        assert {role: plane['id'] for role, plane in moved.items()} == ids
+        assert moved['wall']['distance'] == pytest.approx(wall, abs=3e-3)
+    nothing, _ = planes_of(bench, np.zeros(bench.camera.shape, np.uint16))
+    assert not nothing
+    again, _ = planes_of(bench, room(bench.camera, 2.96))
+    assert {role: plane['id'] for role, plane in again.items()} == ids
+
+
+def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench):
+    before, _ = planes_of(bench, room(bench.camera))
+    pixels = before['wall']['count']
+    # From the next frame on the wall is too small, and one frame later it is not.
+    small = int(min(plane['count'] for plane in before.values()))
+    larger = max(before, key=lambda role: before[role]['count'])
+    assert bench.set_parameters(min_pixels=small + 1)[0].successful
+    between, _ = planes_of(bench, room(bench.camera))
+    assert {role: plane['id'] for role, plane in between.items()} == {larger: before[larger]['id']}
+    assert bench.set_parameters(min_pixels=500)[0].successful
+    after, _ = planes_of(bench, room(bench.camera))
+    assert {role: plane['id'] for role, plane in after.items()} == {
+        role: plane['id'] for role, plane in before.items()
+    }
+    assert after['wall']['count'] == pixels
+    # A looped recording: known planes are others.
+    early = bench.image(room(bench.camera))
+    early.header.stamp.sec -= 100
+    bench.segment(early)
+    planes = planes_from_message(bench.until(lambda: bench.find('planes', early)))
+    assert len(planes) == 2 and min(planes['id']) > max(plane['id'] for plane in after.values())
+
+
+def test_the_rows_of_a_plane_are_one_frame_and_one_covariance(bench):
+    """The quaternion turns z to the normal; normal and distance vary as they can."""
+    planes, _ = planes_of(bench, room(bench.camera))
+    for plane in planes.values():
+        x, y, z, w = (plane[f'orientation_{axis}'] for axis in 'xyzw')
+        turned = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
+        normal = [plane[f'normal_{axis}'] for axis in 'xyz']
+        np.testing.assert_allclose(turned, normal, atol=1e-5)
+        centre = [plane[f'centre_{axis}'] for axis in 'xyz']
+        assert np.dot(normal, centre) + plane['distance'] == pytest.approx(0, abs=1e-4)
+        assert plane['length'] >= plane['width'] > 0.5
+        covariance = np.zeros((4, 4))
+        for i, row in enumerate('xyzd'):
+            for j, column in enumerate('xyzd'[i:], i):
+                covariance[i, j] = covariance[j, i] = plane[f'covariance_{row}{column}']
+        variances = np.linalg.eigvalsh(covariance)
+        # The normal stays a unit vector: of four directions, one does not vary.
+        assert variances[1] > 0 and abs(variances[0]) < 1e-3 * variances[1]
+        assert covariance[:3] @ [*normal, 0] == pytest.approx(0, abs=1e-6 * variances[3] + 1e-9)
+
+
+def test_ground_and_obstacles_share_out_the_points(bench):
+    depth = room(bench.camera)
+    depth[:, :3] = 0
+    with bench.listening('ground', 'obstacles'):
+        planes, image = planes_of(bench, depth)
+        ground, obstacles = (
+            bench.until(lambda name=name: bench.find(name, image))
+            for name in ('ground', 'obstacles')
+        )
+    points = RangeImage.from_depth(depth, bench.camera).points
+    on_floor = bench.labels_of(image) == planes['floor']['label']
+    for cloud, where in ((ground, on_floor), (obstacles, (depth > 0) & ~on_floor)):
+        assert cloud.header == image.header
+        assert (cloud.height, cloud.point_step, cloud.is_dense) == (1, 12, True)
+        assert [field.name for field in cloud.fields] == ['x', 'y', 'z']
+        # One row is not organised; as a column it can be read like one that is.
+        cloud.height, cloud.width, cloud.row_step = cloud.width, 1, 12
+        np.testing.assert_array_equal(points_from_message(cloud)[:, 0], points[where])
+    assert np.percentile(abs(points[on_floor][:, 1] - HEIGHT), 99) < 0.01
+    assert 1000 < on_floor.sum() < (depth > 0).sum() - 1000
+
+
+def test_without_a_floor_all_are_obstacles(bench):
+    with bench.listening('ground', 'obstacles'):
+        image = bench.image()
+        bench.segment(image)
+        ground, obstacles = (
+            bench.until(lambda name=name: bench.find(name, image))
+            for name in ('ground', 'obstacles')
+        )
+    assert ground.width == 0 and len(ground.fields) == 3
+    assert obstacles.width == bench.camera.width * bench.camera.height
+
+
+@contextmanager
+def imu_on(bench):
+    """A reliable accelerometer; the function that publishes what it measures."""
+    assert bench.set_parameters(use_imu=True)[0].successful
+    with bench.advertised(Imu, '/imu') as publisher:
+        bench.until(lambda: bench.node.count_subscribers('/imu'))
+        bench.until(publisher.get_subscription_count)
+
+        def measure(x, y, z, frame=FRAME, covariance=0.0):
+            message = Imu(header=bench.header())
+            message.header.frame_id = frame
+            a = message.linear_acceleration
+            a.x, a.y, a.z = float(x), float(y), float(z)
+            message.linear_acceleration_covariance[0] = covariance
+            publisher.publish(message)
+
+        yield measure
+    assert bench.set_parameters(use_imu=False)[0].successful
+    bench.until(lambda: not bench.node.count_subscribers('/imu'))
+
+
+def roles_while(bench, measure, *acceleration, **fields):
+    """Height of what is the floor while the accelerometer measures that, None without a floor."""
+    for _ in range(5):
+        measure(*acceleration, **fields)
+        bench.spin(0.02)
+    planes, _ = planes_of(bench, room(bench.camera))
+    return planes['floor']['distance'] if 'floor' in planes else None
+
+
+def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
+    level = pytest.approx(HEIGHT, abs=3e-3)
+    with imu_on(bench) as measure:
+        # Nothing measured yet, then nothing that could be used.
+        planes, _ = planes_of(bench, room(bench.camera))
+        assert planes['floor']['distance'] == level
+        for fields in ({'frame': 'imu_link'}, {'covariance': -1.0}):
+            assert roles_while(bench, measure, 0, 0, -GRAVITY, **fields) == level
+        for pushed in ((0, 0, -1.2 * GRAVITY), (np.nan, 0, 0), (0, 0, 0)):
+            assert roles_while(bench, measure, *pushed) == level
+        # A camera that looks down sees the floor in front of it.
+        assert roles_while(bench, measure, 0, 0, -GRAVITY) == pytest.approx(WALL, abs=6e-3)
+        assert roles_while(bench, measure, 0, 0, -GRAVITY, frame='imu_link') == level
+    # Who asks for no accelerometer gets none.
+    planes, _ = planes_of(bench, room(bench.camera))
+    assert planes['floor']['distance'] == level
+    assert "/imu is in frame 'imu_link'" in bench.log()
+
+
+def test_acceleration_is_smoothed_by_the_time_constant():
+    still = Reading('optical', 10**9, np.array([0.0, -GRAVITY, 0.0]))
+    tilted = np.array([GRAVITY, 0.0, 0.0])
+
+    def after(seconds, frame='optical'):
+        new = Reading(frame, 10**9 + round(seconds * 1e9), tilted)
+        return still.followed_by(new).acceleration / GRAVITY
+
+    for seconds in (0.0, 0.01, TIME_CONSTANT, 5.0):
+        left = np.exp(-seconds / TIME_CONSTANT)
+        np.testing.assert_allclose(after(seconds), (1 - left, -left, 0), atol=1e-9)
+    # The same in one step as in many.
+    reading = still
+    for step in range(1, 101):
+        reading = reading.followed_by(Reading('optical', 10**9 + step * 10**7, tilted))
+    np.testing.assert_allclose(reading.acceleration / GRAVITY, after(1.0), atol=1e-9)
+    # Another sensor, or a recording that starts again.
+    np.testing.assert_array_equal(after(0.01, 'other'), (1, 0, 0))
+    np.testing.assert_array_equal(after(-0.01), (1, 0, 0))
