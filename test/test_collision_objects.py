@@ -1,0 +1,121 @@
+"""The example for MoveIt, run on messages of rclpy; of MoveIt itself, no more than a message."""
+
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy')
+pytest.importorskip('shape_msgs.msg')
+
+from ros_bench import DEPTH  # noqa: F401 - gives DDS a domain of its own
+from std_msgs.msg import Header
+
+from rangeseg_ros import Config, RangeImage
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.ros.messages import make_rclpy
+from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.simulation.kinect import kinect_camera
+
+REPOSITORY = Path(__file__).parents[1]
+
+
+class CollisionObject:
+    """The fields of moveit_msgs/CollisionObject that do not need MoveIt's other packages."""
+
+    ADD, REMOVE = b'\x00', b'\x01'
+
+    def __init__(self, header, id, operation=ADD):
+        self.header, self.id, self.operation = header, id, operation
+        self.meshes, self.mesh_poses, self.planes, self.plane_poses = [], [], [], []
+
+
+@pytest.fixture
+def example(monkeypatch):
+    """Names of the example."""
+    package, messages = ModuleType('moveit_msgs'), ModuleType('moveit_msgs.msg')
+    messages.CollisionObject = CollisionObject
+    monkeypatch.setitem(sys.modules, 'moveit_msgs', package)
+    monkeypatch.setitem(sys.modules, 'moveit_msgs.msg', messages)
+    return runpy.run_path(str(REPOSITORY / 'examples' / 'collision_objects.py'))
+
+
+@pytest.fixture(scope='module')
+def room():
+    """What is published of a floor 0.8 m below the camera and a wall 3 m ahead, and its planes."""
+    camera = kinect_camera(160, 120)
+    down = camera.rays[..., 1]
+    depth = np.minimum(0.8 / np.maximum(down, 1e-6), 3).astype(np.float32)
+    image = RangeImage.from_depth(depth, camera)
+    result = SequenceSegmenter(Config()).segment(image, 0)
+    header = Header(frame_id='optical')
+    messages = {
+        name: OUTPUTS[name].message(make_rclpy, header, image, result)
+        for name in ('planes', 'markers')
+    }
+    return messages, result.planes
+
+
+class Scene(list):
+    """Takes the place of the node and of its publisher."""
+
+    def __init__(self):
+        self.known, self.scene, self.publish = set(), self, self.append
+
+
+def area(mesh):
+    """Area of a shape_msgs/Mesh, square metres."""
+    corners = np.array([(p.x, p.y, p.z) for p in mesh.vertices])
+    triangles = np.array([triangle.vertex_indices for triangle in mesh.triangles])
+    # Every corner is used, and none is made up.
+    assert set(triangles.ravel()) == set(range(len(corners)))
+    first, second, third = np.moveaxis(corners[triangles], 1, 0)
+    return np.linalg.norm(np.cross(second - first, third - first), axis=1).sum() / 2
+
+
+def test_hulls_become_meshes_and_go_with_their_planes(example, room):
+    messages, planes = room
+    scene = Scene()
+    example['CollisionObjects'].on_markers(scene, messages['markers'])
+    assert [(o.id, o.operation) for o in scene] == [(f'plane {p.id}', b'\x00') for p in planes]
+    assert len(planes) == 2
+    for item, plane in zip(scene, planes, strict=True):
+        assert item.header.frame_id == 'optical' and len(item.mesh_poses) == 1
+        # Outlines are simplified.
+        assert area(item.meshes[0]) == pytest.approx(plane.area, rel=0.03)
+    scene.clear()
+    names = [name for marker in messages['markers'].markers if (name := marker.ns)]
+    assert names.count('hulls') == 2
+    wall = make_rclpy(
+        'visualization_msgs/msg/MarkerArray',
+        markers=[m for m in messages['markers'].markers if m.id != planes[0].id],
+    )
+    example['CollisionObjects'].on_markers(scene, wall)
+    assert [(o.id, o.operation) for o in scene] == [
+        (f'plane {planes[0].id}', b'\x01'),
+        (f'plane {planes[1].id}', b'\x00'),
+    ]
+
+
+def test_the_floor_becomes_a_plane(example, room):
+    messages, _ = room
+    scene = Scene()
+    example['CollisionObjects'].on_planes(scene, messages['planes'])
+    (floor,) = scene
+    assert floor.id == 'floor' and len(floor.plane_poses) == 1
+    np.testing.assert_allclose(floor.planes[0].coef, (0, -1, 0, 0.8), atol=2e-3)
+    scene.clear()
+    empty = OUTPUTS['planes'].message(
+        make_rclpy, Header(), None, type('Nothing', (), {'planes': []})
+    )
+    example['CollisionObjects'].on_planes(scene, empty)
+    assert not scene
+
+
+def test_the_readme_shows_the_example():
+    source = (REPOSITORY / 'examples' / 'collision_objects.py').read_text()
+    shown = source[source.index('def mesh_of') : source.index('\n\n\nclass ')]
+    assert shown in (REPOSITORY / 'README.md').read_text()
