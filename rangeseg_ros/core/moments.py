@@ -193,24 +193,32 @@ def residual_noise(
     return np.sqrt(complete[:, CHI2]) / size, residual / (size * size - 3)
 
 
-def slopes(blocks: NDArray[np.float64], rays: NDArray[np.float32], size: int) -> NDArray:
+@njit(cache=True)
+def slopes(
+    blocks: NDArray[np.float64], rays: NDArray[np.float32], size: int
+) -> NDArray[np.float64]:
     """Change of the inverse range from pixel to pixel in each block, (rows, columns), 1/m."""
-    theta, _ = fit_all(blocks.reshape(-1, SIZE))
     rows, columns = blocks.shape[:2]
-    if min(rays.shape[:2]) < 2:
-        return np.zeros((rows, columns))
+    slope = np.zeros((rows, columns))
+    theta = np.zeros(3)
     # The pixel in the middle of a block and its neighbours; the last block may be cut off.
-    i = np.minimum(np.arange(rows) * size + size // 2, len(rays) - 2)
-    j = np.minimum(np.arange(columns) * size + size // 2, rays.shape[1] - 2)
-    middle = rays[np.ix_(i, j)]
-    theta = theta.reshape(rows, columns, 3)
-    across = np.einsum('ijk,ijk->ij', rays[np.ix_(i, j + 1)] - middle, theta)
-    down = np.einsum('ijk,ijk->ij', rays[np.ix_(i + 1, j)] - middle, theta)
-    return np.hypot(across, down)
+    for bi in range(rows):
+        i = min(bi * size + size // 2, len(rays) - 2)
+        for bj in range(columns):
+            j = min(bj * size + size // 2, rays.shape[1] - 2)
+            if blocks[bi, bj, COUNT] == 0 or i < 0 or j < 0:
+                continue
+            fit(blocks[bi, bj], theta)
+            across, down = 0.0, 0.0
+            for k in range(3):
+                across += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
+                down += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+            slope[bi, bj] = np.sqrt(across * across + down * down)
+    return slope
 
 
 def weighted(
-    blocks: NDArray[np.float64], sensor: SensorModel, slope: NDArray | float = 0.0
+    blocks: NDArray[np.float64], sensor: SensorModel, slope: NDArray[np.float64] | float = 0.0
 ) -> NDArray[np.float64]:
     """Blocks with weights according to the sensor, and the ratios of its variances.
 
