@@ -64,14 +64,7 @@ def surfaces(
     blocks = moments.reshape(-1, SIZE)
     _, residual = fit_all(blocks)
     smooth = (blocks[:, COUNT] > 0) & (residual < _ROUGH * blocks[:, COUNT])
-    index = np.arange(len(blocks)).reshape(shape)
-    pairs = np.concatenate(
-        [
-            np.stack([index[:, :-1][links[0]], index[:, 1:][links[0]]], axis=1),
-            np.stack([index[:-1][links[1]], index[1:][links[1]]], axis=1),
-        ]
-    )
-    pairs = pairs[smooth[pairs].all(axis=1)]
+    pairs = _pairs(smooth.reshape(shape), *links)
     parent = _quads(blocks, smooth.reshape(shape), *links)
     patch, moments = _renumbered(
         _grow(blocks, smooth, pairs, parent, _PATCH_LARGEST * block**2),
@@ -83,19 +76,48 @@ def surfaces(
     return surface[patch].reshape(shape), moments
 
 
+@njit(cache=True)
+def _pairs(
+    smooth: NDArray[np.bool_], right: NDArray[np.bool_], below: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Numbers of smooth blocks that touch, (N, 2)."""
+    rows, columns = smooth.shape
+    pairs = np.empty((2 * rows * columns, 2), np.intp)
+    count = 0
+    for i in range(rows):
+        for j in range(columns):
+            here = i * columns + j
+            if not smooth[i, j]:
+                continue
+            if j + 1 < columns and right[i, j] and smooth[i, j + 1]:
+                pairs[count] = here, here + 1
+                count += 1
+            if i + 1 < rows and below[i, j] and smooth[i + 1, j]:
+                pairs[count] = here, here + columns
+                count += 1
+    return pairs[:count]
+
+
+@njit(cache=True)
 def _renumbered(
-    root: NDArray[np.intp], moments: NDArray[np.float64], least: int
+    root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
-    count = np.bincount(root, moments[:, COUNT])
-    chosen = np.flatnonzero(count >= least)
-    table = np.zeros(len(count), np.intp)
-    table[chosen] = np.arange(1, len(chosen) + 1)
-    labels = table[root]
-    total = np.empty((len(chosen) + 1, SIZE))
-    for k in range(SIZE):
-        total[:, k] = np.bincount(labels, moments[:, k], len(chosen) + 1)
-    total[0] = 0
+    count = np.zeros(len(root))
+    for a in range(len(root)):
+        count[root[a]] += moments[a, COUNT]
+    number = np.zeros(len(root), np.intp)
+    clusters = 0
+    for a in range(len(root)):
+        if count[a] >= least:
+            clusters += 1
+            number[a] = clusters
+    labels = np.zeros(len(root), np.intp)
+    total = np.zeros((clusters + 1, SIZE))
+    for a in range(len(root)):
+        labels[a] = number[root[a]]
+        if labels[a] > 0:
+            total[labels[a]] += moments[a]
     return labels, total
 
 
