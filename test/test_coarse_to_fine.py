@@ -40,14 +40,14 @@ def value(labels, normals, found, horizontal, vertical, smoothness):
 def test_energy_is_close_to_that_of_the_full_expansion(seed):
     """0.5 % is the package's promise."""
     arguments, _ = problem(seed)
-    fast = value(coarse_to_fine.minimise(*arguments, 5), *arguments)
+    fast = value(coarse_to_fine.minimise(*arguments), *arguments)
     full = value(moves.minimise(*arguments, 20), *arguments)
     assert fast <= 1.005 * full
 
 
 def test_noise_free_patches_are_found_to_the_pixel():
     arguments, label = problem(3, noise=0.0)
-    found = coarse_to_fine.minimise(*arguments, 5)
+    found = coarse_to_fine.minimise(*arguments)
     assert len(np.unique(np.stack([found.ravel(), label.ravel()]), axis=1).T) <= 7
     assert np.mean(found == moves.minimise(*arguments, 5)) > 0.999
 
@@ -56,10 +56,10 @@ def test_noise_free_patches_are_found_to_the_pixel():
 def test_any_size_of_image(shape):
     normals = np.tile(DIRECTIONS[5].astype(np.float32), (*shape, 1))
     edges = np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
-    assert (coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0, 3) == 5).all()
+    assert (coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0) == 5).all()
 
 
 def test_no_normal_at_all():
     normals = np.full((20, 30, 3), np.nan, np.float32)
     edges = np.ones((20, 29)), np.ones((19, 30))
-    assert len(np.unique(coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0, 3))) == 1
+    assert len(np.unique(coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0))) == 1

@@ -61,7 +61,8 @@ def test_coarse_to_fine_and_exact_agree_on_a_corner():
     full = segment(corner(0.002), replace(NORMALS, exact=True))
     assert len(fast.planes) == len(full.planes) == 3
     assert np.mean(fast.labels == full.labels) > 0.97
-    assert full.energy <= fast.energy <= 1.005 * full.energy
+    # Both are local minima: either may be the lower.
+    assert fast.energy == pytest.approx(full.energy, rel=0.005)
 
 
 @pytest.mark.parametrize(

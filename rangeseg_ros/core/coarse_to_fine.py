@@ -14,16 +14,16 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.bands import BandLabelling, Grid
-from rangeseg_ros.core.energy import angles, mixed_angles
+from rangeseg_ros.core.energy import angles
 from rangeseg_ros.core.moves import ROUNDING
 from rangeseg_ros.core.regions import connected_components
 
 # Width of the blocks of each level, pixels, each a divisor of the one before; how many blocks a
 # label may advance in a sweep; sweeps at most.
 LEVELS = ((8, 8, 2), (4, 4, 1), (2, 3, 1), (1, 2, 1))
-_TILE, _ODD, _SAVING = 8, 20.0, 400.0
-# Directions among which votes for the less popular pass to the most popular.
-_CLUSTER = 7
+# Pixels across the tiles that ask for labels; degrees from which a pixel counts as odd; what the
+# odd pixels of a tile must save together, edges.
+_TILE, _ODD, _SAVING = 8, 20.0, 8.0
 # Directions around the mean normal of a region that are tried for it, and its size at most.
 _TRIED, _LARGE = 19, 3000
 
@@ -60,42 +60,38 @@ def minimise(
     vertical = np.pad(vertical, ((0, rows), (0, columns)))
     labelled = directions.astype(np.float32)
 
-    image = wanted = None
-    above = size = LEVELS[0][0]
+    coarsest = LEVELS[0][0]
+    image = _votes(_blocks(normals, coarsest), labelled).reshape(-1, normals.shape[1] // coarsest)
     for size, reach, sweeps in LEVELS:
         grid = Grid(
             _blocks(normals, size),
             *_block_weights(horizontal, vertical, size, smoothness),
             normals.shape[1] // size,
         )
-        shape = -1, grid.width
-        if image is None:
-            image, wanted = _votes(grid.normals, labelled).reshape(shape), None
-        else:
-            image = image.repeat(above // size, axis=0).repeat(above // size, axis=1)
+        ratio = grid.width // image.shape[1]
+        image = image.repeat(ratio, axis=0).repeat(ratio, axis=1)
         labelling = BandLabelling(image.ravel(), grid, labelled)
-        if size < above:
-            wanted = _wanted(
-                labelling.data, grid.normals, grid.width, labelled, _TILE // size, _ODD, _SAVING
-            )
+        wanted = _wanted(
+            labelling.data,
+            grid.normals,
+            grid.width,
+            labelled,
+            _TILE // size,
+            _ODD,
+            _SAVING * smoothness,
+        )
         for _ in range(sweeps):
             helped = labelling.sweep(reach, wanted)
             _turn(labelling, labelled, max(1, _LARGE // size**2))
             if not helped:
                 break
-        image = labelling.labels.reshape(shape)
-        above = size
+        image = labelling.labels.reshape(image.shape)
     return image[:height, :width].astype(np.intp)
 
 
 def _votes(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Direction nearest to the mean normal of each block (n,), or the most popular beside it."""
-    total = _sum(normals)
-    nearest = np.argmax(total @ directions.T, axis=1)
-    counts = np.bincount(nearest[total.any(axis=1)], minlength=len(directions))
-    beside = directions @ directions.T >= 1 - _CLUSTER / len(directions)
-    np.fill_diagonal(beside, True)
-    return np.where(beside, counts, -1).argmax(axis=1).astype(np.int32)[nearest]
+    """Direction nearest to the mean normal of each block (n,)."""
+    return np.argmax(_sum(normals) @ directions.T, axis=1).astype(np.int32)
 
 
 @njit(cache=True)

@@ -62,27 +62,39 @@ class AngularCost:
         return best
 
 
+@njit(cache=True, inline='always')
+def _degrees(cosine: np.float32) -> np.float32:
+    """Arc cosine in degrees, 0 for NaN; Abramowitz and Stegun 4.4.46, to 2e-8 rad.
+
+    Without branches and calls, so that the compiler can make eight at a time.
+    """
+    x = min(abs(cosine), np.float32(1))
+    p = np.float32(-0.0012624911)
+    p = p * x + np.float32(0.0066700901)
+    p = p * x + np.float32(-0.0170881256)
+    p = p * x + np.float32(0.0308918810)
+    p = p * x + np.float32(-0.0501743046)
+    p = p * x + np.float32(0.0889789874)
+    p = p * x + np.float32(-0.2145988016)
+    p = p * x + np.float32(1.5707963050)
+    p = p * np.sqrt(np.float32(1) - x) * np.float32(180 / np.pi)
+    p = p if cosine >= 0 else np.float32(180) - p
+    return p if cosine == cosine else np.float32(0)
+
+
+@njit(cache=True, fastmath={'reassoc'})
+def site_angle(normals: NDArray[np.float32], a: float, b: float, c: float) -> np.float32:
+    """Angles of the direction (a, b, c) to the normals (3, m) of a site, degrees, summed."""
+    total = np.float32(0)
+    for k in range(normals.shape[1]):
+        total += _degrees(normals[0, k] * a + normals[1, k] * b + normals[2, k] * c)
+    return total
+
+
 @njit(cache=True)
 def _to_degrees(cosine: NDArray[np.float32]) -> None:
-    """Arc cosines in place, degrees, 0 for NaN; Abramowitz and Stegun 4.4.46, to 2e-8 rad.
-
-    Without branches and calls, so that the compiler makes eight at a time.
-    """
-    one, degree, half = np.float32(1), np.float32(180 / np.pi), np.float32(180)
     for k in range(len(cosine)):
-        c = cosine[k]
-        x = min(abs(c), one)
-        p = np.float32(-0.0012624911)
-        p = p * x + np.float32(0.0066700901)
-        p = p * x + np.float32(-0.0170881256)
-        p = p * x + np.float32(0.0308918810)
-        p = p * x + np.float32(-0.0501743046)
-        p = p * x + np.float32(0.0889789874)
-        p = p * x + np.float32(-0.2145988016)
-        p = p * x + np.float32(1.5707963050)
-        p = p * np.sqrt(one - x) * degree
-        p = p if c >= 0 else half - p
-        cosine[k] = p if c == c else np.float32(0)
+        cosine[k] = _degrees(cosine[k])
 
 
 @njit(cache=True)

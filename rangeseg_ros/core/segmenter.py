@@ -109,7 +109,9 @@ class Segmenter:
         surface, moments = surfaces(weighted(blocks, sensor, slope), links, size)
         watch.lap('surfaces')
         problem = Problem.of(image, sensor, horizontal, vertical, size)
-        labels, models = refine(problem, surface, moments, sensor, self.config.exact)
+        # A region may gain as much again from pixels that no block could take.
+        least = self.config.min_pixels // 2
+        labels, models = refine(problem, surface, moments, sensor, least, self.config.exact)
         watch.lap('labels')
         regions = plane_regions(
             labels, image.valid & (labels > 0), horizontal, vertical, self.config
