@@ -58,7 +58,7 @@ def curved(
     models = Models.of(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
-    normal, right, area, scale = _normal_equations(
+    normal, right, square, area, scale = _normal_equations(
         regions, problem.inverse, problem.rays, problem.weight, models.theta, limit
     )
     pixels = normal[:, 0, 0]
@@ -67,7 +67,10 @@ def curved(
     solution = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
     bending = np.einsum('ki,kij,kj->k', solution, normal, solution) / np.maximum(pixels, 1)
     distortion = _SHARE * ratio * (size / _PIXELS) ** _EXPONENT
-    visible = bending > distortion + _NOISE / size
+    # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
+    rest = square - (solution * right).sum(axis=1)
+    noise = np.maximum(rest / np.maximum(pixels, 1), 1)
+    visible = bending > distortion + _NOISE * noise / size
     result = visible & (bending * (scale / np.maximum(pixels, 1)) ** 2 > _FLATNESS**2 * area)
     result[0] = False
     return result
@@ -81,17 +84,23 @@ def _normal_equations(
     weight: NDArray[np.float32],
     theta: NDArray[np.float64],
     limit: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
     """Normal equations of a quadratic in the pixel coordinates fitted to each region.
 
     What is fitted are the residuals in standard deviations of the noise, those beyond `limit`
-    left out. Also returns the area in square metres of each region seen face on, and the sum over
-    its pixels of the standard deviation in metres.
+    left out. Also returns the sum of their squares, the area in square metres of each region seen
+    face on, and the sum over its pixels of the standard deviation in metres.
     """
     height, width = regions.shape
     count = len(theta)
     normal, right = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    area, scale = np.zeros(count), np.zeros(count)
+    total, area, scale = np.zeros(count), np.zeros(count), np.zeros(count)
     basis = np.ones(6)
     for i in range(height):
         y = 2 * (i - height / 2) / width
@@ -105,6 +114,7 @@ def _normal_equations(
             value *= root
             if abs(value) > limit[label]:
                 continue
+            total[label] += value * value
             square = inverse[i, j] ** 2
             scale[label] += 1 / (root * square)
             if i > 0 and j > 0 and inverse[i - 1, j] > 0 and inverse[i, j - 1] > 0:
@@ -123,4 +133,4 @@ def _normal_equations(
     for a in range(6):
         for b in range(a):
             normal[:, a, b] = normal[:, b, a]
-    return normal, right, area, scale
+    return normal, right, total, area, scale

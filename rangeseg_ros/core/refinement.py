@@ -36,8 +36,6 @@ _STEP = 1e-6
 _REACH, _BAND = 2, 3
 
 
-_SEED = 250
-"""Pixels of the smallest surface whose plane is tried."""
 _ROUNDS = 10
 
 
@@ -46,6 +44,7 @@ def refine(
     surfaces: NDArray[np.intp],
     moments: NDArray[np.float64],
     sensor: SensorModel,
+    least: int = 0,
     exact: bool = False,
 ) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels with the planes of surfaces.
@@ -58,6 +57,8 @@ def refine(
     moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
+    least : int
+        Pixels of the smallest surface whose plane is tried.
     exact : bool
         Expand labels from wherever they compete, not just near their boundaries, until no
         expansion helps, refit the planes, and repeat until the labelling stands still (at most
@@ -70,7 +71,7 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    kept = moments[:, COUNT] >= _SEED
+    kept = moments[:, COUNT] >= least
     kept[0] = True
     surfaces = np.where(kept, np.cumsum(kept) - 1, 0)[surfaces]
     moments = moments[kept]
