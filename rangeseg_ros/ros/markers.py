@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
-from shapely.geometry.polygon import orient
 
 from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.drawing import colours
@@ -87,15 +85,21 @@ def _triangles(plane: Plane) -> NDArray[np.float64]:
     outline, *holes = ((ring - plane.centroid) @ axes.T for ring in (plane.hull, *plane.holes))
     polygon = shapely.make_valid(shapely.Polygon(outline, holes))
     # No corner lies inside a Delaunay triangle, so sides only cut across: the parts are convex.
-    parts = shapely.intersection(shapely.get_parts(shapely.delaunay_triangles(polygon)), polygon)
-    rings = [orient(part).exterior.coords[:-1] for part in shapely.get_parts(parts) if part.area]
-    corners = [
-        corner
-        for first, *others in rings
-        for side in pairwise(others)
-        for corner in (first, *side)
-    ]
-    return np.array(corners).reshape(-1, 2) @ axes + plane.centroid
+    parts = shapely.get_parts(shapely.delaunay_triangles(polygon))
+    shapely.prepare(polygon)
+    whole = shapely.covers(polygon, parts)
+    cut = shapely.get_parts(shapely.intersection(parts[~whole], polygon))
+    parts = np.concatenate([parts[whole], cut])
+    corners, part = shapely.get_coordinates(parts[shapely.area(parts) > 0], return_index=True)
+    # Each is a fan around its first corner; its last one is the first again.
+    first, last = (np.searchsorted(part, part, side) for side in ('left', 'right'))
+    second = np.arange(len(part))
+    inner = (second > first) & (second < last - 2)
+    triangles = corners[np.stack([first, second, second + 1], axis=1)[inner]]
+    sides = np.diff(triangles, axis=1)
+    clockwise = sides[:, 0, 0] * sides[:, 1, 1] < sides[:, 0, 1] * sides[:, 1, 0]
+    triangles[clockwise] = triangles[clockwise, ::-1]
+    return triangles.reshape(-1, 2) @ axes + plane.centroid
 
 
 def _marker(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -32,6 +32,7 @@ def make_rclpy(kind: str, **fields: Any) -> Any:
     return message_class(kind)(**fields)
 
 
+@cache
 def message_class(kind: str) -> type:
     """Class of rclpy for e.g. 'sensor_msgs/msg/Image'; ImportError when it is not installed."""
     package, _, name = kind.split('/')

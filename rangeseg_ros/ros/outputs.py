@@ -51,11 +51,16 @@ def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, image.points[_on_floor(result)])
+    return _points(make, header, image, _on_floor(result))
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, image.points[image.valid & ~_on_floor(result)])
+    return _points(make, header, image, image.valid & ~_on_floor(result))
+
+
+def _points(make: Make, header: Any, image: RangeImage, where: NDArray[np.bool_]) -> Any:
+    # Of these pixels only, which is faster than RangeImage.points.
+    return points_message(make, header, image.rays[where] / image.inverse[where, None])
 
 
 def _on_floor(result: Segmentation) -> NDArray[np.bool_]:
