@@ -1,7 +1,6 @@
 """Expansions of one label near its boundaries, on a grid of sites: pixels or blocks of them.
 
-Sites have numbers in raster order; `right` and `down` (n,) hold the weight of the edge from a
-site to the next in its row and in its column, 0 at the border.
+Sites have numbers in raster order.
 """
 
 from __future__ import annotations
@@ -27,15 +26,15 @@ class Grid:
     ----------
     normals : (n, 3, m) float32
         Unit normals of the m pixels of each site, NaN where undefined.
-    right, down : (n,) float32
-        Weights of the edges times the smoothness.
+    links : (n, 4) float32
+        Weights times the smoothness of the edges to the right, down, to the left and up, 0 at the
+        border.
     width : int
         Sites in a row.
     """
 
     normals: NDArray[np.float32]
-    right: NDArray[np.float32]
-    down: NDArray[np.float32]
+    links: NDArray[np.float32]
     width: int
 
 
@@ -75,7 +74,7 @@ class BandLabelling:
             A label worth trying at a site that is not at its boundary, -1 for none.
         """
         grid, count = self.grid, len(self._directions)
-        start, fronts = _fronts(self.labels, wanted, grid.right, grid.down, grid.width, count)
+        start, fronts = _fronts(self.labels, wanted, grid.links, grid.width, count)
         helped = False
         for alpha in np.flatnonzero(np.diff(start)).tolist():
             helped |= self._expand(alpha, fronts[start[alpha] : start[alpha + 1]], reach)
@@ -91,8 +90,7 @@ class BandLabelling:
             self._directions[alpha],
             self.labels,
             self.data,
-            grid.right,
-            grid.down,
+            grid.links,
             grid.width,
             self._position,
         )
@@ -102,8 +100,7 @@ class BandLabelling:
             new,
             self.labels,
             self.data,
-            grid.right,
-            grid.down,
+            grid.links,
             grid.width,
             self._position,
         )
@@ -119,8 +116,7 @@ class BandLabelling:
 def _fronts(
     labels: NDArray[np.int32],
     wanted: NDArray[np.int32],
-    right: NDArray[np.float32],
-    down: NDArray[np.float32],
+    links: NDArray[np.float32],
     width: int,
     count: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
@@ -134,7 +130,7 @@ def _fronts(
         for p in range(len(labels)):
             here = labels[p]
             for k in range(2):
-                q, u = (p + 1, right[p]) if k == 0 else (p + width, down[p])
+                q, u = p + (1 if k == 0 else width), links[p, k]
                 if u > 0 and labels[q] != here:
                     there = labels[q]
                     if filling:
@@ -159,21 +155,6 @@ def _fronts(
 
 
 @njit(cache=True)
-def _neighbour(
-    p: int, k: int, right: NDArray[np.float32], down: NDArray[np.float32], width: int
-) -> tuple[int, np.float32]:
-    """Neighbour of site p to the right, below, to the left or above, and the weight between."""
-    if k == 0:
-        return p + 1, right[p]
-    if k == 1:
-        return p + width, down[p]
-    q = p - 1 if k == 2 else p - width
-    if q < 0:
-        return q, np.float32(0)
-    return q, right[q] if k == 2 else down[q]
-
-
-@njit(cache=True)
 def _band(
     alpha: int,
     front: NDArray[np.int32],
@@ -182,8 +163,7 @@ def _band(
     direction: NDArray[np.float32],
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
-    right: NDArray[np.float32],
-    down: NDArray[np.float32],
+    links: NDArray[np.float32],
     width: int,
     position: NDArray[np.int32],
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
@@ -191,6 +171,7 @@ def _band(
 
     Sets their `position`, which is -1 everywhere else.
     """
+    offsets = np.array([1, width, -1, -width])
     a, b, c = direction[0], direction[1], direction[2]
     odd = np.float32(_ODD * normals.shape[2])
     sites = np.empty(max(64, 4 * len(front)), np.int32)
@@ -210,13 +191,13 @@ def _band(
     while done < count:
         p, far = sites[done], steps[done]
         done += 1
+        if far >= 2 * reach:
+            continue
         for k in range(4):
-            q, u = _neighbour(p, k, right, down, width)
+            q, u = p + offsets[k], links[p, k]
             if u > 0 and labels[q] != alpha and position[q] < 0:
                 cost = site_angle(normals[q], a, b, c)
                 step = 0 if data[q] - cost > odd else 1 if data[q] == 0 else 2
-                if far + step > 2 * reach:
-                    continue
                 if count == len(sites):
                     sites = np.concatenate((sites, np.empty_like(sites)))
                     new = np.concatenate((new, np.empty_like(new)))
@@ -236,8 +217,7 @@ def _expansion(
     new: NDArray[np.float32],
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
-    right: NDArray[np.float32],
-    down: NDArray[np.float32],
+    links: NDArray[np.float32],
     width: int,
     position: NDArray[np.int32],
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32], NDArray[np.float64]]:
@@ -245,6 +225,7 @@ def _expansion(
 
     `new` is the data cost of the label; `position` becomes -1 again.
     """
+    offsets = np.array([1, width, -1, -width])
     count = len(sites)
     excess = np.empty(count)
     first = np.empty(2 * count, np.int32)
@@ -257,7 +238,7 @@ def _expansion(
         here = labels[p]
         total = np.float64(new[s]) - np.float64(data[p])
         for k in range(4):
-            q, u = _neighbour(p, k, right, down, width)
+            q, u = p + offsets[k], links[p, k]
             if u == 0:
                 continue
             w = np.float64(u)

@@ -24,8 +24,9 @@ LEVELS = ((8, 8, 2), (4, 4, 1), (2, 3, 1), (1, 2, 1))
 # Pixels across the tiles that ask for labels; degrees from which a pixel counts as odd; what the
 # odd pixels of a tile must save together, edges.
 _TILE, _ODD, _SAVING = 8, 20.0, 8.0
-# Directions around the mean normal of a region that are tried for it, and its size at most.
-_TRIED, _LARGE = 19, 3000
+# Directions around the mean normal of a region that are tried for it, by about so many of its
+# pixels.
+_TRIED, _LARGE = 7, 3000
 
 
 def minimise(
@@ -65,7 +66,7 @@ def minimise(
     for size, reach, sweeps in LEVELS:
         grid = Grid(
             _blocks(normals, size),
-            *_block_weights(horizontal, vertical, size, smoothness),
+            _links(horizontal, vertical, size, smoothness),
             normals.shape[1] // size,
         )
         ratio = grid.width // image.shape[1]
@@ -174,20 +175,23 @@ def _sum(normals: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @njit(cache=True)
-def _block_weights(
+def _links(
     horizontal: NDArray[np.floating], vertical: NDArray[np.floating], size: int, smoothness: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Prior between each block and the next in its row, its column: sums over their border."""
+) -> NDArray[np.float32]:
+    """Prior (n, 4) between each block and its neighbours: sums over their borders."""
     rows, columns = len(horizontal) // size, vertical.shape[1] // size
-    right = np.zeros(rows * columns, np.float32)
-    down = np.zeros(rows * columns, np.float32)
+    links = np.zeros((rows * columns, 4), np.float32)
     for i in range(rows * size):
-        for j in range(columns - 1):
-            right[i // size * columns + j] += smoothness * horizontal[i, (j + 1) * size - 1]
-    for i in range(rows - 1):
+        for j in range(1, columns):
+            p = i // size * columns + j
+            links[p, 2] += smoothness * horizontal[i, j * size - 1]
+            links[p - 1, 0] = links[p, 2]
+    for i in range(1, rows):
         for j in range(columns * size):
-            down[i * columns + j // size] += smoothness * vertical[(i + 1) * size - 1, j]
-    return right, down
+            p = i * columns + j // size
+            links[p, 3] += smoothness * vertical[i * size - 1, j]
+            links[p - columns, 1] = links[p, 3]
+    return links
 
 
 def _turn(labelling: BandLabelling, directions: NDArray[np.float32], largest: int) -> None:
@@ -196,8 +200,8 @@ def _turn(labelling: BandLabelling, directions: NDArray[np.float32], largest: in
     shape = -1, grid.width
     regions = connected_components(
         labelling.labels.reshape(shape),
-        grid.right.reshape(shape)[:, :-1],
-        grid.down.reshape(shape)[:-1],
+        grid.links[:, 0].reshape(shape)[:, :-1],
+        grid.links[:, 1].reshape(shape)[:-1],
     )
     _turn_regions(
         regions.ravel(),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
@@ -59,25 +62,35 @@ def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
     (H, W, 3) float32
         NaN where the pixel or one of its neighbours was not measured or lies outside the image.
     """
-    height, width = image.shape
-    normals = np.full((height, width, 3), np.nan, np.float32)
-    if min(height, width) <= 2 * baseline:
-        return normals
-    x, y, z = cv2.split(image.points)
-    inner = (slice(baseline, -baseline), slice(baseline, -baseline))
-    # NaN, where nothing was measured, spreads by itself.
-    ux, uy, uz = (
-        c[baseline:-baseline, 2 * baseline :] - c[baseline:-baseline, : -2 * baseline]
-        for c in (x, y, z)
-    )
-    vx, vy, vz = (
-        c[2 * baseline :, baseline:-baseline] - c[: -2 * baseline, baseline:-baseline]
-        for c in (x, y, z)
-    )
-    cross = cv2.merge((uz * vy - uy * vz, ux * vz - uz * vx, uy * vx - ux * vy))
-    normals[inner] = cross
-    normals[~image.valid] = np.nan
-    return _towards_sensor(normals, image)
+    return _cross_product(image.inverse, image.rays, baseline)
+
+
+@njit(cache=True)
+def _cross_product(
+    inverse: NDArray[np.float32], rays: NDArray[np.float32], reach: int
+) -> NDArray[np.float32]:
+    normals = np.full(rays.shape, np.nan, np.float32)
+    u, v = np.empty(3), np.empty(3)
+    for i in range(reach, inverse.shape[0] - reach):
+        for j in range(reach, inverse.shape[1] - reach):
+            left, right = inverse[i, j - reach], inverse[i, j + reach]
+            upper, lower = inverse[i - reach, j], inverse[i + reach, j]
+            if min(left, right, upper, lower, inverse[i, j]) <= 0:
+                continue
+            for c in range(3):
+                u[c] = rays[i, j + reach, c] / right - rays[i, j - reach, c] / left
+                v[c] = rays[i + reach, j, c] / lower - rays[i - reach, j, c] / upper
+            x = u[2] * v[1] - u[1] * v[2]
+            y = u[0] * v[2] - u[2] * v[0]
+            z = u[1] * v[0] - u[0] * v[1]
+            facing = x * rays[i, j, 0] + y * rays[i, j, 1] + z * rays[i, j, 2]
+            length = math.sqrt(x * x + y * y + z * z)
+            if length > 0 and facing != 0:
+                scale = -math.copysign(1 / length, facing)
+                normals[i, j, 0] = x * scale
+                normals[i, j, 1] = y * scale
+                normals[i, j, 2] = z * scale
+    return normals
 
 
 def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
