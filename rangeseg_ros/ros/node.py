@@ -1,4 +1,4 @@
-"""The node: depth messages in; labels, planes, markers and overlay out while somebody listens."""
+"""The node: depth messages in; what `OUTPUTS` lists out, each while somebody listens."""
 
 from __future__ import annotations
 
