@@ -5,7 +5,7 @@ import pytest
 
 from rangeseg_ros.core import coarse_to_fine, moves
 from rangeseg_ros.core.directions import directions
-from rangeseg_ros.core.energy import angle, energy
+from rangeseg_ros.core.energy import angle, angles, energy
 
 DIRECTIONS = directions('platonic', 73)
 
@@ -63,3 +63,32 @@ def test_no_normal_at_all():
     normals = np.full((20, 30, 3), np.nan, np.float32)
     edges = np.ones((20, 29)), np.ones((19, 30))
     assert len(np.unique(coarse_to_fine.minimise(normals, DIRECTIONS, *edges, 40.0))) == 1
+
+
+def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
+    random = np.random.default_rng(0)
+    normals = random.normal(size=(500, 3, 4))
+    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
+    normals[::7, :, 1] = np.nan
+    direction = DIRECTIONS[4].astype(np.float32)
+    found = angles(np.arange(0, 500, 3, dtype=np.int32), normals, direction)
+    cosine = np.einsum('ncm,c->nm', normals.astype(float), direction.astype(float))
+    expected = np.nansum(np.degrees(np.arccos(np.clip(cosine, -1, 1))), axis=1)[::3]
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
+def test_pixels_without_normal_belong_to_their_side_of_a_jump():
+    """A jump within a block, pixels without normal beside it: the prior alone places them."""
+    normals = np.empty((64, 64, 3), np.float32)
+    normals[:, :35], normals[:, 35:] = DIRECTIONS[5], DIRECTIONS[40]
+    normals[:, 32:38] = np.nan
+    horizontal, vertical = np.ones((64, 63)), np.ones((63, 64))
+    horizontal[:, 34] = 0
+    found = coarse_to_fine.minimise(normals, DIRECTIONS, horizontal, vertical, 100.0)
+    assert (found[:, :35] == 5).all() and (found[:, 35:] == 40).all()
+
+
+def test_same_labels_every_time():
+    arguments, _ = problem(2)
+    first = coarse_to_fine.minimise(*arguments)
+    assert np.array_equal(first, coarse_to_fine.minimise(*arguments))
