@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -47,12 +45,7 @@ def curved(
     count = int(regions.max(initial=0)) + 1
     # Every other row and column will do: what is asked for is smooth.
     sparse = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-    problem = replace(
-        problem,
-        inverse=problem.inverse[sparse],
-        rays=problem.rays[sparse],
-        weight=problem.weight[sparse],
-    )
+    problem = problem.crop(*sparse)
     regions = regions[sparse]
     moments = region_moments(problem, regions, count, sensor)
     models = Models.of(moments)

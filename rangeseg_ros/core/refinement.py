@@ -9,7 +9,7 @@ planes at hand, refitting lowers the residuals of the labelling at hand.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -91,14 +91,11 @@ def refine(
             moments[:, SLOPE] * refitted[:, COUNT] / np.maximum(moments[:, COUNT], 1)
         )
         models = Models.of(refitted)
-        cost = _costs(
-            labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
-        )
+        cost = _costs(labels, problem, models)
     return labels, models
 
 
-@dataclass(frozen=True, eq=False)
-class Problem:
+class Problem(NamedTuple):
     """What the labelling has to explain.
 
     Attributes
@@ -133,6 +130,16 @@ class Problem:
         weight = _weights(image.inverse, sensor.noise, sensor.range_noise)
         return cls(image.inverse, image.rays, weight, horizontal, vertical, block)
 
+    def crop(self, rows: slice, columns: slice) -> Problem:
+        """The problem of a part of the image."""
+        return self._replace(
+            inverse=self.inverse[rows, columns],
+            rays=self.rays[rows, columns],
+            weight=self.weight[rows, columns],
+            horizontal=self.horizontal[rows, columns],
+            vertical=self.vertical[rows, columns],
+        )
+
 
 @njit(cache=True)
 def _weights(
@@ -147,8 +154,7 @@ def _weights(
     return weight
 
 
-@dataclass(frozen=True, eq=False)
-class Models:
+class Models(NamedTuple):
     """The planes that are labels.
 
     Attributes
@@ -178,89 +184,49 @@ def _descended(
 
     Costs in the interior of surfaces, where no label competes, are left at 0.
     """
-    labels, cost = _nearest(
-        surfaces,
-        problem.block,
-        problem.inverse,
-        problem.rays,
-        problem.weight,
-        models.theta,
-        models.tolerance,
-    )
-    _descend(
-        labels,
-        cost,
-        problem.inverse,
-        problem.rays,
-        problem.weight,
-        problem.horizontal,
-        problem.vertical,
-        models.theta,
-        models.tolerance,
-    )
+    labels, cost = _nearest(surfaces, problem, models)
+    _descend(labels, cost, problem, models)
     return labels, cost
 
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
     """Value of eq. 5.3: data costs plus the weights of the edges between unlike labels."""
-    cost = _costs(
-        labels, problem.inverse, problem.rays, problem.weight, models.theta, models.tolerance
-    )
+    cost = _costs(labels, problem, models)
     unlike = problem.horizontal[labels[:, 1:] != labels[:, :-1]].sum(dtype=np.float64)
     unlike += problem.vertical[labels[1:] != labels[:-1]].sum(dtype=np.float64)
     return float(cost.sum(dtype=np.float64) + _SMOOTHNESS * unlike)
 
 
 @njit(cache=True)
-def _data_cost(
-    label: int,
-    ray: NDArray[np.float32],
-    y: float,
-    weight: float,
-    theta: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
-) -> float:
+def _data_cost(label: int, i: int, j: int, problem: Problem, models: Models) -> float:
     """What a label costs a measured pixel."""
     if label == 0:
         return _NO_PLANE
-    plane = theta[label]
-    residual = y - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
-    return min(0.5 / _PATCH * weight * residual * residual / tolerance[label], _CAP)
+    plane, ray = models.theta[label], problem.rays[i, j]
+    residual = problem.inverse[i, j] - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
+    variances = problem.weight[i, j] * residual * residual / models.tolerance[label]
+    return min(0.5 / _PATCH * variances, _CAP)
 
 
 @njit(cache=True)
-def _costs(
-    labels: NDArray[np.int32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    theta: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
-) -> NDArray[np.float32]:
+def _costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArray[np.float32]:
     """What each pixel's label costs it; 0 where nothing was measured."""
     cost = np.zeros(labels.shape, np.float32)
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
-            if weight[i, j] > 0:
-                cost[i, j] = _data_cost(
-                    labels[i, j], rays[i, j], inverse[i, j], weight[i, j], theta, tolerance
-                )
+            if problem.weight[i, j] > 0:
+                cost[i, j] = _data_cost(labels[i, j], i, j, problem, models)
     return cost
 
 
 @njit(cache=True)
 def _nearest(
-    surfaces: NDArray[np.int32],
-    block: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    theta: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    surfaces: NDArray[np.int32], problem: Problem, models: Models
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Give each pixel the cheapest label among those of the blocks around it."""
     rows, columns = surfaces.shape
-    height, width = inverse.shape
+    height, width = problem.inverse.shape
+    block = problem.block
     labels = np.zeros((height, width), np.int32)
     cost = np.zeros((height, width), np.float32)
     side = 2 * _REACH + 1
@@ -281,23 +247,14 @@ def _nearest(
             settled &= count == 1
             for i in range(bi * block, min((bi + 1) * block, height)):
                 for j in range(bj * block, min((bj + 1) * block, width)):
-                    if weight[i, j] == 0:
+                    if problem.weight[i, j] == 0:
                         continue
                     if settled:
                         labels[i, j] = candidates[0]
                         continue
                     best, least = 0, np.float32(_NO_PLANE)
                     for k in range(count):
-                        value = np.float32(
-                            _data_cost(
-                                candidates[k],
-                                rays[i, j],
-                                inverse[i, j],
-                                weight[i, j],
-                                theta,
-                                tolerance,
-                            )
-                        )
+                        value = np.float32(_data_cost(candidates[k], i, j, problem, models))
                         if value < least:
                             best, least = candidates[k], value
                     labels[i, j], cost[i, j] = best, least
@@ -306,15 +263,7 @@ def _nearest(
 
 @njit(cache=True)
 def _descend(
-    labels: NDArray[np.int32],
-    cost: NDArray[np.float32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    horizontal: NDArray[np.float32],
-    vertical: NDArray[np.float32],
-    theta: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    labels: NDArray[np.int32], cost: NDArray[np.float32], problem: Problem, models: Models
 ) -> None:
     """Iterated conditional modes (Besag 1986): pixels take a neighbour's label where it pays.
 
@@ -335,7 +284,7 @@ def _descend(
                 or (j + 1 < width and labels[i, j + 1] != here)
                 or (i > 0 and labels[i - 1, j] != here)
                 or (i + 1 < height and labels[i + 1, j] != here)
-            ) and weight[i, j] > 0:
+            ) and problem.weight[i, j] > 0:
                 queue[last] = i * width + j
                 queued[i, j] = True
                 last += 1
@@ -350,13 +299,13 @@ def _descend(
         around[:] = here
         links[:] = 0
         if j > 0:
-            around[0], links[0] = labels[i, j - 1], horizontal[i, j - 1]
+            around[0], links[0] = labels[i, j - 1], problem.horizontal[i, j - 1]
         if j + 1 < width:
-            around[1], links[1] = labels[i, j + 1], horizontal[i, j]
+            around[1], links[1] = labels[i, j + 1], problem.horizontal[i, j]
         if i > 0:
-            around[2], links[2] = labels[i - 1, j], vertical[i - 1, j]
+            around[2], links[2] = labels[i - 1, j], problem.vertical[i - 1, j]
         if i + 1 < height:
-            around[3], links[3] = labels[i + 1, j], vertical[i, j]
+            around[3], links[3] = labels[i + 1, j], problem.vertical[i, j]
         least = cost[i, j]
         for k in range(4):
             if around[k] != here:
@@ -366,9 +315,7 @@ def _descend(
             label = around[k] if k < 4 else np.int32(0)
             if label == here or (k < 4 and links[k] == 0):
                 continue
-            data = np.float32(
-                _data_cost(int(label), rays[i, j], inverse[i, j], weight[i, j], theta, tolerance)
-            )
+            data = np.float32(_data_cost(int(label), i, j, problem, models))
             total = data
             for m in range(4):
                 if around[m] != label:
@@ -433,13 +380,8 @@ def _expand(
         index,
         here,
         cost[rows, columns],
-        problem.inverse[rows, columns],
-        problem.rays[rows, columns],
-        problem.weight[rows, columns],
-        problem.horizontal[rows, columns],
-        problem.vertical[rows, columns],
-        models.theta,
-        models.tolerance,
+        problem.crop(rows, columns),
+        models,
     )
     switched = minimum_cut(excess, first, second, link)
     value = excess[switched].sum() + link[switched[first] != switched[second]].sum()
@@ -458,13 +400,8 @@ def _expansion(
     index: NDArray[np.int32],
     labels: NDArray[np.int32],
     cost: NDArray[np.float32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    horizontal: NDArray[np.float32],
-    vertical: NDArray[np.float32],
-    theta: NDArray[np.float64],
-    tolerance: NDArray[np.float64],
+    problem: Problem,
+    models: Models,
 ) -> tuple[
     NDArray[np.float64],
     NDArray[np.float32],
@@ -487,18 +424,18 @@ def _expansion(
     edges = 0
     for s in range(count):
         i, j = sites[s] // width, sites[s] % width
-        new[s] = _data_cost(alpha, rays[i, j], inverse[i, j], weight[i, j], theta, tolerance)
+        new[s] = _data_cost(alpha, i, j, problem, models)
         excess[s] = np.float64(new[s]) - np.float64(cost[i, j])
         here = labels[i, j]
         for k in range(4):
             if k == 0 and j + 1 < width:
-                ni, nj, u = i, j + 1, horizontal[i, j]
+                ni, nj, u = i, j + 1, problem.horizontal[i, j]
             elif k == 1 and i + 1 < height:
-                ni, nj, u = i + 1, j, vertical[i, j]
+                ni, nj, u = i + 1, j, problem.vertical[i, j]
             elif k == 2 and j > 0:
-                ni, nj, u = i, j - 1, horizontal[i, j - 1]
+                ni, nj, u = i, j - 1, problem.horizontal[i, j - 1]
             elif k == 3 and i > 0:
-                ni, nj, u = i - 1, j, vertical[i - 1, j]
+                ni, nj, u = i - 1, j, problem.vertical[i - 1, j]
             else:
                 continue
             if u == 0:
