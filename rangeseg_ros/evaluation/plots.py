@@ -25,7 +25,7 @@ METRICS = ('correct', 'over', 'under', 'missed', 'noise')
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows under the columns of all of them; numbers to four significant digits."""
+    """Write rows under the columns of all of them; numbers to six significant digits."""
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with replacing(path) as partial, partial.open('w', newline='') as file:
         writer = csv.DictWriter(file, columns, lineterminator='\n')
@@ -35,7 +35,7 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def _text(value: Any) -> Any:
-    return f'{value:.4g}' if isinstance(value, float) else value
+    return f'{value:.6g}' if isinstance(value, float) else value
 
 
 def plot_tolerances(path: Path, rows: Sequence[Row], title: str) -> None:
