@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from rangeseg_ros.core.blocks import block_links, block_moments, weighted
 from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import plane_deviation
-from rangeseg_ros.core.moments import COUNT, block_links, block_moments, fit_all, weighted
+from rangeseg_ros.core.moments import COUNT, fit_all
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
@@ -30,7 +31,8 @@ def grown(inverse, noise=NOISE, seed=0, **sensor):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = weights(image, plane_deviation(image, Config().edge_step))
     model = SensorModel.from_config(Config(**sensor))
-    blocks = weighted(block_moments(image.inverse, image.rays, *edges, 4), model)
+    blocks = block_moments(image.inverse, image.rays, *edges, 4)
+    blocks = weighted(blocks, model, np.zeros(blocks.shape[:2]))
     return surfaces(blocks, block_links(*edges, 4), 4)
 
 

@@ -6,13 +6,15 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core import refinement
+from rangeseg_ros.core import expansion, refinement
+from rangeseg_ros.core.blocks import block_links, block_moments, weighted
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.growing import surfaces
-from rangeseg_ros.core.moments import RATIO, block_links, block_moments, weighted
+from rangeseg_ros.core.moments import RATIO
 from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import Models, Problem, energy, refine, region_moments
+from rangeseg_ros.core.refinement import refine
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -37,7 +39,8 @@ def random_case(seed, height, width, count=3):
     edges = weights(image)
     for edge in edges:
         edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
-    models = Models(theta, np.concatenate([[1.0], random.uniform(1, 4, count)]))
+    # Half of chi-squared, three pixels counting as one measurement, one to four variances granted.
+    models = Models(theta, 0.5 / 3 / np.concatenate([[1.0], random.uniform(1, 4, count)]))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
     return Problem.of(image, SENSOR, *edges, BLOCK), models, labels.astype(np.int32)
 
@@ -45,21 +48,26 @@ def random_case(seed, height, width, count=3):
 def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
     residual = problem.inverse - np.einsum('ijk,lk->lij', problem.rays, models.theta)
-    chi2 = residual**2 * problem.weight / models.tolerance[:, None, None]
-    # Three pixels count as one measurement.
-    cost = np.minimum(chi2 / 2, 8.0) / 3
+    cost = np.minimum(residual**2 * problem.weight * models.price[:, None, None], 8.0 / 3)
     cost[0] = 6.0 / 3
     return np.where(problem.weight > 0, cost, 0)
 
 
+def prior(problem):
+    """Costs of unlike labels to the right (H, W-1) and below (H-1, W)."""
+    links = problem.links.reshape(*problem.inverse.shape, 4)
+    return links[:, :-1, 0], links[:-1, :, 1]
+
+
 def literal_energy(labels, problem, models):
     cost, total = unary(problem, models), 0.0
+    horizontal, vertical = prior(problem)
     for i, j in np.ndindex(labels.shape):
         total += cost[labels[i, j], i, j]
         if j + 1 < labels.shape[1] and labels[i, j] != labels[i, j + 1]:
-            total += 1.2 * problem.horizontal[i, j]
+            total += horizontal[i, j]
         if i + 1 < labels.shape[0] and labels[i, j] != labels[i + 1, j]:
-            total += 1.2 * problem.vertical[i, j]
+            total += vertical[i, j]
     return total
 
 
@@ -72,14 +80,51 @@ def energies(many, problem, models):
     """Energies (n,) of labellings (n, H, W)."""
     rows, columns = np.indices(many.shape[1:])
     total = unary(problem, models)[many, rows, columns].sum(axis=(1, 2))
-    total += 1.2 * ((many[:, :, 1:] != many[:, :, :-1]) * problem.horizontal).sum(axis=(1, 2))
-    return total + 1.2 * ((many[:, 1:] != many[:, :-1]) * problem.vertical).sum(axis=(1, 2))
+    horizontal, vertical = prior(problem)
+    total += ((many[:, :, 1:] != many[:, :, :-1]) * horizontal).sum(axis=(1, 2))
+    return total + ((many[:, 1:] != many[:, :-1]) * vertical).sum(axis=(1, 2))
 
 
-def expand(alpha, labels, cost, problem, models, reach=4):
-    rows, columns = np.nonzero(labels == alpha)
-    box = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
-    return refinement._expand(alpha, box, labels, cost, problem, models, reach)
+def expand(alpha, labels, cost, problem, models, reach=12):
+    """Expand a label from everywhere; in place."""
+    labels, cost = labels.ravel(), cost.ravel()
+    width = problem.inverse.shape[1]
+    start, sites = expansion.fronts(labels, problem.links, width, len(models.theta))
+    front, position = sites[start[alpha] : start[alpha + 1]], np.full(len(labels), -1, np.int32)
+    move = refinement._move(alpha, front, reach, labels, cost, problem, models, position)
+    assert (position == -1).all()
+    return move.make(alpha, labels, cost, 1e-6)
+
+
+def linked(problem, label, labels):
+    """Pixels (H, W) of other labels that edges join to those of a label, directly or not."""
+    links = problem.links.reshape(*labels.shape, 4) > 0
+    reached = labels == label
+    for _ in range(labels.size):
+        before = reached.copy()
+        reached[:, 1:] |= before[:, :-1] & links[:, :-1, 0]
+        reached[:, :-1] |= before[:, 1:] & links[:, :-1, 0]
+        reached[1:] |= before[:-1] & links[:-1, :, 1]
+        reached[:-1] |= before[1:] & links[:-1, :, 1]
+    return reached & (labels != label)
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 6), (6, 1), (5, 7)])
+def test_links_are_the_weights_on_all_four_sides(shape):
+    random = np.random.default_rng(sum(shape))
+    horizontal = random.random((shape[0], shape[1] - 1)).astype(np.float32)
+    vertical = random.random((shape[0] - 1, shape[1])).astype(np.float32)
+    links = expansion.links(horizontal, vertical, 3.0).reshape(*shape, 4)
+    for side, (weight, border) in enumerate(
+        [
+            (links[:, :-1, 0] / 3, links[:, -1, 0]),
+            (links[:-1, :, 1] / 3, links[-1, :, 1]),
+            (links[:, 1:, 2] / 3, links[:, 0, 2]),
+            (links[1:, :, 3] / 3, links[0, :, 3]),
+        ]
+    ):
+        np.testing.assert_allclose(weight, vertical if side % 2 else horizontal, rtol=1e-6)
+        assert not border.any()
 
 
 def test_weights_are_inverse_variances():
@@ -99,12 +144,12 @@ def test_energy_is_what_it_is_defined_to_be(seed):
 
 @pytest.mark.parametrize('seed', range(20))
 def test_an_expansion_is_the_best_there_is(seed):
-    """Of all subsets of the pixels that may switch; it never switches those without data."""
+    """Of all subsets of the pixels that edges join to the label."""
     problem, models, labels = random_case(seed, 3, 4)
     labels[0, 0], problem.inverse[0, 0] = 1, models.theta[1] @ problem.rays[0, 0]
     problem.weight[0, 0] = problem.weight.max()
     cost = cost_of(labels, problem, models)
-    free = np.flatnonzero((labels != 1) & (problem.weight > 0))
+    free = np.flatnonzero(linked(problem, 1, labels))
     chosen = np.array(list(product([False, True], repeat=len(free))))
     every = np.repeat(labels.reshape(1, -1), len(chosen), axis=0)
     every[:, free] = np.where(chosen, 1, every[:, free])
@@ -145,12 +190,13 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
     np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
     beside = np.zeros((5, *labels.shape), bool)
     beside[0] = True
+    horizontal, vertical = prior(problem)
     for label in range(1, 5):
         here = labels == label
-        beside[label, :, 1:] |= here[:, :-1] & (problem.horizontal > 0)
-        beside[label, :, :-1] |= here[:, 1:] & (problem.horizontal > 0)
-        beside[label, 1:] |= here[:-1] & (problem.vertical > 0)
-        beside[label, :-1] |= here[1:] & (problem.vertical > 0)
+        beside[label, :, 1:] |= here[:, :-1] & (horizontal > 0)
+        beside[label, :, :-1] |= here[:, 1:] & (horizontal > 0)
+        beside[label, 1:] |= here[:-1] & (vertical > 0)
+        beside[label, :-1] |= here[1:] & (vertical > 0)
     value = energies(labels[None], problem, models)[0]
     for label in range(5):
         pixels = np.flatnonzero(beside[label] & (problem.weight > 0))
@@ -165,7 +211,8 @@ def small_room(seed=900):
     sensor = SensorModel.from_config(Config())
     edges = weights(image)
     blocks = block_moments(image.inverse, image.rays, *edges, BLOCK)
-    found = surfaces(weighted(blocks, sensor), block_links(*edges, BLOCK), BLOCK)
+    blocks = weighted(blocks, sensor, np.zeros(blocks.shape[:2]))
+    found = surfaces(blocks, block_links(*edges, BLOCK), BLOCK)
     return Problem.of(image, sensor, *edges, BLOCK), found, sensor
 
 
@@ -188,9 +235,9 @@ def test_each_stage_lowers_the_energy(monkeypatch):
         monkeypatch.setattr(refinement, name, run)
 
     watched('_descended', lambda arguments, result: (result[0], arguments[2]))
-    watched('_expand', lambda arguments, result: (arguments[2], arguments[5]))
+    watched('_expand_each', lambda arguments, result: (arguments[0], arguments[3]))
     labels, models = refine(problem, surface, moments, sensor)
-    assert len(values) >= 5
+    assert len(values) == 3
     assert (np.diff(values) <= 1e-3).all()
     assert values[1] < 0.5 * values[0]
     assert values[-1] < values[1]

@@ -11,7 +11,7 @@ from rangeseg_ros.core.regions import (
     is_noise,
     merge,
     plane_regions,
-    relabel,
+    without,
 )
 
 
@@ -66,10 +66,10 @@ def test_merge_keeps_noise_that_touches_nothing():
     assert merge(regions, np.array([False, True]))[2, 2] == 1
 
 
-def test_relabel_counts_down_by_size():
-    regions = np.array([[1, 2, 2], [3, 3, 3], [0, 0, 0]])
-    found = relabel(regions, np.array([False, True, True, True]))
-    assert found.tolist() == [[3, 2, 2], [1, 1, 1], [0, 0, 0]]
+def test_regions_left_keep_their_order():
+    regions = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
+    found = without(regions, np.array([True, False, True, False, False]))
+    assert found.tolist() == [[1, 1, 1, 1], [0, 0, 0, 2], [2, 3, 0, 0]]
     assert found.dtype == np.uint16
 
 

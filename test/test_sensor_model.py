@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from rangeseg_ros.core.blocks import block_moments, residual_noise, slopes_and_residuals
 from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.moments import block_moments, residual_noise
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
@@ -30,7 +30,8 @@ def shown(noise, range_noise, outliers=0.0, seed=0):
     inverse[random.random(CAMERA.shape) < outliers] += 0.05
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     blocks = block_moments(image.inverse, image.rays, *weights(image), 4)
-    return residual_noise(blocks, 4)
+    _, residual = slopes_and_residuals(blocks, image.rays, 4)
+    return residual_noise(blocks, residual, 4)
 
 
 def test_variance_is_the_sum_of_both_kinds():

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import FLOOR, SensorModel
+from rangeseg_ros.core.threads import halves
 
 MOST = 100
 """Cells of a region at most."""
@@ -75,8 +76,10 @@ class Cells(NamedTuple):
         start = np.concatenate([[0], np.cumsum(rows * columns)])
         cells = cls(box, border, size, columns, start, np.zeros((start[-1], RECORD)))
         central = image.camera is not None
-        _accumulate(labels, image.inverse, image.rays, cells, variances, central)
-        return cells
+        upper, lower = halves(
+            _sums, len(labels), labels, image.inverse, image.rays, cells, variances, central
+        )
+        return cells._replace(sums=upper + lower)
 
     def without_outliers(
         self,
@@ -208,18 +211,21 @@ def _add(
         record[POINT + entry] += sign * value
 
 
-@njit(cache=True)
-def _accumulate(
+@njit(cache=True, nogil=True)
+def _sums(
+    top: int,
+    bottom: int,
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     cells: Cells,
     variances: NDArray[np.float64],
     central: bool,
-) -> None:
-    """Add every measured pixel to its cell."""
-    height, width = labels.shape
-    for i in range(height):
+) -> NDArray[np.float64]:
+    """Sums (N, 25) over the measured pixels of some rows."""
+    sums = np.zeros_like(cells.sums)
+    width = labels.shape[1]
+    for i in range(top, bottom):
         j = 0
         while j < width:
             first, label = j, labels[i, j]
@@ -228,8 +234,9 @@ def _accumulate(
             while j < min(end, width) and labels[i, j] == label:
                 j += 1
             if label > 0:
-                record = cells.sums[_index(cells, label, i, first)]
+                record = sums[_index(cells, label, i, first)]
                 _add(record, i, first, j, inverse, rays, variances, central, 1.0)
+    return sums
 
 
 @njit(cache=True)

@@ -7,8 +7,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.moments import COUNT, RATIO
-from rangeseg_ros.core.refinement import Models, Problem, region_moments
+from rangeseg_ros.core.plane_energy import Models, Problem, region_moments
 from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.threads import halves
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
@@ -21,6 +22,8 @@ _FLATNESS = 0.02
 # times its mean.
 _NOISE = 9.0 * 3.0 * 4.0
 _STRIDE = 2
+# Exponents of the six terms of a quadratic in the pixel coordinates x and y.
+_X, _Y = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 # Standard deviations, of noise and twice the distortion, to which a residual is the region's.
 _INLIER = 4.0
 
@@ -45,15 +48,25 @@ def curved(
     count = int(regions.max(initial=0)) + 1
     # Every other row and column will do: what is asked for is smooth.
     sparse = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-    problem = problem.crop(*sparse)
+    problem = problem._replace(
+        inverse=problem.inverse[sparse], rays=problem.rays[sparse], weight=problem.weight[sparse]
+    )
     regions = regions[sparse]
     moments = region_moments(problem, regions, count, sensor)
     models = Models.of(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
-    normal, right, square, area, scale = _normal_equations(
-        regions, problem.inverse, problem.rays, problem.weight, models.theta, limit
+    parts = halves(
+        _normal_equations,
+        len(regions),
+        regions,
+        problem.inverse,
+        problem.rays,
+        problem.weight,
+        models.theta,
+        limit,
     )
+    normal, right, square, area, scale = map(np.add, *parts)
     pixels = normal[:, 0, 0]
     size = np.maximum(pixels * _STRIDE**2, 1)
     ridge = 1e-9 * np.maximum(pixels, 1)[:, None, None] * np.eye(6)
@@ -69,8 +82,10 @@ def curved(
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _normal_equations(
+    first: int,
+    after: int,
     regions: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
@@ -84,7 +99,7 @@ def _normal_equations(
     NDArray[np.float64],
     NDArray[np.float64],
 ]:
-    """Normal equations of a quadratic in the pixel coordinates fitted to each region.
+    """Normal equations of a quadratic in the pixel coordinates fitted to some rows of each region.
 
     What is fitted are the residuals in standard deviations of the noise, those beyond `limit`
     left out. Also returns the sum of their squares, the area in square metres of each region seen
@@ -94,36 +109,44 @@ def _normal_equations(
     count = len(theta)
     normal, right = np.zeros((count, 6, 6)), np.zeros((count, 6))
     total, area, scale = np.zeros(count), np.zeros(count), np.zeros(count)
-    basis = np.ones(6)
-    for i in range(height):
+    for i in range(first, after):
         y = 2 * (i - height / 2) / width
-        for j in range(width):
+        j = 0
+        while j < width:
             label = regions[i, j]
             if label == 0:
+                j += 1
                 continue
-            plane, ray = theta[label], rays[i, j]
-            value = inverse[i, j] - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
-            root = np.sqrt(weight[i, j])
-            value *= root
-            if abs(value) > limit[label]:
-                continue
-            total[label] += value * value
-            square = inverse[i, j] ** 2
-            scale[label] += 1 / (root * square)
-            if i > 0 and j > 0 and inverse[i - 1, j] > 0 and inverse[i, j - 1] > 0:
-                across, along = 0.0, 0.0
-                for k in range(3):
-                    across += (ray[k] - rays[i, j - 1, k]) ** 2
-                    along += (ray[k] - rays[i - 1, j, k]) ** 2
-                area[label] += np.sqrt(across * along) / square
-            x = 2 * j / width - 1
-            basis[1], basis[2] = x, y
-            basis[3], basis[4], basis[5] = x * x, x * y, y * y
+            # Along a run of the row only x varies: its powers are all there is to sum.
+            plane = theta[label]
+            p0 = p1 = p2 = p3 = p4 = v0 = v1 = v2 = squares = metres = deviations = 0.0
+            while j < width and regions[i, j] == label:
+                ray = rays[i, j]
+                value = inverse[i, j] - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
+                root = np.sqrt(weight[i, j])
+                value *= root
+                if abs(value) <= limit[label]:
+                    squares += value * value
+                    square = inverse[i, j] ** 2
+                    deviations += 1 / (root * square)
+                    if i > 0 and j > 0 and inverse[i - 1, j] > 0 and inverse[i, j - 1] > 0:
+                        across, along = 0.0, 0.0
+                        for k in range(3):
+                            across += (ray[k] - rays[i, j - 1, k]) ** 2
+                            along += (ray[k] - rays[i - 1, j, k]) ** 2
+                        metres += np.sqrt(across * along) / square
+                    x = 2 * j / width - 1
+                    square = x * x
+                    p0, p1, p2 = p0 + 1, p1 + x, p2 + square
+                    p3, p4 = p3 + square * x, p4 + square * square
+                    v0, v1, v2 = v0 + value, v1 + value * x, v2 + value * square
+                j += 1
+            total[label] += squares
+            area[label] += metres
+            scale[label] += deviations
+            power, response = (p0, p1, p2, p3, p4), (v0, v1, v2)
             for a in range(6):
-                right[label, a] += basis[a] * value
-                for b in range(a, 6):
-                    normal[label, a, b] += basis[a] * basis[b]
-    for a in range(6):
-        for b in range(a):
-            normal[:, a, b] = normal[:, b, a]
+                right[label, a] += y ** _Y[a] * response[_X[a]]
+                for b in range(6):
+                    normal[label, a, b] += y ** (_Y[a] + _Y[b]) * power[_X[a] + _X[b]]
     return normal, right, total, area, scale

@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.threads import halves
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
 _FAR = 2.0
@@ -38,7 +39,9 @@ def areas_and_axes(
     major : (M + 1, 3) float64
         Unit vector in the plane of the largest second moment of the area; x >= 0.
     """
-    sums = _area_moments(labels, image.inverse, image.rays, _footprints(image), theta, tangents)
+    arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents
+    upper, lower = halves(_area_moments, len(labels), *arrays)
+    sums = upper + lower
     # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
     area = sums[:, 0] * np.linalg.norm(theta, axis=1)
     mean = sums[:, 1:3] / np.maximum(sums[:, :1], 1e-300)
@@ -74,7 +77,10 @@ def rectangles(
     """
     camera = image.camera
     half = (0.5 / camera.fx, 0.5 / camera.fy) if camera else (0.0, 0.0)
-    return _limits(labels, image.inverse, image.rays, theta, axes, *half)
+    arrays = labels, image.inverse, image.rays, theta, axes
+    upper, lower = halves(_limits, len(labels), *arrays, *half)
+    # Smallest and largest.
+    return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
 
 
 def _footprints(image: RangeImage) -> NDArray[np.float32]:
@@ -111,8 +117,10 @@ def _ray_footprints(
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _area_moments(
+    first: int,
+    after: int,
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
@@ -122,8 +130,8 @@ def _area_moments(
 ) -> NDArray[np.float64]:
     """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2: a is area over |theta|."""
     sums = np.zeros((len(theta), 6))
-    height, width = labels.shape
-    for i in range(height):
+    width = labels.shape[1]
+    for i in range(first, after):
         for j in range(width):
             label = int(labels[i, j])
             y = inverse[i, j]
@@ -156,8 +164,10 @@ def _area_moments(
     return sums
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _limits(
+    first: int,
+    after: int,
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
@@ -170,8 +180,8 @@ def _limits(
     limits = np.empty((len(theta), 2, 2))
     limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
     corners = 1 if half_x == 0 else 4
-    height, width = labels.shape
-    for i in range(height):
+    width = labels.shape[1]
+    for i in range(first, after):
         for j in range(width):
             label = labels[i, j]
             # Rows of pixels are straight on the plane: the extremes lie at their ends.

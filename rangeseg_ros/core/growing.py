@@ -17,7 +17,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, common_residual, fit, fit_all
+from rangeseg_ros.core.blocks import Links
+from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, common_residual, fit
+from rangeseg_ros.core.threads import halves
 
 DISTORTION_PIXELS = 2000.0
 """Regions of this size meet half the variance of the distortion, large ones all of it."""
@@ -34,9 +36,6 @@ _WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 2.0, 10.0, 30.0
 _PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = 10.0
-
-# (rows, columns-1) and (rows-1, columns): whether a block touches its right, its lower neighbour.
-Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 def surfaces(
@@ -62,18 +61,35 @@ def surfaces(
     """
     shape = moments.shape[:2]
     blocks = moments.reshape(-1, SIZE)
-    _, residual = fit_all(blocks)
-    smooth = (blocks[:, COUNT] > 0) & (residual < _ROUGH * blocks[:, COUNT])
-    pairs = _pairs(smooth.reshape(shape), *links)
-    parent = _quads(blocks, smooth.reshape(shape), *links)
-    patch, moments = _renumbered(
-        _grow(blocks, smooth, pairs, parent, _PATCH_LARGEST * block**2),
-        blocks,
-        _PATCH_MINIMUM * block**2,
-    )
-    border = _borders(pairs, patch, len(moments))
+    # No patch reaches over the middle, but neither does any reach across a large surface.
+    roots = halves(_patches, shape[0], moments, *links, _PATCH_LARGEST * block**2)
+    patch, moments = _renumbered(np.concatenate(roots), blocks, _PATCH_MINIMUM * block**2)
+    border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumbered(_join(moments, border), moments, 1)
     return surface[patch].reshape(shape), moments
+
+
+@njit(cache=True, nogil=True)
+def _patches(
+    first: int,
+    after: int,
+    moments: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    largest: float,
+) -> NDArray[np.intp]:
+    """Group some rows of blocks into patches; number of the block at the root of each block's."""
+    shape = after - first, moments.shape[1]
+    blocks = moments[first:after].copy().reshape(-1, SIZE)
+    right, below = right[first:after], below[first : max(after - 1, first)]
+    theta = np.zeros(3)
+    smooth = np.zeros(len(blocks), np.bool_)
+    for a in range(len(blocks)):
+        count = blocks[a, COUNT]
+        smooth[a] = count > 0 and fit(blocks[a], theta) < _ROUGH * count
+    pairs = _pairs(smooth.reshape(shape), right, below)
+    parent = _quads(blocks, smooth.reshape(shape), right, below)
+    return _grow(blocks, smooth, pairs, parent, largest) + first * shape[1]
 
 
 @njit(cache=True)
@@ -117,19 +133,30 @@ def _renumbered(
     for a in range(len(root)):
         labels[a] = number[root[a]]
         if labels[a] > 0:
-            total[labels[a]] += moments[a]
+            for entry in range(SIZE):
+                total[labels[a], entry] += moments[a, entry]
     return labels, total
 
 
 @njit(cache=True)
-def _borders(pairs: NDArray[np.intp], patch: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+def _borders(
+    patch: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
+) -> NDArray[np.float64]:
     """Length of the border between every two patches, in blocks: (count, count), symmetric."""
+    rows, columns = patch.shape
     border = np.zeros((count, count))
-    for k in range(len(pairs)):
-        a, b = patch[pairs[k, 0]], patch[pairs[k, 1]]
-        if a != b and a > 0 and b > 0:
-            border[a, b] += 1
-            border[b, a] += 1
+    for i in range(rows):
+        for j in range(columns):
+            a = patch[i, j]
+            for k in range(2):
+                if k == 0 and (j + 1 == columns or not right[i, j]):
+                    continue
+                if k == 1 and (i + 1 == rows or not below[i, j]):
+                    continue
+                b = patch[i, j + 1] if k == 0 else patch[i + 1, j]
+                if a != b and a > 0 and b > 0:
+                    border[a, b] += 1
+                    border[b, a] += 1
     return border
 
 
@@ -186,12 +213,11 @@ def _grow(
     largest: float,
 ) -> NDArray[np.intp]:
     """Merge blocks to patches of at most `largest` pixels, the flattest first, each with the
-    neighbour it fits best.
+    neighbour it fits best; in place.
 
     Returns the root of each block's patch, itself for a block that is no node.
     """
     count = len(moments)
-    moments = moments.copy()
     for a in range(count):
         if parent[a] != a:
             moments[parent[a]] += moments[a]

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.threads import aside, strips
 
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
 GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
@@ -126,9 +127,24 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
     """
     inverse = image.inverse
     mask = (inverse > 0).astype(np.float32)
-    near, wide = (_window_sums(inverse, mask, size) for size in (_WINDOW, 2 * _WINDOW + 1))
-    strong = _strong(inverse, *near, step)
-    return _crossings(inverse, strong, *wide, _CLEAR * step)
+    wide = aside(_window_sums, inverse, mask, 2 * _WINDOW + 1)
+    mean = _means(*_window_sums(inverse, mask, _WINDOW))
+    height, width = image.shape
+    strong = np.zeros((height, width), np.bool_)
+    strips(_find_strong, height, mean, step, strong)
+    horizontal = np.zeros((height, width - 1), np.bool_)
+    vertical = np.zeros((height - 1, width), np.bool_)
+    strips(
+        _find_crossings,
+        height,
+        inverse,
+        strong,
+        *wide.result(),
+        _CLEAR * step,
+        horizontal,
+        vertical,
+    )
+    return horizontal, vertical
 
 
 def _window_sums(
@@ -142,25 +158,28 @@ def _window_sums(
 
 
 @njit(cache=True)
-def _strong(
-    inverse: NDArray[np.float32],
-    total: NDArray[np.float32],
-    count: NDArray[np.float32],
-    step: float,
-) -> NDArray[np.bool_]:
-    """Pixels at which the step to some neighbour leaves the steps beside it by more than `step`.
-
-    A boundary that runs along the rows shows in the columns alone, the risers of its staircase
-    too: what counts is a pixel's deviation in either direction.
-    """
-    height, width = inverse.shape
+def _means(total: NDArray[np.float32], count: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of windows, NaN where nothing was measured and in a margin around the image."""
+    height, width = total.shape
     mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
     for i in range(height):
         for j in range(width):
             if count[i, j] > 0.5:
                 mean[i + _MARGIN, j + _MARGIN] = total[i, j] / count[i, j]
-    strong = np.zeros((height, width), np.bool_)
-    for i in range(height):
+    return mean
+
+
+@njit(cache=True, nogil=True)
+def _find_strong(
+    first: int, after: int, mean: NDArray[np.float32], step: float, strong: NDArray[np.bool_]
+) -> None:
+    """Pixels at which the step to some neighbour leaves the steps beside it by more than `step`.
+
+    A boundary that runs along the rows shows in the columns alone, the risers of its staircase
+    too: what counts is a pixel's deviation in either direction.
+    """
+    height, width = strong.shape
+    for i in range(first, after):
         row = mean[i + _MARGIN]
         for j in range(width):
             # Boundaries with the next pixel: the windows around the last but one and so on.
@@ -168,11 +187,11 @@ def _strong(
             if j + 1 < width and _leaves(row[k - 4], row[k - 1], row[k + 2], row[k + 5], step):
                 strong[i, j] = strong[i, j + 1] = True
             m = i + _MARGIN
+            # The row below may belong to another strip, but both only ever set.
             if i + 1 < height and _leaves(
                 mean[m - 4, k], mean[m - 1, k], mean[m + 2, k], mean[m + 5, k], step
             ):
                 strong[i, j] = strong[i + 1, j] = True
-    return strong
 
 
 @njit(cache=True)
@@ -189,22 +208,24 @@ def _leaves(a: float, b: float, c: float, d: float, step: float) -> bool:
     return above or below
 
 
-@njit(cache=True)
-def _crossings(
+@njit(cache=True, nogil=True)
+def _find_crossings(
+    first: int,
+    after: int,
     inverse: NDArray[np.float32],
     strong: NDArray[np.bool_],
     total: NDArray[np.float32],
     count: NDArray[np.float32],
     clear: float,
-) -> GridEdges:
+    horizontal: NDArray[np.bool_],
+    vertical: NDArray[np.bool_],
+) -> None:
     """Edges between strong pixels on unlike sides of the local mean, and all of a clear step.
 
     The latter because where three surfaces meet, two may lie on the same side of the mean.
     """
     height, width = inverse.shape
-    horizontal = np.zeros((height, width - 1), np.bool_)
-    vertical = np.zeros((height - 1, width), np.bool_)
-    for i in range(height):
+    for i in range(first, after):
         for j in range(width):
             here = inverse[i, j]
             if here == 0:
@@ -224,4 +245,3 @@ def _crossings(
                     and strong[i + 1, j]
                     and above != (there * count[i + 1, j] > total[i + 1, j])
                 )
-    return horizontal, vertical

@@ -79,21 +79,25 @@ def _components(
     parent = np.empty(height * width + 1, np.int32)
     count = 0
     for i in range(height):
+        # What was last found equivalent: most pixels tell what the one before has told.
+        known = -1
         for j in range(width):
             left = j > 0 and horizontal[i, j - 1] > 0 and labels[i, j] == labels[i, j - 1]
             up = i > 0 and vertical[i - 1, j] > 0 and labels[i, j] == labels[i - 1, j]
             if left:
                 found[i, j] = found[i, j - 1]
-                if up:
+                if up and found[i - 1, j] != known:
                     a, b = found[i, j], found[i - 1, j]
+                    known = b
                     while parent[a] != a:
                         a = parent[a]
                     while parent[b] != b:
                         b = parent[b]
                     parent[max(a, b)] = min(a, b)
             elif up:
-                found[i, j] = found[i - 1, j]
+                found[i, j] = known = found[i - 1, j]
             else:
+                known = -1
                 count += 1
                 parent[count] = count
                 found[i, j] = count
@@ -195,11 +199,11 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
     return framed.reshape(height + 2, row)[1:-1, 1:-1].copy()
 
 
-def relabel(regions: NDArray[np.integer], keep: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Number the regions to keep 1...M by falling size, the rest 0; at most 65535 are kept."""
-    area = np.where(keep, np.bincount(regions.ravel(), minlength=len(keep)), 0)
-    area[0] = 0
-    return _translated(regions, by_falling_size(area))
+def without(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
+    kept = ~dropped
+    kept[0] = False
+    return _translated(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
 
 
 def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:

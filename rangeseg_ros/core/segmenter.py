@@ -11,28 +11,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core import coarse_to_fine, moves
+from rangeseg_ros.core.blocks import (
+    block_links,
+    block_moments,
+    block_size,
+    residual_noise,
+    slopes_and_residuals,
+    weighted,
+)
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.curvature import curved
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle, energy
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
-from rangeseg_ros.core.moments import (
-    block_links,
-    block_moments,
-    block_size,
-    residual_noise,
-    slopes,
-    weighted,
-)
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
+from rangeseg_ros.core.plane_energy import Problem
+from rangeseg_ros.core.plane_energy import energy as plane_energy
 from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import Problem, refine
-from rangeseg_ros.core.refinement import energy as plane_energy
-from rangeseg_ros.core.regions import plane_regions, relabel
+from rangeseg_ros.core.refinement import refine
+from rangeseg_ros.core.regions import plane_regions, without
 from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.threads import aside
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +104,15 @@ class Segmenter:
         """Regions, the sensor and the energy, with planes as labels."""
         size = block_size(image.shape)
         blocks = block_moments(image.inverse, image.rays, horizontal, vertical, size)
-        sensor = SensorModel.from_config(self.config).measured(*residual_noise(blocks, size))
-        slope = slopes(blocks, image.rays, size)
+        slope, residual = slopes_and_residuals(blocks, image.rays, size)
+        noise = residual_noise(blocks, residual, size)
+        sensor = SensorModel.from_config(self.config).measured(*noise)
         watch.lap('blocks')
+        pending = aside(Problem.of, image, sensor, horizontal, vertical, size)
         links = block_links(horizontal, vertical, size)
         surface, moments = surfaces(weighted(blocks, sensor, slope), links, size)
+        problem = pending.result()
         watch.lap('surfaces')
-        problem = Problem.of(image, sensor, horizontal, vertical, size)
         # A region may gain as much again from pixels that no block could take.
         least = self.config.min_pixels // 2
         labels, models = refine(problem, surface, moments, sensor, least, self.config.exact)
@@ -116,7 +120,7 @@ class Segmenter:
         regions = plane_regions(
             labels, image.valid & (labels > 0), horizontal, vertical, self.config
         )
-        regions = relabel(regions, ~curved(problem, regions, sensor))
+        regions = without(regions, curved(problem, regions, sensor))
         watch.lap('regions')
         return regions, sensor, lambda: plane_energy(labels, problem, models)
 

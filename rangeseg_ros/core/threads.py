@@ -1,0 +1,67 @@
+"""Compiled kernels on several threads: they release the interpreter while they run.
+
+Threads of our own and none of numba's: those do not survive a fork, and the default ones may not
+be entered from two threads. There are as many as OpenCV uses, so that `cv2.setNumThreads` sets
+both.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import cv2
+
+T = TypeVar('T')
+
+# More would wait for the memory.
+_MOST = 4
+# Rows that are worth the handing over.
+_ROWS = 16
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(_MOST, 'rangeseg')
+
+
+os.register_at_fork(after_in_child=_pool.cache_clear)
+
+
+def strips(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
+    """Run kernel(first, after, *arguments) on strips of the rows at the same time.
+
+    What one strip writes no other may touch: then the result is the same for any number of
+    threads.
+    """
+    count = max(min(cv2.getNumThreads(), _MOST, rows // _ROWS), 1)
+    bounds = [rows * part // count for part in range(count + 1)]
+    others = [
+        _pool().submit(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])
+    ]
+    kernel(0, bounds[1], *arguments)
+    for other in others:
+        other.result()
+
+
+def halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T, T]:
+    """Results of kernel(first, after, *arguments) for the upper and the lower half of the rows.
+
+    These halves, whatever the number of threads: sums over them always round alike.
+    """
+    middle = rows // 2
+    lower = aside(kernel, middle, rows, *arguments)
+    return kernel(0, middle, *arguments), lower.result()
+
+
+def aside(task: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Start a task that has no subtasks here, beside what the caller does until `result()`."""
+    if cv2.getNumThreads() > 1:
+        return _pool().submit(task, *arguments)
+    future: Future[T] = Future()
+    future.set_result(task(*arguments))
+    return future

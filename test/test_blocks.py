@@ -1,0 +1,123 @@
+"""Blocks against their definition."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.blocks import (
+    block_links,
+    block_moments,
+    residual_noise,
+    slopes_and_residuals,
+    weighted,
+)
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, fit_all
+from rangeseg_ros.core.sensor import SensorModel
+
+
+def grid(height, width, seed=0):
+    """Inverse range and rays of a noisy plane, and neighbourhood weights without jumps."""
+    random = np.random.default_rng(seed)
+    rays = np.ones((height, width, 3), np.float32)
+    rays[..., 0] = (np.arange(width) - width / 2) / 50
+    rays[..., 1] = ((np.arange(height) - height / 2) / 50)[:, None]
+    inverse = rays @ np.array([0.1, -0.05, 0.5]) + random.normal(0, 0.002, (height, width))
+    horizontal = np.ones((height, width - 1), np.float32)
+    vertical = np.ones((height - 1, width), np.float32)
+    return inverse.astype(np.float32), rays, horizontal, vertical
+
+
+def test_blocks_are_sums_over_their_pixels():
+    inverse, rays, *edges = grid(12, 14)
+    blocks = block_moments(inverse, rays, *edges, 4)
+    assert blocks.shape == (3, 4, SIZE)
+    part = slice(4, 8), slice(8, 12)
+    own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
+    expected = [*(own.T @ own)[np.triu_indices(3)], *own.T @ y, y @ y, 16, 0, 0]
+    np.testing.assert_allclose(blocks[1, 2], expected, rtol=1e-12)
+    assert (blocks[:, :3, COUNT] == 16).all()
+    assert not blocks[:, 3].any(), 'half a block at the border'
+
+
+def test_blocks_that_jumps_cross_are_left_out():
+    """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
+    inverse, rays, horizontal, vertical = grid(12, 20)
+    horizontal[1, 1] = 0  # inside block (0, 0)
+    vertical[6, 9] = 0  # inside block (1, 2)
+    horizontal[9, 7] = 0  # between blocks (2, 1) and (2, 2)
+    vertical[3, 14] = 0  # between blocks (0, 3) and (1, 3)
+    inverse[1, 17] = 0
+    horizontal[1, 16:18] = 0
+    vertical[0:2, 17] = 0
+    count = block_moments(inverse, rays, horizontal, vertical, 4)[..., COUNT]
+    expected = np.full((3, 5), 16)
+    expected[0, 0] = expected[1, 2] = 0
+    expected[0, 4] = 15
+    np.testing.assert_array_equal(count, expected)
+
+
+@pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
+def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
+    """30 % of 16 pixels are 4.8."""
+    inverse, rays, horizontal, vertical = grid(4, 4)
+    inverse.ravel()[:missing] = 0
+    block = block_moments(inverse, rays, horizontal, vertical, 4)[0, 0]
+    assert block[COUNT] == (16 - missing if kept else 0)
+    assert block.any() == kept
+
+
+@pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
+def test_blocks_touch_along_half_of_their_border(shape):
+    height, width = shape
+    random = np.random.default_rng(sum(shape))
+    horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
+    vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
+    right, below = block_links(horizontal, vertical, 4)
+    rows, columns = -(-height // 4), -(-width // 4)
+    assert right.shape == (rows, columns - 1) and below.shape == (rows - 1, columns)
+    for i, j in np.ndindex(right.shape):
+        assert right[i, j] == (horizontal[4 * i : 4 * i + 4, 4 * j + 3].sum() >= 2)
+    for i, j in np.ndindex(below.shape):
+        assert below[i, j] == (vertical[4 * i + 3, 4 * j : 4 * j + 4].sum() >= 2)
+
+
+def noise_of(blocks, rays):
+    _, residual = slopes_and_residuals(blocks, rays, 4)
+    return residual_noise(blocks, residual, 4)
+
+
+def test_slopes_and_residuals_are_those_of_the_planes():
+    random = np.random.default_rng(5)
+    inverse, rays, *edges = grid(40, 60)
+    blocks = block_moments(inverse, rays, *edges, 4)
+    slope, residual = slopes_and_residuals(blocks, rays, 4)
+    i, j = random.integers(0, (10, 15))
+    part = slice(4 * i, 4 * i + 4), slice(4 * j, 4 * j + 4)
+    own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
+    theta, square, _, _ = np.linalg.lstsq(own, y, rcond=None)
+    assert residual[i, j] == pytest.approx(square[0], rel=1e-6)
+    # Rays are 1/50 apart.
+    assert slope[i, j] == pytest.approx(np.hypot(*theta[:2]) / 50, rel=1e-4)
+
+
+def test_residual_noise_is_unbiased():
+    inverse, rays, *edges = grid(200, 240, seed=3)
+    inverse[0, 0] = 0  # an incomplete block does not count
+    at, variance = noise_of(block_moments(inverse, rays, *edges, 4), rays)
+    assert len(at) == len(variance) == 50 * 60 - 1
+    # 3000 blocks of 13 degrees of freedom: 0.7 % of standard error.
+    assert variance.mean() == pytest.approx(0.002**2, rel=0.03)
+    assert at.mean() == pytest.approx(inverse.mean(), rel=1e-3)
+
+
+def test_weights_count_in_variances_of_the_sensor():
+    inverse, rays, *edges = grid(80, 80, seed=4)
+    sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
+    plain = block_moments(inverse, rays, *edges, 4)
+    blocks = weighted(plain, sensor, np.zeros(plain.shape[:2]))
+    theta, residual = fit_all(blocks.reshape(-1, SIZE))
+    unweighted, _ = fit_all(plain.reshape(-1, SIZE))
+    np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)
+    # Chi-squared of 16 - 3 degrees of freedom each; 400 blocks: 2 % of standard error.
+    assert residual.mean() == pytest.approx(13, rel=0.08)
+    np.testing.assert_allclose(blocks[..., RATIO], 16 * 4.0, rtol=1e-5)
