@@ -245,14 +245,37 @@ def test_each_stage_lowers_the_energy(monkeypatch):
 
 
 def test_no_expansion_helps_after_the_exact_minimisation():
+    """Of no plane to anywhere, of the others to the pixels around their blocks."""
     problem, (surface, moments), sensor = small_room()
     labels, models = refine(problem, surface, moments, sensor, exact=True)
     value = energies(labels[None], problem, models)[0]
-    for alpha in range(1, len(models.theta)):
-        if (labels == alpha).any():
-            changed = labels.copy()
-            expand(alpha, changed, cost_of(labels, problem, models), problem, models, 12)
-            assert energies(changed[None], problem, models)[0] > value - 1e-2
+    assert value <= energies(refine(problem, surface, moments, sensor)[0][None], problem, models)
+    width = labels.shape[1]
+    for alpha in range(len(models.theta)):
+        blocks = np.pad(surface == alpha, 4)
+        around = np.lib.stride_tricks.sliding_window_view(blocks, (9, 9)).any(axis=(2, 3))
+        pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
+        front = np.flatnonzero(pixels & (problem.weight > 0)).astype(np.int32)
+        changed, cost = labels.ravel().copy(), cost_of(labels, problem, models).ravel()
+        position = np.full(labels.size, -1, np.int32)
+        move = refinement._move(alpha, front, 1, changed, cost, problem, models, position)
+        move.make(alpha, changed, cost, 1e-6)
+        changed = changed.reshape(1, -1, width)
+        assert energies(changed, problem, models)[0] > value - 1e-2
+
+
+@pytest.mark.parametrize('exact', [False, True])
+def test_refits_lower_the_energy_until_they_do_not(exact):
+    problem, (surface, moments), sensor = small_room()
+    values = []
+    for refits in (0, 1, 2, 5, 40):
+        labels, models = refine(problem, surface, moments, sensor, 0, exact, refits)
+        values.append(energies(labels[None], problem, models)[0])
+    assert values[1] < values[0]
+    assert (np.diff(values) <= 0).all()
+    # Some round before the last did not help.
+    again, _ = refine(problem, surface, moments, sensor, 0, exact, 41)
+    np.testing.assert_array_equal(labels, again)
 
 
 def test_moments_of_regions_are_sums_over_their_pixels():

@@ -106,9 +106,16 @@ class Config:
     )
     exact: bool = option(
         False,
-        'minimise the energy without shortcuts: method normals expands all directions at full '
-        'resolution (minutes), method planes expands all planes and refits them until nothing '
-        'changes (seconds)',
+        'minimise the energy without shortcuts: every label is expanded at full resolution until '
+        'nothing changes, directions to all of the image (minutes), planes to the pixels around '
+        'their surfaces (a second)',
+    )
+    refits: int = option(
+        0,
+        'method planes: rounds of fitting the planes to the labels and the labels to the planes '
+        'again; fewer when that does not lower the energy',
+        low=0,
+        high=1000,
     )
     noise_regions: str = option(
         'identify',
@@ -173,7 +180,7 @@ class Config:
         high=10.0,
     )
     track_memory: int = option(
-        30,
+        90,
         'frames that a plane may be out of sight, or go unnoticed, and keep its id',
         low=0,
         high=100000,

@@ -16,6 +16,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.moves import minimum_cut
 
+Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
+"""Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
+
 
 @njit(cache=True, nogil=True)
 def links(
@@ -42,9 +45,7 @@ def links(
 
 
 @njit(cache=True)
-def fronts(
-    labels: NDArray[np.int32], links: NDArray[np.float32], width: int, count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, count: int) -> Sites:
     """Sites across an edge from each label's own.
 
     Parameters
@@ -56,11 +57,6 @@ def fronts(
     count : int
         Number of labels.
 
-    Returns
-    -------
-    start : (count + 1,) int64
-    sites : (N,) int32
-        Label k's from start[k] to start[k + 1].
     """
     # Pairs (p, q), then sorted by counting.
     pairs = np.empty((2 * len(labels), 2), np.int32)

@@ -7,18 +7,20 @@ at hand.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.expansion import Choice, band, choice, fronts
-from rangeseg_ros.core.moments import COUNT, SLOPE
+from rangeseg_ros.core.expansion import Choice, Sites, band, choice, fronts
+from rangeseg_ros.core.moments import COUNT
 from rangeseg_ros.core.plane_energy import (
     NO_PLANE,
     Models,
     Problem,
     costs,
     data_cost,
+    energy,
     region_moments,
 )
 from rangeseg_ros.core.sensor import SensorModel
@@ -28,8 +30,9 @@ from rangeseg_ros.core.threads import strips
 _STEP = 1e-6
 # Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
 _REACH, _BAND = 2, 4
-
-_ROUNDS = 10
+# Blocks from a surface that its label is expanded to when exact. Its plane may well explain pixels
+# anywhere in the image, but these are rarely the surface's.
+_DOMAIN = 4
 
 
 def refine(
@@ -39,6 +42,7 @@ def refine(
     sensor: SensorModel,
     least: int = 0,
     exact: bool = False,
+    refits: int = 0,
 ) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels with the planes of surfaces.
 
@@ -53,9 +57,11 @@ def refine(
     least : int
         Pixels of the smallest surface whose plane is tried.
     exact : bool
-        Expand labels from wherever they compete, not just near their boundaries, until no
-        expansion helps, refit the planes, and repeat until the labelling stands still (at most
-        ten times).
+        Expand every label to all pixels within four blocks of its surface until no expansion
+        helps; otherwise every label once, near its boundaries.
+    refits : int
+        Rounds, at most, of fitting the planes to the labels and the labels to the planes again;
+        fewer when a round does not lower the energy, as a fit may: it does not know of the cap.
 
     Returns
     -------
@@ -66,26 +72,54 @@ def refine(
     """
     kept = moments[:, COUNT] >= least
     kept[0] = True
-    surfaces = np.where(kept, np.cumsum(kept) - 1, 0)[surfaces]
+    number = np.where(kept, np.cumsum(kept) - 1, 0).astype(np.int32)
+    starts = number[surfaces]
     moments = moments[kept]
     models = Models.of(moments)
-    labels, cost = _descended(problem, surfaces.astype(np.int32), models)
-    if not exact:
-        _expand_each(labels, cost, problem, models, _BAND)
-        return labels, models
-    for _ in range(_ROUNDS):
-        before = labels.copy()
-        while _expand_each(labels, cost, problem, models, _REACH * problem.block):
-            pass
-        if np.array_equal(labels, before):
+    labels, cost = _descended(problem, starts, models)
+    domains = _domains(starts, problem, len(moments)) if exact else None
+    _minimise(labels, cost, problem, models, domains)
+    value = energy(labels, problem, models) if refits else 0.0
+    for _ in range(refits):
+        moments = region_moments(problem, labels, len(moments), sensor)
+        refitted, better = Models.of(moments)._replace(price=models.price), labels.copy()
+        _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
+        last, value = value, energy(better, problem, refitted)
+        if value >= last - _STEP:
             break
-        refitted = region_moments(problem, labels, len(moments), sensor)
-        refitted[:, SLOPE] = (
-            moments[:, SLOPE] * refitted[:, COUNT] / np.maximum(moments[:, COUNT], 1)
-        )
-        models = Models.of(refitted)
-        cost = costs(labels, problem, models)
+        labels, models = better, refitted
     return labels, models
+
+
+def _minimise(
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+    domains: Sites | None,
+) -> None:
+    """Expand the labels near their boundaries, or in their domains until none helps; in place."""
+    if domains is None:
+        near = fronts(labels.ravel(), problem.links, labels.shape[1], len(models.theta))
+        _expand_each(labels, cost, problem, models, near, _BAND)
+        return
+    cost = costs(labels, problem, models)
+    while _expand_each(labels, cost, problem, models, domains, 1):
+        pass
+
+
+def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites:
+    """Pixels that each label may expand to: no plane all, others those near their surface."""
+    measured = problem.weight > 0
+    height, width = measured.shape
+    window = np.ones(2 * [2 * _DOMAIN + 1], np.uint8)
+    domains = [np.flatnonzero(measured)]
+    for label in range(1, count):
+        blocks = cv2.dilate((surfaces == label).astype(np.uint8), window) > 0
+        pixels = blocks.repeat(problem.block, axis=0).repeat(problem.block, axis=1)
+        domains.append(np.flatnonzero(pixels[:height, :width] & measured))
+    start = np.cumsum([0, *map(len, domains)])
+    return start, np.concatenate(domains).astype(np.int32)
 
 
 def _descended(
@@ -166,12 +200,14 @@ def _descend(
     queued = np.zeros(len(labels), np.bool_)
     waiting = 0
     for p in range(len(labels)):
-        for k in range(4):
-            if links[p, k] > 0 and labels[p + offsets[k]] != labels[p]:
-                queue[waiting] = p
-                queued[p] = True
-                waiting += 1
-                break
+        for k in range(2):
+            q = p + offsets[k]
+            if q < len(labels) and labels[q] != labels[p] and links[p, k] > 0:
+                for end in (p, q):
+                    if not queued[end]:
+                        queue[waiting] = end
+                        queued[end] = True
+                        waiting += 1
     first, last = 0, waiting % len(queue)
     while waiting > 0:
         p = queue[first]
@@ -211,15 +247,18 @@ def _expand_each(
     cost: NDArray[np.float32],
     problem: Problem,
     models: Models,
+    near: Sites,
     reach: int,
 ) -> bool:
-    """Expand every label once, by at most `reach` pixels; in place. Whether that helped."""
-    width = labels.shape[1]
+    """Expand every label once, to the pixels `near` it and by `reach` - 1 beyond; in place.
+
+    Whether that helped.
+    """
     labels, cost = labels.ravel(), cost.ravel()
-    start, sites = fronts(labels, problem.links, width, len(models.theta))
     position = np.full(len(labels), -1, np.int32)
+    start, sites = near
     helped = False
-    for alpha in range(1, len(models.theta)):
+    for alpha in range(len(models.theta)):
         front = sites[start[alpha] : start[alpha + 1]]
         move = _move(alpha, front, reach, labels, cost, problem, models, position)
         helped |= move.make(alpha, labels, cost, _STEP)

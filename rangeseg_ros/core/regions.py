@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.threads import halves
 
 
 def plane_regions(
@@ -33,8 +34,7 @@ def plane_regions(
     (H, W) uint16
         0 = no plane, 1...M by falling size.
     """
-    regions = connected_components(labels, horizontal, vertical)
-    regions[~valid] = 0
+    regions = connected_components(labels, horizontal, vertical, valid)
     area, perimeter = _measures(regions)
     if config.noise_regions != 'leave':
         noise = _thin(area, perimeter)
@@ -50,6 +50,7 @@ def connected_components(
     labels: NDArray[np.integer],
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
+    valid: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int32]:
     """4-connected components of like labels that cross no disconnected edge.
 
@@ -58,13 +59,17 @@ def connected_components(
     labels : (H, W) int
     horizontal, vertical : (H, W-1), (H-1, W) float
         Neighbourhood weights, 0 where disconnected.
+    valid : (H, W) bool, optional
+        Pixels to look at, all by default.
 
     Returns
     -------
     (H, W) int32
-        1...N.
+        1...N, 0 where not `valid`.
     """
-    return _components(labels, horizontal, vertical)
+    if valid is None:
+        valid = np.ones(labels.shape, np.bool_)
+    return _components(labels, horizontal, vertical, valid)
 
 
 @njit(cache=True)
@@ -72,6 +77,7 @@ def _components(
     labels: NDArray[np.integer],
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
+    valid: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
     """Two passes over the image with a table of equivalent labels (thesis 3.1.1)."""
     height, width = labels.shape
@@ -82,8 +88,14 @@ def _components(
         # What was last found equivalent: most pixels tell what the one before has told.
         known = -1
         for j in range(width):
-            left = j > 0 and horizontal[i, j - 1] > 0 and labels[i, j] == labels[i, j - 1]
-            up = i > 0 and vertical[i - 1, j] > 0 and labels[i, j] == labels[i - 1, j]
+            if not valid[i, j]:
+                found[i, j] = 0
+                continue
+            here = labels[i, j]
+            left = j > 0 and horizontal[i, j - 1] > 0 and labels[i, j - 1] == here
+            up = i > 0 and vertical[i - 1, j] > 0 and labels[i - 1, j] == here
+            left &= found[i, j - 1] > 0
+            up &= found[i - 1, j] > 0
             if left:
                 found[i, j] = found[i, j - 1]
                 if up and found[i - 1, j] != known:
@@ -138,16 +150,20 @@ def _thin(area: NDArray[np.int64], perimeter: NDArray[np.int64]) -> NDArray[np.b
     return noise
 
 
-@njit(cache=True)
 def _measures(regions: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number of pixels of each region, and of those that touch another or the border."""
+    count = int(regions.max(initial=0)) + 1
+    (upper, upper_rim), (lower, lower_rim) = halves(_counts, len(regions), regions, count)
+    return upper + lower, upper_rim + lower_rim
+
+
+@njit(cache=True, nogil=True)
+def _counts(
+    first: int, after: int, regions: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     height, width = regions.shape
-    count = 1
-    for i in range(height):
-        for j in range(width):
-            count = max(count, regions[i, j] + 1)
     area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    for i in range(height):
+    for i in range(first, after):
         for j in range(width):
             here = regions[i, j]
             area[here] += 1

@@ -115,7 +115,9 @@ class Segmenter:
         watch.lap('surfaces')
         # A region may gain as much again from pixels that no block could take.
         least = self.config.min_pixels // 2
-        labels, models = refine(problem, surface, moments, sensor, least, self.config.exact)
+        labels, models = refine(
+            problem, surface, moments, sensor, least, self.config.exact, self.config.refits
+        )
         watch.lap('labels')
         regions = plane_regions(
             labels, image.valid & (labels > 0), horizontal, vertical, self.config

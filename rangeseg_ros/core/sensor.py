@@ -92,12 +92,11 @@ class SensorModel:
         bins = min(_BINS, len(inverse) // _PER_BIN)
         if bins == 0:
             return self
-        order = np.argsort(inverse, kind='stable')
-        at = np.array([np.median(inverse[part]) for part in np.array_split(order, bins)])
-        variance = np.array(
-            [np.quantile(residual[part], _QUANTILE) for part in np.array_split(order, bins)]
-        )
-        variance = np.maximum(variance, self.variance(at))
+        parts = np.array_split(np.argsort(inverse, kind='stable'), bins)
+        at = np.array([inverse[part[len(part) // 2]] for part in parts])
+        ranked = [np.sort(residual[part]) for part in parts]
+        shown = np.array([part[int(_QUANTILE * len(part))] for part in ranked])
+        variance = np.maximum(shown, self.variance(at))
         # Relative errors count the same at every range.
         terms = np.stack([np.ones(bins), at**4], axis=1) / variance[:, None]
         (constant, quartic), _ = nnls(terms, np.ones(bins))
