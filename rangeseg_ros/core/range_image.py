@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -142,10 +142,15 @@ _NEAREST, _FARTHEST = 1e-6, 1e6
 def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
     """1 / (scale * distance) in 1/m, 0 where that is no distance from 1 um to 1000 km."""
     if distance.dtype == np.uint16:
-        # One division for each of the 65536 depths there can be, not for each pixel.
-        return _reciprocal(np.arange(65536, dtype=np.float64), scale)[distance]
+        return _reciprocals(scale)[distance]
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         metres = distance.astype(np.float64) * scale
         inverse = (1.0 / metres).astype(np.float32)
     inverse[~((metres >= _NEAREST) & (metres <= _FARTHEST))] = 0
     return inverse
+
+
+@lru_cache(maxsize=4)
+def _reciprocals(scale: float) -> NDArray[np.float32]:
+    """Of the 65536 depths there can be."""
+    return _reciprocal(np.arange(65536, dtype=np.float64), scale)
