@@ -12,7 +12,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.moments import RATIO
 from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.plane_energy import Models, Problem, energy, region_moments
+from rangeseg_ros.core.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.refinement import refine
 from rangeseg_ros.core.sensor import SensorModel
@@ -47,15 +47,15 @@ def random_case(seed, height, width, count=3):
 
 def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
-    residual = problem.inverse - np.einsum('ijk,lk->lij', problem.rays, models.theta)
-    cost = np.minimum(residual**2 * problem.weight * models.price[:, None, None], 8.0 / 3)
+    residual = problem.inverse - models.theta @ problem.rays.T
+    cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0 / 3)
     cost[0] = 6.0 / 3
-    return np.where(problem.weight > 0, cost, 0)
+    return np.where(problem.weight > 0, cost, 0).reshape(len(cost), -1, problem.width)
 
 
 def prior(problem):
     """Costs of unlike labels to the right (H, W-1) and below (H-1, W)."""
-    links = problem.links.reshape(*problem.inverse.shape, 4)
+    links = problem.links.reshape(-1, problem.width, 4)
     return links[:, :-1, 0], links[:-1, :, 1]
 
 
@@ -88,8 +88,7 @@ def energies(many, problem, models):
 def expand(alpha, labels, cost, problem, models, reach=12):
     """Expand a label from everywhere; in place."""
     labels, cost = labels.ravel(), cost.ravel()
-    width = problem.inverse.shape[1]
-    start, sites = expansion.fronts(labels, problem.links, width, len(models.theta))
+    start, sites = expansion.fronts(labels, problem.links, problem.width, len(models.theta))
     front, position = sites[start[alpha] : start[alpha + 1]], np.full(len(labels), -1, np.int32)
     move = refinement._move(alpha, front, reach, labels, cost, problem, models, position)
     assert (position == -1).all()
@@ -138,7 +137,7 @@ def test_weights_are_inverse_variances():
 def test_energy_is_what_it_is_defined_to_be(seed):
     problem, models, labels = random_case(seed, 13, 9)
     expected = literal_energy(labels, problem, models)
-    assert energy(labels, problem, models) == pytest.approx(expected, rel=1e-5)
+    assert energy(labels.ravel(), problem, models) == pytest.approx(expected, rel=1e-5)
     assert energies(labels[None], problem, models)[0] == pytest.approx(expected)
 
 
@@ -146,8 +145,8 @@ def test_energy_is_what_it_is_defined_to_be(seed):
 def test_an_expansion_is_the_best_there_is(seed):
     """Of all subsets of the pixels that edges join to the label."""
     problem, models, labels = random_case(seed, 3, 4)
-    labels[0, 0], problem.inverse[0, 0] = 1, models.theta[1] @ problem.rays[0, 0]
-    problem.weight[0, 0] = problem.weight.max()
+    labels[0, 0], problem.inverse[0] = 1, models.theta[1] @ problem.rays[0]
+    problem.weight[0] = problem.weight.max()
     cost = cost_of(labels, problem, models)
     free = np.flatnonzero(linked(problem, 1, labels))
     chosen = np.array(list(product([False, True], repeat=len(free))))
@@ -159,7 +158,7 @@ def test_an_expansion_is_the_best_there_is(seed):
     assert helped == (labels != before).any()
     assert energies(labels[None], problem, models)[0] == pytest.approx(least, abs=1e-4)
     assert ((labels == before) | (labels == 1)).all()
-    assert not labels[problem.weight == 0].any()
+    assert not labels.ravel()[problem.weight == 0].any()
     np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
 
 
@@ -185,8 +184,11 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
     """Nor by none: the labels of the neighbours it is connected with are what it may take."""
     problem, models, _ = random_case(seed, 20, 24, 4)
     blocks = np.random.default_rng(seed).integers(0, 5, (5, 6)).astype(np.int32)
-    labels, cost = refinement._descended(problem, blocks, models)
-    assert not labels[problem.weight == 0].any()
+    labels, cost = (
+        array.reshape(20, 24) for array in refinement._descended(problem, blocks, models)
+    )
+    measured = problem.weight.reshape(20, 24) > 0
+    assert not labels[~measured].any()
     np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
     beside = np.zeros((5, *labels.shape), bool)
     beside[0] = True
@@ -199,7 +201,7 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
         beside[label, :-1] |= here[1:] & (vertical > 0)
     value = energies(labels[None], problem, models)[0]
     for label in range(5):
-        pixels = np.flatnonzero(beside[label] & (problem.weight > 0))
+        pixels = np.flatnonzero(beside[label] & measured)
         changed = np.repeat(labels.reshape(1, -1), len(pixels), axis=0)
         changed[np.arange(len(pixels)), pixels] = label
         assert energies(changed.reshape(-1, *labels.shape), problem, models).min() > value - 1e-4
@@ -227,15 +229,16 @@ def test_each_stage_lowers_the_energy(monkeypatch):
         def run(*arguments):
             result = original(*arguments)
             labels, models = labels_and_models(arguments, result)
+            labels = labels.reshape(1, -1, problem.width)
             if not values:
-                values.append(energies(np.zeros((1, *labels.shape), int), problem, models)[0])
-            values.append(energies(labels[None], problem, models)[0])
+                values.append(energies(np.zeros(labels.shape, int), problem, models)[0])
+            values.append(energies(labels, problem, models)[0])
             return result
 
         monkeypatch.setattr(refinement, name, run)
 
     watched('_descended', lambda arguments, result: (result[0], arguments[2]))
-    watched('_expand_each', lambda arguments, result: (arguments[0], arguments[3]))
+    watched('_expand_each', lambda arguments, result: (arguments[1], arguments[4]))
     labels, models = refine(problem, surface, moments, sensor)
     assert len(values) == 3
     assert (np.diff(values) <= 1e-3).all()
@@ -248,20 +251,19 @@ def test_no_expansion_helps_after_the_exact_minimisation():
     """Of no plane to anywhere, of the others to the pixels around their blocks."""
     problem, (surface, moments), sensor = small_room()
     labels, models = refine(problem, surface, moments, sensor, exact=True)
-    value = energies(labels[None], problem, models)[0]
-    assert value <= energies(refine(problem, surface, moments, sensor)[0][None], problem, models)
-    width = labels.shape[1]
+    value = energy(labels, problem, models)
+    assert value < energy(refine(problem, surface, moments, sensor)[0], problem, models)
+    measured = problem.weight.reshape(-1, problem.width) > 0
     for alpha in range(len(models.theta)):
         blocks = np.pad(surface == alpha, 4)
         around = np.lib.stride_tricks.sliding_window_view(blocks, (9, 9)).any(axis=(2, 3))
         pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
-        front = np.flatnonzero(pixels & (problem.weight > 0)).astype(np.int32)
-        changed, cost = labels.ravel().copy(), cost_of(labels, problem, models).ravel()
+        front = np.flatnonzero(pixels & measured).astype(np.int32)
+        changed, cost = labels.copy(), costs(labels, problem, models)
         position = np.full(labels.size, -1, np.int32)
         move = refinement._move(alpha, front, 1, changed, cost, problem, models, position)
         move.make(alpha, changed, cost, 1e-6)
-        changed = changed.reshape(1, -1, width)
-        assert energies(changed, problem, models)[0] > value - 1e-2
+        assert energy(changed, problem, models) > value - 1e-2
 
 
 @pytest.mark.parametrize('exact', [False, True])
@@ -270,7 +272,7 @@ def test_refits_lower_the_energy_until_they_do_not(exact):
     values = []
     for refits in (0, 1, 2, 5, 40):
         labels, models = refine(problem, surface, moments, sensor, 0, exact, refits)
-        values.append(energies(labels[None], problem, models)[0])
+        values.append(energy(labels, problem, models))
     assert values[1] < values[0]
     assert (np.diff(values) <= 0).all()
     # Some round before the last did not help.
@@ -280,10 +282,14 @@ def test_refits_lower_the_energy_until_they_do_not(exact):
 
 def test_moments_of_regions_are_sums_over_their_pixels():
     problem, _, labels = random_case(3, 17, 13)
-    moments = region_moments(problem, labels, 4, SENSOR)
+    arrays = (
+        array.reshape(17, 13, *array.shape[1:])
+        for array in (problem.inverse, problem.rays, problem.weight)
+    )
+    moments = region_moments(labels, 4, *arrays, SENSOR)
     assert not moments[0].any()
     for label in range(1, 4):
-        mask = labels == label
+        mask = labels.ravel() == label
         rays, y, w = problem.rays[mask], problem.inverse[mask], problem.weight[mask]
         rays, y, w = (part.astype(np.float64) for part in (rays, y, w))
         square = np.einsum('n,ni,nj->ij', w, rays, rays)[np.triu_indices(3)]

@@ -48,11 +48,11 @@ def curved(
     count = int(regions.max(initial=0)) + 1
     # Every other row and column will do: what is asked for is smooth.
     sparse = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-    problem = problem._replace(
-        inverse=problem.inverse[sparse], rays=problem.rays[sparse], weight=problem.weight[sparse]
-    )
-    regions = regions[sparse]
-    moments = region_moments(problem, regions, count, sensor)
+    shape, regions = regions.shape, regions[sparse]
+    inverse = problem.inverse.reshape(shape)[sparse]
+    rays = problem.rays.reshape(*shape, 3)[sparse]
+    weight = problem.weight.reshape(shape)[sparse]
+    moments = region_moments(regions, count, inverse, rays, weight, sensor)
     models = Models.of(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
@@ -60,9 +60,9 @@ def curved(
         _normal_equations,
         len(regions),
         regions,
-        problem.inverse,
-        problem.rays,
-        problem.weight,
+        inverse,
+        rays,
+        weight,
         models.theta,
         limit,
     )

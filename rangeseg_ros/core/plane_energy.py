@@ -31,16 +31,18 @@ _GRANTED = 2.0
 
 
 class Problem(NamedTuple):
-    """What the labelling has to explain.
+    """What the labelling has to explain: n pixels in raster order.
 
     Attributes
     ----------
-    inverse, rays : (H, W), (H, W, 3) float32
+    inverse, rays : (n,), (n, 3) float32
         Range image.
-    weight : (H, W) float32
+    weight : (n,) float32
         1 / random variance of the inverse range; 0 where nothing was measured.
-    links : (H * W, 4) float32
+    links : (n, 4) float32
         Cost of unlike labels across each pixel's edges: right, down, left, up.
+    width : int
+        Columns of the image.
     block : int
         Rows and columns of the blocks that surfaces are grown from.
     """
@@ -49,6 +51,7 @@ class Problem(NamedTuple):
     rays: NDArray[np.float32]
     weight: NDArray[np.float32]
     links: NDArray[np.float32]
+    width: int
     block: int
 
     @classmethod
@@ -61,9 +64,10 @@ class Problem(NamedTuple):
         block: int,
     ) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor."""
-        weight = _weights(image.inverse, sensor.noise, sensor.range_noise)
+        inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
+        weight = _weights(inverse, sensor.noise, sensor.range_noise)
         prior = links(horizontal, vertical, _SMOOTHNESS)
-        return cls(image.inverse, image.rays, weight, prior, block)
+        return cls(inverse, rays, weight, prior, image.shape[1], block)
 
 
 @njit(cache=True, nogil=True)
@@ -71,11 +75,10 @@ def _weights(
     inverse: NDArray[np.float32], noise: float, range_noise: float
 ) -> NDArray[np.float32]:
     weight = np.zeros_like(inverse)
-    for i in range(inverse.shape[0]):
-        for j in range(inverse.shape[1]):
-            y = np.float64(inverse[i, j])
-            if y > 0:
-                weight[i, j] = 1 / (FLOOR + noise**2 + (range_noise * y * y) ** 2)
+    for p in range(len(inverse)):
+        y = np.float64(inverse[p])
+        if y > 0:
+            weight[p] = 1 / (FLOOR + noise**2 + (range_noise * y * y) ** 2)
     return weight
 
 
@@ -104,52 +107,67 @@ class Models(NamedTuple):
 
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
-    """Value of eq. 5.3: data costs plus the weights of the edges between unlike labels."""
-    cost = costs(labels, problem, models)
-    prior = problem.links.reshape(*labels.shape, 4)
-    unlike = prior[:, :-1, 0][labels[:, 1:] != labels[:, :-1]].sum(dtype=np.float64)
-    unlike += prior[:-1, :, 1][labels[1:] != labels[:-1]].sum(dtype=np.float64)
-    return float(cost.sum(dtype=np.float64) + unlike)
+    """Value of eq. 5.3 for labels (n,): data costs and the costs of the edges between unlike."""
+    below = problem.links[: -problem.width, 1]
+    right = problem.links[:-1, 0]  # 0 from the end of one row to the next
+    unlike = right[labels[1:] != labels[:-1]].sum(dtype=np.float64)
+    unlike += below[labels[problem.width :] != labels[: -problem.width]].sum(dtype=np.float64)
+    return float(costs(labels, problem, models).sum(dtype=np.float64) + unlike)
 
 
 @njit(cache=True)
 def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
-    """What a label costs a measured pixel, given by its number in raster order."""
+    """What a label costs a measured pixel."""
     if label == 0:
         return NO_PLANE
-    i, j = divmod(p, problem.inverse.shape[1])
-    plane, ray = models.theta[label], problem.rays[i, j]
-    residual = problem.inverse[i, j] - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
-    return min(models.price[label] * problem.weight[i, j] * residual * residual, _CAP)
+    theta, rays = models.theta, problem.rays
+    level = (
+        theta[label, 0] * rays[p, 0] + theta[label, 1] * rays[p, 1] + theta[label, 2] * rays[p, 2]
+    )
+    residual = problem.inverse[p] - level
+    return min(models.price[label] * problem.weight[p] * residual * residual, _CAP)
 
 
 @njit(cache=True)
 def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArray[np.float32]:
-    """What each pixel's label costs it, (H, W); 0 where nothing was measured."""
-    width = labels.shape[1]
-    cost = np.zeros(labels.shape, np.float32)
-    for i in range(labels.shape[0]):
-        for j in range(width):
-            if problem.weight[i, j] > 0:
-                cost[i, j] = data_cost(labels[i, j], i * width + j, problem, models)
+    """What each pixel's label costs it, (n,); 0 where nothing was measured."""
+    cost = np.zeros(len(labels), np.float32)
+    for p in range(len(labels)):
+        if problem.weight[p] > 0:
+            cost[p] = data_cost(labels[p], p, problem, models)
     return cost
 
 
 def region_moments(
-    problem: Problem, labels: NDArray[np.integer], count: int, sensor: SensorModel
+    labels: NDArray[np.integer],
+    count: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    sensor: SensorModel,
 ) -> NDArray[np.float64]:
-    """Moments (count, 13) of the pixels of each label."""
-    upper, lower = halves(
-        _sum_moments,
-        len(labels),
-        labels,
-        count,
-        problem.inverse,
-        problem.rays,
-        problem.weight,
-        sensor.distortion,
-        sensor.range_distortion,
-    )
+    """Moments of the pixels of each label.
+
+    Parameters
+    ----------
+    labels : (H, W) int
+    count : int
+        Number of labels, 0 included.
+    inverse, rays : (H, W), (H, W, 3) float32
+        Range image.
+    weight : (H, W) float32
+        1 / random variance of the inverse range.
+    sensor : SensorModel
+        Its distortion is read.
+
+    Returns
+    -------
+    (count, 13) float64
+        Zeros for label 0.
+    """
+    arrays = labels, count, inverse, rays, weight
+    distortion = sensor.distortion, sensor.range_distortion
+    upper, lower = halves(_sum_moments, len(labels), *arrays, *distortion)
     return upper + lower
 
 

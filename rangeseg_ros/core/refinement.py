@@ -65,7 +65,7 @@ def refine(
 
     Returns
     -------
-    labels : (H, W) int32
+    labels : (n,) int32
         0 = no plane.
     models : Models
         The planes the labelling was found for.
@@ -81,7 +81,10 @@ def refine(
     _minimise(labels, cost, problem, models, domains)
     value = energy(labels, problem, models) if refits else 0.0
     for _ in range(refits):
-        moments = region_moments(problem, labels, len(moments), sensor)
+        shape = -1, problem.width
+        arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
+        weight = problem.weight.reshape(shape)
+        moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
         refitted, better = Models.of(moments)._replace(price=models.price), labels.copy()
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
         last, value = value, energy(better, problem, refitted)
@@ -100,17 +103,19 @@ def _minimise(
 ) -> None:
     """Expand the labels near their boundaries, or in their domains until none helps; in place."""
     if domains is None:
-        near = fronts(labels.ravel(), problem.links, labels.shape[1], len(models.theta))
-        _expand_each(labels, cost, problem, models, near, _BAND)
+        near = fronts(labels, problem.links, problem.width, len(models.theta))
+        # No plane is not expanded: every pixel has had that choice, and it gains next to nothing.
+        _expand_each(range(1, len(models.theta)), labels, cost, problem, models, near, _BAND)
         return
     cost = costs(labels, problem, models)
-    while _expand_each(labels, cost, problem, models, domains, 1):
+    every = range(len(models.theta))
+    while _expand_each(every, labels, cost, problem, models, domains, 1):
         pass
 
 
 def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites:
     """Pixels that each label may expand to: no plane all, others those near their surface."""
-    measured = problem.weight > 0
+    measured = problem.weight.reshape(-1, problem.width) > 0
     height, width = measured.shape
     window = np.ones(2 * [2 * _DOMAIN + 1], np.uint8)
     domains = [np.flatnonzero(measured)]
@@ -126,8 +131,8 @@ def _descended(
     problem: Problem, surfaces: NDArray[np.int32], models: Models
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
-    labels = np.zeros(problem.inverse.shape, np.int32)
-    cost = np.zeros(labels.shape, np.float32)
+    labels = np.zeros(len(problem.inverse), np.int32)
+    cost = np.zeros(len(labels), np.float32)
     strips(_take_nearest, len(surfaces), surfaces, problem, models, labels, cost)
     _descend(labels, cost, problem, models)
     return labels, cost
@@ -148,8 +153,8 @@ def _take_nearest(
     Costs in the interior of surfaces, where no label competes, stay 0.
     """
     rows, columns = surfaces.shape
-    height, width = labels.shape
-    block = problem.block
+    width, block = problem.width, problem.block
+    height = len(labels) // width
     side = 2 * _REACH + 1
     candidates = np.empty(side * side, np.int32)
     for bi in range(first, after):
@@ -167,20 +172,19 @@ def _take_nearest(
                         count += 1
             settled &= count == 1
             for i in range(bi * block, min((bi + 1) * block, height)):
-                for j in range(bj * block, min((bj + 1) * block, width)):
-                    if problem.weight[i, j] == 0:
+                row = i * width
+                for p in range(row + bj * block, row + min((bj + 1) * block, width)):
+                    if problem.weight[p] == 0:
                         continue
                     if settled:
-                        labels[i, j] = candidates[0]
+                        labels[p] = candidates[0]
                         continue
                     best, least = 0, np.float32(NO_PLANE)
                     for k in range(count):
-                        value = np.float32(
-                            data_cost(candidates[k], i * width + j, problem, models)
-                        )
+                        value = np.float32(data_cost(candidates[k], p, problem, models))
                         if value < least:
                             best, least = candidates[k], value
-                    labels[i, j], cost[i, j] = best, least
+                    labels[p], cost[p] = best, least
 
 
 @njit(cache=True)
@@ -192,8 +196,8 @@ def _descend(
     In place, until no pixel changes. It leaves the energy in a poor local minimum, but one from
     which the cuts have only the boundaries left to move.
     """
-    offsets = np.array([1, labels.shape[1], -1, -labels.shape[1]])
-    labels, cost, links = labels.ravel(), cost.ravel(), problem.links
+    offsets = np.array([1, problem.width, -1, -problem.width])
+    links = problem.links
     around = np.zeros(4, np.int32)
     # A ring, long enough as no pixel is in it twice.
     queue = np.empty(len(labels), np.int32)
@@ -243,6 +247,7 @@ def _descend(
 
 
 def _expand_each(
+    alphas: range,
     labels: NDArray[np.int32],
     cost: NDArray[np.float32],
     problem: Problem,
@@ -250,15 +255,14 @@ def _expand_each(
     near: Sites,
     reach: int,
 ) -> bool:
-    """Expand every label once, to the pixels `near` it and by `reach` - 1 beyond; in place.
+    """Expand each label once, to the pixels `near` it and by `reach` - 1 beyond; in place.
 
     Whether that helped.
     """
-    labels, cost = labels.ravel(), cost.ravel()
     position = np.full(len(labels), -1, np.int32)
     start, sites = near
     helped = False
-    for alpha in range(len(models.theta)):
+    for alpha in alphas:
         front = sites[start[alpha] : start[alpha + 1]]
         move = _move(alpha, front, reach, labels, cost, problem, models, position)
         helped |= move.make(alpha, labels, cost, _STEP)
@@ -277,9 +281,9 @@ def _move(
     position: NDArray[np.int32],
 ) -> Choice:
     """Expansion of one label from its front."""
-    width = problem.inverse.shape[1]
-    sites = band(alpha, front, reach, labels, problem.links, width, position)
+    links, width = problem.links, problem.width
+    sites = band(alpha, front, reach, labels, links, width, position)
     new = np.empty(len(sites), np.float32)
     for s in range(len(sites)):
         new[s] = data_cost(alpha, int(sites[s]), problem, models)
-    return choice(alpha, sites, new, labels, cost, problem.links, width, position)
+    return choice(alpha, sites, new, labels, cost, links, width, position)

@@ -119,9 +119,8 @@ class Segmenter:
             problem, surface, moments, sensor, least, self.config.exact, self.config.refits
         )
         watch.lap('labels')
-        regions = plane_regions(
-            labels, image.valid & (labels > 0), horizontal, vertical, self.config
-        )
+        image_labels = labels.reshape(image.shape)
+        regions = plane_regions(image_labels, image_labels > 0, horizontal, vertical, self.config)
         regions = without(regions, curved(problem, regions, sensor))
         watch.lap('regions')
         return regions, sensor, lambda: plane_energy(labels, problem, models)
