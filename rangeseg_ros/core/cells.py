@@ -99,7 +99,14 @@ class Cells(NamedTuple):
             Number of outliers, whether taken out or kept.
         """
         central = image.camera is not None
-        return _subtract(labels, image.inverse, image.rays, self, variances, central, theta)
+        arrays = labels, image.inverse, image.rays
+        parts = halves(_find_outliers, len(labels), *arrays, len(self.size), variances, theta)
+        (found, outliers, pixels), (more, more_outliers, more_pixels) = parts
+        outliers += more_outliers
+        minority = 2 * outliers <= pixels + more_pixels
+        for some in (found, more):
+            _subtract(some, minority, *arrays, self, variances, central)
+        return outliers
 
     def regions(self) -> NDArray[np.float64]:
         """Sums over whole regions, (M + 1, 25)."""
@@ -239,31 +246,31 @@ def _sums(
     return sums
 
 
-@njit(cache=True)
-def _subtract(
+@njit(cache=True, nogil=True)
+def _find_outliers(
+    first: int,
+    after: int,
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    cells: Cells,
+    regions: int,
     variances: NDArray[np.float64],
-    central: bool,
     theta: NDArray[np.float64],
-) -> NDArray[np.intp]:
-    """Take outliers out of their cells; their number in each region."""
-    height, width = labels.shape
-    outliers = np.zeros(len(cells.size), np.intp)
-    counts = np.zeros(len(cells.size), np.intp)
-    found = np.empty(labels.size, np.intp)
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Outliers among some rows, their number and that of all pixels in each region."""
+    width = labels.shape[1]
+    outliers, pixels = np.zeros(regions, np.intp), np.zeros(regions, np.intp)
+    found = np.empty((after - first) * width, np.intp)
     number = 0
     constant = _OUTLIER**2 * (variances[0] + variances[2])
     quartic = _OUTLIER**2 * (variances[1] + variances[3])
-    for i in range(height):
+    for i in range(first, after):
         for j in range(width):
             label = int(labels[i, j])
             y = float(inverse[i, j])
             if label == 0 or y == 0:
                 continue
-            counts[label] += 1
+            pixels[label] += 1
             ray, plane = rays[i, j], theta[label]
             residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
             squared = y * y
@@ -271,10 +278,25 @@ def _subtract(
                 outliers[label] += 1
                 found[number] = i * width + j
                 number += 1
-    for index in found[:number]:
+    return found[:number], outliers, pixels
+
+
+@njit(cache=True)
+def _subtract(
+    pixels: NDArray[np.intp],
+    wanted: NDArray[np.bool_],
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    cells: Cells,
+    variances: NDArray[np.float64],
+    central: bool,
+) -> None:
+    """Take pixels out of the cells of the wanted regions."""
+    width = labels.shape[1]
+    for index in pixels:
         i, j = index // width, index % width
         label = int(labels[i, j])
-        if 2 * outliers[label] <= counts[label]:
+        if wanted[label]:
             record = cells.sums[_index(cells, label, i, j)]
             _add(record, i, j, j + 1, inverse, rays, variances, central, -1.0)
-    return outliers
