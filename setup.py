@@ -32,6 +32,7 @@ setup(
         'click>=8.0',
         'jinja2>=3.0',
         'lz4',
+        'mapbox-earcut>=1.0',
         'matplotlib>=3.6',
         'mcap>=1.2.1',
         'numba>=0.59',
@@ -41,7 +42,6 @@ setup(
         'PyYAML>=5.4',
         'rosbags>=0.11',
         'scipy>=1.11',
-        'shapely>=2.0',
         'tqdm>=4.60',
     ],
     extras_require={

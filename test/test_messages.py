@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import CameraError, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.roles import ROLES
@@ -247,6 +248,28 @@ def test_concave_hull_with_a_hole_is_filled_and_no_more():
     notch = (centres[:, 0] > 1) & (centres[:, 0] < 2) & (centres[:, 1] < 2)
     inside = (abs(centres[:, 0] - 0.5) < 0.25) & (abs(centres[:, 1] - 1.25) < 0.25)
     assert not (notch | inside).any()
+
+
+@pytest.mark.parametrize('axis', range(3))
+@pytest.mark.parametrize('sign', [-1, 1])
+def test_triangles_of_planes_of_any_direction_face_the_sensor(axis, sign):
+    tilt = Rotation.from_euler('xyz', [20, -15, 30], degrees=True)
+    normal = tilt.apply(sign * np.eye(3)[axis])
+    frame = np.linalg.svd(normal[None])[2][1:]
+    frame *= np.linalg.det([*frame, normal])
+    hull = np.array([(0, 0), (2, 0), (1, 0.5), (2, 2), (0, 2)]) @ frame - 2 * normal
+    found = plane(1, hull)
+    found.normal = normal
+    triangles = corners_of(markers_message(make_rosbags, header(), [found]).markers[1])
+    first, second, third = np.moveaxis(triangles, 1, 0)
+    doubled = np.cross(second - first, third - first) @ normal
+    assert (doubled > 0).all() and doubled.sum() / 2 == pytest.approx(3)
+
+
+def test_a_hull_that_crosses_itself_still_makes_whole_triangles():
+    bow_tie = [(0, 0, 2), (1, 1, 2), (0, 1, 2), (1, 0, 2), (2, 3, 2)]
+    hull = markers_message(make_rosbags, header(), [plane(1, bow_tie)]).markers[1]
+    assert len(hull.points) % 3 == 0
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import shapely
-from numpy.typing import ArrayLike, NDArray
+from mapbox_earcut import triangulate_float64
+from numpy.typing import ArrayLike
 
 from rangeseg_ros.core.planes import Plane
 from rangeseg_ros.drawing import colours
@@ -40,7 +40,7 @@ def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 plane.id,
                 TRIANGLE_LIST,
                 colour=(*rgb, 0.6),
-                points=_points(make, _triangles(plane)),
+                points=_triangles(make, plane),
             )
         )
         markers.append(
@@ -76,30 +76,20 @@ def _points(make: Make, coordinates: ArrayLike) -> list[Any]:
     return [make('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in rows]
 
 
-def _triangles(plane: Plane) -> NDArray[np.float64]:
-    """Corners (3 M, 3) of triangles that make up the hull of `plane` without its holes."""
+def _triangles(make: Make, plane: Plane) -> list[Any]:
+    """Corners of triangles that make up the hull of `plane` without its holes."""
     if len(plane.hull) < 3:
-        return np.empty((0, 3))
-    across = np.linalg.svd(plane.normal[None])[2][1]
-    axes = np.stack([across, np.cross(plane.normal, across)])
-    outline, *holes = ((ring - plane.centroid) @ axes.T for ring in (plane.hull, *plane.holes))
-    polygon = shapely.make_valid(shapely.Polygon(outline, holes))
-    # No corner lies inside a Delaunay triangle, so sides only cut across: the parts are convex.
-    parts = shapely.get_parts(shapely.delaunay_triangles(polygon))
-    shapely.prepare(polygon)
-    whole = shapely.covers(polygon, parts)
-    cut = shapely.get_parts(shapely.intersection(parts[~whole], polygon))
-    parts = np.concatenate([parts[whole], cut])
-    corners, part = shapely.get_coordinates(parts[shapely.area(parts) > 0], return_index=True)
-    # Each is a fan around its first corner; its last one is the first again.
-    first, last = (np.searchsorted(part, part, side) for side in ('left', 'right'))
-    second = np.arange(len(part))
-    inner = (second > first) & (second < last - 2)
-    triangles = corners[np.stack([first, second, second + 1], axis=1)[inner]]
-    sides = np.diff(triangles, axis=1)
-    clockwise = sides[:, 0, 0] * sides[:, 1, 1] < sides[:, 0, 1] * sides[:, 1, 0]
-    triangles[clockwise] = triangles[clockwise, ::-1]
-    return triangles.reshape(-1, 2) @ axes + plane.centroid
+        return []
+    rings = plane.hull, *plane.holes
+    corners = np.concatenate(rings)
+    # Seen along the axis nearest to the normal, from the sensor's side.
+    axis = np.abs(plane.normal).argmax()
+    right, up = (axis + np.array([1, 2] if plane.normal[axis] > 0 else [2, 1])) % 3
+    flat = np.ascontiguousarray(corners[:, [right, up]])
+    ends = np.cumsum([len(ring) for ring in rings], dtype=np.uint32)
+    # A message may hold one point at several places.
+    points = _points(make, corners)
+    return [points[k] for k in triangulate_float64(flat, ends).tolist()]
 
 
 def _marker(
