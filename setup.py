@@ -32,7 +32,7 @@ setup(
         'click>=8.0',
         'jinja2>=3.0',
         'lz4',
-        'mapbox-earcut>=1.0',
+        'mapbox-earcut>=2.0,<3',
         'matplotlib>=3.6',
         'mcap>=1.2.1',
         'numba>=0.59',

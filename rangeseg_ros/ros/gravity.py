@@ -66,7 +66,7 @@ class Gravity:
         if reading.frame != frame:
             self._node.get_logger().warning(
                 f'{topic} is in frame {reading.frame!r}, not in {frame!r} like the images: '
-                'ignored, up is that of the parameters',
+                'ignored, up is that of the parameters; imu_transformer (imu_pipeline) turns it',
                 throttle_duration_sec=5.0,
             )
             return None

@@ -31,7 +31,7 @@ class NodeConfig(Config):
     use_imu: bool = option(
         False,
         'take up from the accelerometer on the topic imu, once there is one in the frame of the '
-        'images, instead of up_x, up_y, up_z',
+        'images, instead of up_x, up_y, up_z; not turned by tf, imu_transformer does that',
     )
     stall_timeout: float = option(
         2.0,
