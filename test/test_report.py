@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -133,6 +134,30 @@ def test_replay_of_a_damaged_recording_says_so(tmp_path):
     assert outcome.damage
     assert f'Not read to its end: {outcome.damage}' in page.text
     assert f'{outcome.frames} frames in' in page.text
+
+
+def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names = ['walls', 'torn #2']
+    for name in names:
+        record_walls(tmp_path / name, 16)
+    file = next((tmp_path / names[1]).glob('*.mcap'))
+    with file.open('r+b') as stream:
+        stream.truncate(file.stat().st_size - 100)
+    arguments = ['rangeseg', 'replay', *names, '--output', 'out', '--jobs', '1']
+    pages = []
+    for _ in range(2):  # the second time, all is found done
+        monkeypatch.setattr(sys, 'argv', arguments)
+        with pytest.raises(SystemExit) as end:
+            main()
+        assert end.value.code == 1
+        pages.append((tmp_path / 'out/index.html').read_text(encoding='utf-8'))
+    assert pages[0] == pages[1]
+    page = Page(tmp_path / 'out/index.html')
+    assert [unquote(link) for link in page.sources] == [f'{name}/report.html' for name in names]
+    assert all((tmp_path / 'out' / unquote(link)).exists() for link in page.sources)
+    whole, torn = (line for line in page.text.splitlines() if line.startswith(tuple(names)))
+    assert whole == 'walls160.5220' and torn.startswith('torn #2') and 'damaged after' in torn
 
 
 def test_report_of_evaluate(tmp_path, monkeypatch):

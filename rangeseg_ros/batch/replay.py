@@ -39,6 +39,8 @@ class Outcome:
         Number of frames segmented.
     reasons : dict
         Why frames have no planes -> number of these frames.
+    figures : dict
+        See `ReplayReport.figures`.
     damage : str
         Why the recording was not read to its end; empty when it was.
     found_done : bool
@@ -47,6 +49,7 @@ class Outcome:
 
     frames: int
     reasons: dict[str, int]
+    figures: dict[str, float]
     damage: str = ''
     found_done: bool = False
 
@@ -132,7 +135,9 @@ class Replay:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
-            outcome = Outcome(report.frames, dict(report.reasons), ''.join(damage))
+            outcome = Outcome(
+                report.frames, dict(report.reasons), report.figures(), ''.join(damage)
+            )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
             bag.record({'key': key, 'outcome': kept})

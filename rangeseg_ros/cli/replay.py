@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import asdict
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import click
 
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import measures, options
 from rangeseg_ros.parallel import run_all, run_on_cluster
+from rangeseg_ros.report.replay import write_overview
 from rangeseg_ros.ros.outputs import OUTPUTS
 
 
@@ -68,6 +71,7 @@ def command(
       bag                           what the node would publish (mcap)
       report.html                   pictures, planes over time, times
 
+    Several recordings have index.html beside their folders, which leads to their reports.
     A recording that is done is not done again, one that was interrupted starts anew. A damaged
     one is read up to the damage, and the exit code is 1.
     """
@@ -89,6 +93,8 @@ def command(
         click.echo(f'{task.recording}: {read}')
         _report(task, outcome)
         outcomes.append(outcome)
+    if len(tasks) > 1:
+        write_overview(output / 'index.html', output.name, list(map(_row, tasks, outcomes)))
     if any(outcome.damage for outcome in outcomes):
         ctx.exit(1)
 
@@ -112,6 +118,12 @@ def _outcomes(tasks: list[Replay], jobs: int | None, scheduler: str | None) -> I
     if len(tasks) == 1:
         return [tasks[0].run(lambda frames, total: options.progress(frames, total, 'frame'))]
     return options.progress(run_all(tasks, jobs), len(tasks), 'bag')
+
+
+def _row(task: Replay, outcome: Outcome) -> dict[str, Any]:
+    """What the overview tells of a recording."""
+    empty = sum(outcome.reasons.values())
+    return {'name': task.folder.name, 'empty': empty, **asdict(outcome), **outcome.figures}
 
 
 def _report(task: Replay, outcome: Outcome) -> None:

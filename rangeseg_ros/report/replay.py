@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -54,11 +56,20 @@ class ReplayReport:
         if not result.planes:
             self.reasons[result.reason] += 1
 
+    def figures(self) -> dict[str, float]:
+        """`duration` in seconds, median number of `planes_per_frame`, and number of `ids`."""
+        sightings = np.concatenate(self._sightings)
+        per_frame = np.bincount(sightings['frame'], minlength=self.frames)
+        return {
+            'duration': (self._stamps[-1] - self._stamps[0]) / 1e9 if self.frames else 0.0,
+            'planes_per_frame': float(np.median(per_frame)) if self.frames else 0.0,
+            'ids': len(np.unique(sightings['id'])),
+        }
+
     def write(self, path: Path, damage: str = '') -> None:
         """Write the page; `damage` says why the recording was not read to its end."""
         sightings = np.concatenate(self._sightings)
         times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
-        per_frame = np.bincount(sightings['frame'], minlength=self.frames)
         frames = np.arange(self.frames, dtype=float)
         write_page(
             path,
@@ -66,9 +77,7 @@ class ReplayReport:
             name=self.name,
             damage=damage,
             frames=self.frames,
-            duration=times[-1] if self.frames else 0.0,
-            ids=len(np.unique(sightings['id'])),
-            planes_per_frame=np.median(per_frame) if self.frames else 0.0,
+            **self.figures(),
             pictures=spread(self._pictures),
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
@@ -79,3 +88,12 @@ class ReplayReport:
             else '',
             **common(self.config, self._timings, self.reasons),
         )
+
+
+def write_overview(path: Path, name: str, recordings: Sequence[Mapping[str, Any]]) -> None:
+    """Write the page that leads to the reports of several recordings, in folders beside it.
+
+    Each has the `name` of its folder, the number of its `frames` and of those that are `empty`,
+    its `damage`, and what `ReplayReport.figures` returns.
+    """
+    write_page(path, 'overview.html', name=name, recordings=recordings)
