@@ -1,10 +1,8 @@
-"""Fast minimiser: blocks of pixels vote for few labels, then bands around the boundaries.
+"""Fast minimiser: pieces of the image first, then pixels around the boundaries.
 
-On the coarsest level the energy of labellings that are constant on blocks is minimised (data
-costs summed over the block, weights over its borders). Finer levels start from the labelling
-above and expand each label by a few blocks, in the end pixels, around the boundaries of its
-regions, and where the normals of a block ask for a label far better than its own. On every
-level regions then move to the direction that suits all of their normals.
+The energy of labellings that are constant on pieces is minimised: regions of pieces take labels
+as wholes, then the labels in use are expanded. Last, labels are expanded by some pixels about
+their boundaries.
 """
 
 from __future__ import annotations
@@ -13,20 +11,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.bands import BandLabelling, Grid
-from rangeseg_ros.core.energy import angles
+from rangeseg_ros.core.energy import angles, mixed_angles, site_angle
+from rangeseg_ros.core.expansion import band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
-from rangeseg_ros.core.regions import connected_components
+from rangeseg_ros.core.piece_moves import PieceLabelling
+from rangeseg_ros.core.pieces import Pieces, pieces
 
-# Width of the blocks of each level, pixels, each a divisor of the one before; how many blocks a
-# label may advance in a sweep; sweeps at most.
-LEVELS = ((8, 8, 2), (4, 4, 1), (2, 3, 1), (1, 2, 1))
-# Pixels across the tiles that ask for labels; degrees from which a pixel counts as odd; what the
-# odd pixels of a tile must save together, edges.
-_TILE, _ODD, _SAVING = 8, 20.0, 8.0
-# Directions around the mean normal of a region that are tried for it, by about so many of its
-# pixels.
-_TRIED, _LARGE = 7, 3000
+# Pixels that labels advance in the end, not counting those that gain by so many degrees.
+_REACH, _ODD = 4, 15.0
 
 
 def minimise(
@@ -53,210 +45,88 @@ def minimise(
     (H, W) intp
         Index into `directions`.
     """
-    height, width = normals.shape[:2]
-    # Whole blocks only: beyond the image nothing is measured and nothing connected.
-    rows, columns = -height % LEVELS[0][0], -width % LEVELS[0][0]
-    normals = np.pad(normals, ((0, rows), (0, columns), (0, 0)), constant_values=np.nan)
-    horizontal = np.pad(horizontal, ((0, rows), (0, columns)))
-    vertical = np.pad(vertical, ((0, rows), (0, columns)))
-    labelled = directions.astype(np.float32)
-
-    coarsest = LEVELS[0][0]
-    image = _votes(_blocks(normals, coarsest), labelled).reshape(-1, normals.shape[1] // coarsest)
-    for size, reach, sweeps in LEVELS:
-        grid = Grid(
-            _blocks(normals, size),
-            _links(horizontal, vertical, size, smoothness),
-            normals.shape[1] // size,
-        )
-        ratio = grid.width // image.shape[1]
-        image = image.repeat(ratio, axis=0).repeat(ratio, axis=1)
-        labelling = BandLabelling(image.ravel(), grid, labelled)
-        wanted = _wanted(
-            labelling.data,
-            grid.normals,
-            grid.width,
-            labelled,
-            _TILE // size,
-            _ODD,
-            _SAVING * smoothness,
-        )
-        for _ in range(sweeps):
-            helped = labelling.sweep(reach, wanted)
-            _turn(labelling, labelled, max(1, _LARGE // size**2))
-            if not helped:
-                break
-        image = labelling.labels.reshape(image.shape)
-    return image[:height, :width].astype(np.intp)
+    parts = pieces(normals, directions, horizontal, vertical, smoothness)
+    # Any label will do where neither an edge nor a normal is.
+    labels = np.append(_label_pieces(parts, parts.votes), np.int32(0))[parts.image]
+    _refine(labels, normals, directions, horizontal, vertical, smoothness)
+    return labels.astype(np.intp)
 
 
-def _votes(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Direction nearest to the mean normal of each block (n,)."""
-    return np.argmax(_sum(normals) @ directions.T, axis=1).astype(np.int32)
+def _label_pieces(parts: Pieces, labels: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Labels (n,) of pieces, in place."""
+    labelling = PieceLabelling(parts, labels)
+    for _ in range(2):
+        labelling.settle()
+        labelling.turn()
+    labelling.expand()
+    labelling.turn()
+    return labelling.labels
 
 
-@njit(cache=True)
-def _wanted(
-    data: NDArray[np.float32],
+def _refine(
+    image: NDArray[np.int32],
     normals: NDArray[np.float32],
-    width: int,
-    directions: NDArray[np.float32],
-    tile: int,
-    odd: float,
-    saving: float,
-) -> NDArray[np.int32]:
-    """Direction of the sites of a tile that their label suits badly, where all save much by it.
-
-    -1 elsewhere.
-    """
-    pixels = normals.shape[2]
-    wanted = np.full(len(data), -1, np.int32)
-    sites = np.empty(tile * tile, np.int32)
-    for i0 in range(0, len(data) // width, tile):
-        for j0 in range(0, width, tile):
-            count = 0
-            x, y, z = np.float32(0), np.float32(0), np.float32(0)
-            for i in range(i0, i0 + tile):
-                for j in range(j0, j0 + tile):
-                    p = i * width + j
-                    if data[p] > odd * pixels:
-                        sites[count] = p
-                        count += 1
-                        for k in range(pixels):
-                            if normals[p, 0, k] == normals[p, 0, k]:
-                                x += normals[p, 0, k]
-                                y += normals[p, 1, k]
-                                z += normals[p, 2, k]
-            total = np.float32(0)
-            for k in range(count):
-                total += data[sites[k]]
-            if total <= saving:
-                continue
-            best, most = 0, np.float32(-1e30)
-            for d in range(len(directions)):
-                along = x * directions[d, 0] + y * directions[d, 1] + z * directions[d, 2]
-                if along > most:
-                    best, most = d, along
-            each = angles(sites[:count], normals, directions[best])
-            saved = np.float32(0)
-            for k in range(count):
-                saved += max(data[sites[k]] - each[k], np.float32(0))
-            if saved > saving:
-                for k in range(count):
-                    if data[sites[k]] > each[k]:
-                        wanted[sites[k]] = best
-    return wanted
+    directions: NDArray[np.floating],
+    horizontal: NDArray[np.floating],
+    vertical: NDArray[np.floating],
+    smoothness: float,
+) -> None:
+    """Expand the labels of an image by some pixels, in place."""
+    width, labels = image.shape[1], image.reshape(-1)
+    sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3, 1)
+    vectors = directions.astype(np.float32)
+    links = grid_links(horizontal.astype(np.float32), vertical.astype(np.float32), smoothness)
+    data = mixed_angles(labels, sites, vectors)
+    position = np.full(len(labels), -1, np.int32)
+    start, beside = fronts(labels, links, width, len(vectors))
+    for alpha in np.flatnonzero(np.diff(start)).tolist():
+        front = beside[start[alpha] : start[alpha + 1]]
+        front = _onward(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
+        near = band(alpha, front, _REACH, labels, links, width, position)
+        new = angles(near, sites, vectors[alpha])
+        move = choice(alpha, near, new, labels, data, links, width, position)
+        move.make(alpha, labels, data, ROUNDING)
 
 
 @njit(cache=True)
-def _blocks(normals: NDArray[np.float32], size: int) -> NDArray[np.float32]:
-    """Normals (H, W, 3) by blocks (n, 3, size * size)."""
-    rows, columns = normals.shape[0] // size, normals.shape[1] // size
-    blocks = np.empty((rows * columns, 3, size * size), np.float32)
-    for i in range(rows * size):
-        for j in range(columns * size):
-            block = blocks[i // size * columns + j // size]
-            for c in range(3):
-                block[c, i % size * size + j % size] = normals[i, j, c]
-    return blocks
-
-
-@njit(cache=True)
-def _sum(normals: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sums (n, 3) of the normals of each block."""
-    total = np.zeros((len(normals), 3), np.float32)
-    for p in range(len(normals)):
-        for c in range(3):
-            for k in range(normals.shape[2]):
-                x = normals[p, c, k]
-                if x == x:
-                    total[p, c] += x
-    return total
-
-
-@njit(cache=True)
-def _links(
-    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], size: int, smoothness: float
-) -> NDArray[np.float32]:
-    """Prior (n, 4) between each block and its neighbours: sums over their borders."""
-    rows, columns = len(horizontal) // size, vertical.shape[1] // size
-    links = np.zeros((rows * columns, 4), np.float32)
-    for i in range(rows * size):
-        for j in range(1, columns):
-            p = i // size * columns + j
-            links[p, 2] += smoothness * horizontal[i, j * size - 1]
-            links[p - 1, 0] = links[p, 2]
-    for i in range(1, rows):
-        for j in range(columns * size):
-            p = i * columns + j // size
-            links[p, 3] += smoothness * vertical[i * size - 1, j]
-            links[p - columns, 1] = links[p, 3]
-    return links
-
-
-def _turn(labelling: BandLabelling, directions: NDArray[np.float32], largest: int) -> None:
-    """Give every region up to a size the direction that suits its normals best."""
-    grid = labelling.grid
-    shape = -1, grid.width
-    regions = connected_components(
-        labelling.labels.reshape(shape),
-        grid.links[:, 0].reshape(shape)[:, :-1],
-        grid.links[:, 1].reshape(shape)[:-1],
-    )
-    _turn_regions(
-        regions.ravel(),
-        labelling.labels,
-        labelling.data,
-        grid.normals,
-        directions,
-        1 - _TRIED / len(directions),
-        largest,
-    )
-
-
-@njit(cache=True)
-def _turn_regions(
-    regions: NDArray[np.int32],
+def _onward(
+    alpha: int,
+    front: NDArray[np.int32],
+    normals: NDArray[np.float32],
+    direction: NDArray[np.float32],
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    cosine: float,
-    largest: int,
-) -> None:
-    """In place; directions within the angle of the cosine to the mean normal are tried."""
-    start = np.zeros(regions.max() + 2, np.int64)
-    for p in range(len(regions)):
-        start[regions[p] + 1] += 1
-    start = np.cumsum(start)
-    last = start[:-1].copy()
-    order = np.empty(len(regions), np.int32)
-    for p in range(len(regions)):
-        order[last[regions[p]]] = p
-        last[regions[p]] += 1
-    for r in range(len(start) - 1):
-        sites = order[start[r] : start[r + 1]]
-        if len(sites) == 0:
-            continue
-        sample = sites[:: 1 + len(sites) // largest]
-        x, y, z, cost = 0.0, 0.0, 0.0, 0.0
-        for p in sample:
-            cost += data[p]
-            for k in range(normals.shape[2]):
-                if normals[p, 0, k] == normals[p, 0, k]:
-                    x += normals[p, 0, k]
-                    y += normals[p, 1, k]
-                    z += normals[p, 2, k]
-        limit = cosine * np.sqrt(x * x + y * y + z * z)
-        best = label = labels[sites[0]]
-        for d in range(len(directions)):
-            along = x * directions[d, 0] + y * directions[d, 1] + z * directions[d, 2]
-            if d == label or along <= limit:
+    links: NDArray[np.float32],
+    width: int,
+    position: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    """Sites of a front, and on from there those that gain much by the label.
+
+    `position` is -1 and becomes so again.
+    """
+    offsets = np.array([1, width, -1, -width])
+    sites = np.empty(2 * len(front) + 64, np.int32)
+    count = 0
+    for p in front:
+        if labels[p] != alpha and position[p] < 0:
+            position[p] = count
+            sites[count] = p
+            count += 1
+    done = 0
+    while done < count:
+        p = sites[done]
+        done += 1
+        for k in range(4):
+            q = p + offsets[k]
+            if links[p, k] == 0 or labels[q] == alpha or position[q] >= 0 or data[q] <= _ODD:
                 continue
-            total = 0.0
-            for value in angles(sample, normals, directions[d]):
-                total += value
-            if total < cost - ROUNDING:
-                best, cost = d, total
-        if best != label:
-            labels[sites], data[sites] = best, angles(sites, normals, directions[best])
+            cost = site_angle(normals[q], direction[0], direction[1], direction[2])
+            if data[q] - cost > _ODD:
+                if count == len(sites):
+                    sites = np.concatenate((sites, np.empty_like(sites)))
+                position[q] = count
+                sites[count] = q
+                count += 1
+    for p in sites[:count]:
+        position[p] = -1
+    return sites[:count]
