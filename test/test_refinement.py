@@ -113,7 +113,7 @@ def test_links_are_the_weights_on_all_four_sides(shape):
     random = np.random.default_rng(sum(shape))
     horizontal = random.random((shape[0], shape[1] - 1)).astype(np.float32)
     vertical = random.random((shape[0] - 1, shape[1])).astype(np.float32)
-    links = expansion.links(horizontal, vertical, 3.0).reshape(*shape, 4)
+    links = expansion.grid_links(horizontal, vertical, 3.0).reshape(*shape, 4)
     for side, (weight, border) in enumerate(
         [
             (links[:, :-1, 0] / 3, links[:, -1, 0]),

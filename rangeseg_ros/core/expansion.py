@@ -21,7 +21,7 @@ Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 
 
 @njit(cache=True, nogil=True)
-def links(
+def grid_links(
     horizontal: NDArray[np.float32], vertical: NDArray[np.float32], smoothness: float
 ) -> NDArray[np.float32]:
     """Weights (H * W, 4) of each pixel's edges times the smoothness; 0 at the border.
@@ -56,7 +56,6 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
         Sites in a row.
     count : int
         Number of labels.
-
     """
     # Pairs (p, q), then sorted by counting.
     pairs = np.empty((2 * len(labels), 2), np.int32)

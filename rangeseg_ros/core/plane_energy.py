@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.expansion import links
+from rangeseg_ros.core.expansion import grid_links
 from rangeseg_ros.core.growing import DISTORTION_PIXELS
 from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
 from rangeseg_ros.core.range_image import RangeImage
@@ -66,7 +66,7 @@ class Problem(NamedTuple):
         """Weigh the pixels of an image by the noise of its sensor."""
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor.noise, sensor.range_noise)
-        prior = links(horizontal, vertical, _SMOOTHNESS)
+        prior = grid_links(horizontal, vertical, _SMOOTHNESS)
         return cls(inverse, rays, weight, prior, image.shape[1], block)
 
 
