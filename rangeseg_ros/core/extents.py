@@ -132,35 +132,30 @@ def _area_moments(
     sums = np.zeros((len(theta), 6))
     width = labels.shape[1]
     for i in range(first, after):
-        for j in range(width):
+        j = 0
+        while j < width:
             label = int(labels[i, j])
-            y = inverse[i, j]
-            if label == 0 or y == 0:
+            if label == 0:
+                j += 1
                 continue
-            x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
-            level = theta[label, 0] * x0 + theta[label, 1] * x1 + theta[label, 2] * x2
-            if level * _FAR < y:
-                continue
-            z = 1 / level
-            x0, x1, x2 = z * x0, z * x1, z * x2
-            u = (
-                tangents[label, 0, 0] * x0
-                + tangents[label, 0, 1] * x1
-                + tangents[label, 0, 2] * x2
-            )
-            v = (
-                tangents[label, 1, 0] * x0
-                + tangents[label, 1, 1] * x1
-                + tangents[label, 1, 2] * x2
-            )
-            area = footprints[i, j] * z * z * z
-            au, av = area * u, area * v
-            sums[label, 0] += area
-            sums[label, 1] += au
-            sums[label, 2] += av
-            sums[label, 3] += au * u
-            sums[label, 4] += au * v
-            sums[label, 5] += av * v
+            plane, across, along = theta[label], tangents[label, 0], tangents[label, 1]
+            # In variables of their own: sums in an array go through memory for every pixel.
+            one = su = sv = suu = suv = svv = 0.0
+            while j < width and labels[i, j] == label:
+                y = inverse[i, j]
+                x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+                level = plane[0] * x0 + plane[1] * x1 + plane[2] * x2
+                if y > 0 and level * _FAR >= y:
+                    z = 1 / level
+                    u = z * (across[0] * x0 + across[1] * x1 + across[2] * x2)
+                    v = z * (along[0] * x0 + along[1] * x1 + along[2] * x2)
+                    area = footprints[i, j] * z * z * z
+                    au, av = area * u, area * v
+                    one, su, sv = one + area, su + au, sv + av
+                    suu, suv, svv = suu + au * u, suv + au * v, svv + av * v
+                j += 1
+            for entry, value in enumerate((one, su, sv, suu, suv, svv)):
+                sums[label, entry] += value
     return sums
 
 

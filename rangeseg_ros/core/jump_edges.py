@@ -179,33 +179,47 @@ def _find_strong(
     too: what counts is a pixel's deviation in either direction.
     """
     height, width = strong.shape
-    for i in range(first, after):
-        row = mean[i + _MARGIN]
+    leaving = np.zeros(width, np.bool_)
+    below = np.zeros(width, np.bool_)
+    for i in range(first - 1, after):
+        # Boundaries with the next pixel: the windows around the last but one and so on.
+        k = i + _MARGIN
+        above, below = below, np.zeros(width, np.bool_)
+        if 0 <= i < height - 1:
+            columns = mean[:, _MARGIN : _MARGIN + width]
+            _leave(columns[k - 4], columns[k - 1], columns[k + 2], columns[k + 5], step, below)
+        if i < first:
+            continue
+        row = mean[k, _MARGIN - 4 :]
+        _leave(row, row[3:], row[6:], row[9:], step, leaving[: width - 1])
         for j in range(width):
-            # Boundaries with the next pixel: the windows around the last but one and so on.
-            k = j + _MARGIN
-            if j + 1 < width and _leaves(row[k - 4], row[k - 1], row[k + 2], row[k + 5], step):
-                strong[i, j] = strong[i, j + 1] = True
-            m = i + _MARGIN
-            # The row below may belong to another strip, but both only ever set.
-            if i + 1 < height and _leaves(
-                mean[m - 4, k], mean[m - 1, k], mean[m + 2, k], mean[m + 5, k], step
-            ):
-                strong[i, j] = strong[i + 1, j] = True
+            strong[i, j] = above[j] | below[j] | leaving[j]
+        for j in range(1, width):
+            strong[i, j] |= leaving[j - 1]
 
 
-@njit(cache=True)
-def _leaves(a: float, b: float, c: float, d: float, step: float) -> bool:
-    """Whether the step from b to c lies outside those from a to b and from c to d so far.
+@njit(cache=True, nogil=True)
+def _leave(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    c: NDArray[np.float32],
+    d: NDArray[np.float32],
+    step: float,
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the steps from b to c lie outside those from a to b and from c to d so far.
 
     A side that was not measured (NaN) is left out.
     """
-    here, before, after = c - b, b - a, d - c
-    if np.isnan(here) or (np.isnan(before) and np.isnan(after)):
-        return False
-    above = (np.isnan(before) or here - before > step) and (np.isnan(after) or here - after > step)
-    below = (np.isnan(before) or before - here > step) and (np.isnan(after) or after - here > step)
-    return above or below
+    # Without branches, so that the compiler takes many at a time.
+    step = np.float32(step)
+    for j in range(len(result)):
+        here = c[j] - b[j]
+        before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
+        first, last = before != before, after != after
+        above = ((before > step) | first) & ((after > step) | last)
+        below = ((before < -step) | first) & ((after < -step) | last)
+        result[j] = (above | below) & ~(first & last)
 
 
 @njit(cache=True, nogil=True)
