@@ -34,12 +34,14 @@ _CLEAR = 24.0
 _WITHIN_PATCH, _BETWEEN_PATCHES, _WITHIN_SURFACE = 2.0, 10.0, 30.0
 # Blocks of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
 _PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
+# Blocks that may lie between the parts of a face.
+_GAP = 4
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = 10.0
 
 
 def surfaces(
-    moments: NDArray[np.float64], links: Links, block: int
+    moments: NDArray[np.float64], links: Links, block: int, least: int = 1
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
@@ -51,6 +53,8 @@ def surfaces(
         Which neighbouring blocks are connected.
     block : int
         Rows and columns of a block.
+    least : int
+        Pixels of the smallest surface.
 
     Returns
     -------
@@ -65,8 +69,12 @@ def surfaces(
     roots = halves(_patches, shape[0], moments, *links, _PATCH_LARGEST * block**2)
     patch, moments = _renumbered(np.concatenate(roots), blocks, _PATCH_MINIMUM * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))
-    surface, moments = _renumbered(_join(moments, border), moments, 1)
-    return surface[patch].reshape(shape), moments
+    surface, moments = _renumbered(_join(moments, border, _BETWEEN_PATCHES), moments, least)
+    labels = surface[patch].reshape(shape)
+    # A neck narrower than a block, or a row of holes, may keep parts of a face from touching.
+    root = _join(moments, _nearby(labels, len(moments)), _WITHIN_PATCH)
+    surface, moments = _renumbered(root, moments, 1)
+    return surface[labels], moments
 
 
 @njit(cache=True, nogil=True)
@@ -158,6 +166,26 @@ def _borders(
                     border[a, b] += 1
                     border[b, a] += 1
     return border
+
+
+@njit(cache=True)
+def _nearby(labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+    """Pairs of blocks within `_GAP` of each other, of every two surfaces: as `_borders`."""
+    rows, columns = labels.shape
+    near = np.zeros((count, count))
+    for i in range(rows):
+        for j in range(columns):
+            a = labels[i, j]
+            inner = 0 < j < columns - 1 and labels[i, j - 1] == a and labels[i, j + 1] == a
+            if a == 0 or (inner and i + 1 < rows and labels[i + 1, j] == a):
+                continue
+            for ni in range(i, min(i + _GAP + 1, rows)):
+                for nj in range(max(j - _GAP, 0), min(j + _GAP + 1, columns)):
+                    b = labels[ni, nj]
+                    if b > 0 and b != a:
+                        near[a, b] += 1
+                        near[b, a] += 1
+    return near
 
 
 @njit(cache=True)
@@ -286,11 +314,13 @@ def _grow(
 
 
 @njit(cache=True)
-def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[np.intp]:
+def _join(
+    moments: NDArray[np.float64], border: NDArray[np.float64], granted: float
+) -> NDArray[np.intp]:
     """Join patches 1...P to surfaces, those that agree best first; returns the roots.
 
     The strain between two surfaces is the mean misfit of the patches on either side of their
-    border.
+    border, where so many systematic variances are granted.
     """
     count = len(moments)
     moments, border = moments.copy(), border.copy()
@@ -305,7 +335,7 @@ def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[
         for b in range(a + 1, count):
             if border[a, b] > 0:
                 extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
-                misfit = _misfit(extra, moments[a], moments[b], _BETWEEN_PATCHES)
+                misfit = _misfit(extra, moments[a], moments[b], granted)
                 strain[a, b] = strain[b, a] = misfit * border[a, b]
                 heappush(heap, (strain[a, b] / border[a, b], a, b))
     parent = np.arange(count)
@@ -318,8 +348,8 @@ def _join(moments: NDArray[np.float64], border: NDArray[np.float64]) -> NDArray[
         chi2 = common_residual(moments[a], moments[b])
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
-        granted = _WITHIN_SURFACE * pixels / (pixels + DISTORTION_PIXELS)
-        if _misfit(extra, moments[a], moments[b], granted) >= 1:
+        within = _WITHIN_SURFACE * pixels / (pixels + DISTORTION_PIXELS)
+        if _misfit(extra, moments[a], moments[b], within) >= 1:
             continue
         parent[b] = a
         moments[a] += moments[b]

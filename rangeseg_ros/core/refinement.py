@@ -13,7 +13,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.expansion import Choice, Sites, band, choice, fronts
-from rangeseg_ros.core.moments import COUNT
 from rangeseg_ros.core.plane_energy import (
     NO_PLANE,
     Models,
@@ -40,7 +39,6 @@ def refine(
     surfaces: NDArray[np.intp],
     moments: NDArray[np.float64],
     sensor: SensorModel,
-    least: int = 0,
     exact: bool = False,
     refits: int = 0,
 ) -> tuple[NDArray[np.int32], Models]:
@@ -54,8 +52,6 @@ def refine(
     moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
-    least : int
-        Pixels of the smallest surface whose plane is tried.
     exact : bool
         Expand every label to all pixels within four blocks of its surface until no expansion
         helps; otherwise every label once, near its boundaries.
@@ -70,12 +66,7 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    kept = moments[:, COUNT] >= least
-    kept[0] = True
-    number = np.where(kept, np.cumsum(kept) - 1, 0).astype(np.int32)
-    starts = number[surfaces]
-    moments = moments[kept]
-    models = Models.of(moments)
+    starts, models = surfaces.astype(np.int32), Models.of(moments)
     labels, cost = _descended(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains)

@@ -110,13 +110,13 @@ class Segmenter:
         watch.lap('blocks')
         pending = aside(Problem.of, image, sensor, horizontal, vertical, size)
         links = block_links(horizontal, vertical, size)
-        surface, moments = surfaces(weighted(blocks, sensor, slope), links, size)
+        # A region may gain as much again from pixels that no block could take.
+        least = self.config.min_pixels // 2 or 1
+        surface, moments = surfaces(weighted(blocks, sensor, slope), links, size, least)
         problem = pending.result()
         watch.lap('surfaces')
-        # A region may gain as much again from pixels that no block could take.
-        least = self.config.min_pixels // 2
         labels, models = refine(
-            problem, surface, moments, sensor, least, self.config.exact, self.config.refits
+            problem, surface, moments, sensor, self.config.exact, self.config.refits
         )
         watch.lap('labels')
         image_labels = labels.reshape(image.shape)
