@@ -56,6 +56,24 @@ def test_cylinders_are_curved(radius):
     assert verdict(inverse, inverse > 0, 0.5).tolist() == [False, True]
 
 
+@pytest.mark.parametrize(('bend', 'expected'), [(0.008, False), (0.018, True)])
+@pytest.mark.parametrize('angle', [0, 30, 60])
+def test_a_bend_counts_across_the_plane_however_obliquely_it_is_seen(bend, expected, angle):
+    """A sheet bent like a barrel, by a share of the square root of its area."""
+    rays = CAMERA.rays.astype(float)
+    turn = np.tan(np.radians(angle))
+    flat = rays @ np.array([turn, 0, 1.0]) / 1.5
+    seen = (np.abs(rays[..., :2]) < 0.1).all(axis=-1)
+    distance = 1.5 * np.cos(np.radians(angle))
+    area = (1 / (CAMERA.fx * CAMERA.fy * distance * flat[seen] ** 3)).sum()
+    barrel = (rays[..., 1][seen] / flat[seen]) ** 2
+    barrel -= barrel.mean()
+    inverse = np.zeros(CAMERA.shape)
+    height = bend * np.sqrt(area) * barrel / barrel.std()
+    inverse[seen] = flat[seen] * (1 + height / distance)
+    assert verdict(inverse, seen).tolist() == [False, expected]
+
+
 def test_only_the_curved_region_is():
     inverse = cylinder(0.25)
     regions = np.where(inverse > 0, 2, 1)

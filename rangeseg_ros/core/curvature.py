@@ -15,9 +15,10 @@ from rangeseg_ros.core.threads import halves
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
 # within two and a half times that.
 _SHARE, _PIXELS, _EXPONENT = 1.5**2, 1e4, 0.78
-# A bend of less than 2 % of its width, root mean square, is a plane to most who ask: a bulging
-# box. A sphere cut to pieces of a third of its radius bends by 3 %.
-_FLATNESS = 0.02
+# A bend of less than 1 % of its width, root mean square, is a plane to most who ask: a bulging
+# box. A sphere cut to pieces of a third of its radius bends by 3 %, a cylinder cut to strips as
+# wide as its radius and three times as high by 2 %.
+_FLATNESS = 0.01
 # Nine agreeing pixels count as one; the chi-squared of three terms of curvature stays below four
 # times its mean.
 _NOISE = 9.0 * 3.0 * 4.0
@@ -102,8 +103,9 @@ def _normal_equations(
     """Normal equations of a quadratic in the pixel coordinates fitted to some rows of each region.
 
     What is fitted are the residuals in standard deviations of the noise, those beyond `limit`
-    left out. Also returns the sum of their squares, the area in square metres of each region seen
-    face on, and the sum over its pixels of the standard deviation in metres.
+    left out. Also returns the sum of their squares, the area in square metres of each region, and
+    the sum over its pixels of the standard deviation in metres, both on and across its plane:
+    neither depends on how obliquely it is seen.
     """
     height, width = regions.shape
     count = len(theta)
@@ -119,6 +121,7 @@ def _normal_equations(
                 continue
             # Along a run of the row only x varies: its powers are all there is to sum.
             plane = theta[label]
+            distance = 1 / np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
             p0 = p1 = p2 = p3 = p4 = v0 = v1 = v2 = squares = metres = deviations = 0.0
             while j < width and regions[i, j] == label:
                 ray = rays[i, j]
@@ -127,14 +130,17 @@ def _normal_equations(
                 value *= root
                 if abs(value) <= limit[label]:
                     squares += value * value
-                    square = inverse[i, j] ** 2
-                    deviations += 1 / (root * square)
+                    # An error of the inverse leaves the plane by distance / inverse times as much.
+                    deviations += distance / (root * inverse[i, j])
                     if i > 0 and j > 0 and inverse[i - 1, j] > 0 and inverse[i, j - 1] > 0:
                         across, along = 0.0, 0.0
                         for k in range(3):
                             across += (ray[k] - rays[i, j - 1, k]) ** 2
                             along += (ray[k] - rays[i - 1, j, k]) ** 2
-                        metres += np.sqrt(across * along) / square
+                        length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+                        # Seen face on it is smaller by the cosine, distance inverse / length.
+                        face = np.sqrt(across * along) / inverse[i, j] ** 2
+                        metres += face * length / (distance * inverse[i, j])
                     x = 2 * j / width - 1
                     square = x * x
                     p0, p1, p2 = p0 + 1, p1 + x, p2 + square
