@@ -11,6 +11,7 @@ from rangeseg_ros.core.regions import (
     is_noise,
     merge,
     plane_regions,
+    rejoined,
     without,
 )
 
@@ -97,3 +98,35 @@ def test_small_regions_and_shadow_are_no_plane():
     found = plane_regions(labels, valid, *uncut((20, 20)), config)
     assert not found[:5, :5].any() and not found[:, 15:].any()
     assert (found[5:, :15] == 1).all()
+
+
+def test_what_an_edge_cut_off_rejoins_the_region_of_its_label():
+    labels = np.array([[1, 1, 1, 2, 2], [1, 1, 1, 2, 2], [0, 0, 0, 2, 1], [3, 3, 3, 2, 1]])
+    regions = np.array(
+        [[1, 0, 0, 0, 2], [1, 0, 1, 0, 0], [0, 0, 0, 2, 0], [0, 0, 0, 0, 0]], np.uint16
+    )
+    kept = regions.copy()
+    # Label 3 has no region, and that of label 1 does not reach round the corner.
+    assert rejoined(regions, labels).tolist() == [
+        [1, 1, 1, 2, 2],
+        [1, 1, 1, 2, 2],
+        [0, 0, 0, 2, 0],
+        [0, 0, 0, 2, 0],
+    ]
+    np.testing.assert_array_equal(regions, kept)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_rejoined_pixels_are_linked_to_a_region_of_their_label(seed):
+    """Against the components of like labels: those with one region become all of it."""
+    random = np.random.default_rng(seed)
+    labels = random.integers(0, 3, (12, 15))
+    components = connected_components(labels, *uncut(labels.shape))
+    chosen = random.random(components.max() + 1) < 0.5
+    regions = np.zeros(labels.shape, np.uint16)
+    for component in np.flatnonzero(chosen):
+        pixels = np.flatnonzero((components == component) & (labels > 0))
+        if len(pixels):
+            regions.ravel()[random.choice(pixels, 1 + len(pixels) // 3)] = component
+    expected = np.where(chosen[components] & (labels > 0), components, 0)
+    np.testing.assert_array_equal(rejoined(regions, labels), expected)

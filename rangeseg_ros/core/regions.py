@@ -46,6 +46,41 @@ def plane_regions(
     return _translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
 
 
+@njit(cache=True)
+def rejoined(regions: NDArray[np.uint16], labels: NDArray[np.integer]) -> NDArray[np.uint16]:
+    """Give pixels of no region to the region of their label that they touch.
+
+    For labels that are planes: what a jump edge cuts off from a region of the same plane, too
+    little to be a region itself, is no jump away from it.
+
+    Parameters
+    ----------
+    regions : (H, W) uint16
+        0...M, 0 for no region.
+    labels : (H, W) int
+        0 = no plane.
+    """
+    height, width = regions.shape
+    regions = regions.copy()
+    queue = [(0, 0)]
+    queue.clear()
+    for i in range(height):
+        for j in range(width):
+            if regions[i, j] > 0 or labels[i, j] == 0:
+                continue
+            for ni, nj in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
+                if 0 <= ni < height and 0 <= nj < width and regions[ni, nj] > 0:
+                    queue.append((ni, nj))
+    for i, j in queue:
+        for ni, nj in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
+            if not (0 <= ni < height and 0 <= nj < width):
+                continue
+            if regions[ni, nj] == 0 and labels[ni, nj] == labels[i, j]:
+                regions[ni, nj] = regions[i, j]
+                queue.append((ni, nj))
+    return regions
+
+
 def connected_components(
     labels: NDArray[np.integer],
     horizontal: NDArray[np.floating],

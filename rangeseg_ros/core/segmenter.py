@@ -32,7 +32,7 @@ from rangeseg_ros.core.plane_energy import energy as plane_energy
 from rangeseg_ros.core.planes import Plane, fit_planes
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.refinement import refine
-from rangeseg_ros.core.regions import plane_regions, without
+from rangeseg_ros.core.regions import plane_regions, rejoined, without
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.core.threads import aside
 
@@ -121,6 +121,7 @@ class Segmenter:
         watch.lap('labels')
         image_labels = labels.reshape(image.shape)
         regions = plane_regions(image_labels, image_labels > 0, horizontal, vertical, self.config)
+        regions = rejoined(regions, image_labels)
         regions = without(regions, curved(problem, regions, sensor))
         watch.lap('regions')
         return regions, sensor, lambda: plane_energy(labels, problem, models)
