@@ -212,13 +212,13 @@ def _leave(
     A side that was not measured (NaN) is left out.
     """
     # Without branches, so that the compiler takes many at a time.
-    step = np.float32(step)
+    limit = np.float32(step)
     for j in range(len(result)):
         here = c[j] - b[j]
         before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
         first, last = before != before, after != after
-        above = ((before > step) | first) & ((after > step) | last)
-        below = ((before < -step) | first) & ((after < -step) | last)
+        above = ((before > limit) | first) & ((after > limit) | last)
+        below = ((before < -limit) | first) & ((after < -limit) | last)
         result[j] = (above | below) & ~(first & last)
 
 
