@@ -92,3 +92,29 @@ def test_same_labels_every_time():
     arguments, _ = problem(2)
     first = coarse_to_fine.minimise(*arguments)
     assert np.array_equal(first, coarse_to_fine.minimise(*arguments))
+
+
+def scene(shift):
+    """Patches that move to the left, by whole pixels and with noise of their own."""
+    normals, _ = patches(7, 75, 131, 0.0)
+    seen = normals[:, shift : shift + 101]
+    noisy = seen + 0.15 * np.random.default_rng(shift).normal(size=seen.shape)
+    noisy = (noisy / np.linalg.norm(noisy, axis=2, keepdims=True)).astype(np.float32)
+    return noisy, DIRECTIONS, np.ones((75, 100)), np.ones((74, 101)), 40.0
+
+
+def test_warm_start_is_as_good_as_the_cold_one_in_a_sequence():
+    before = None
+    for shift in range(0, 30, 2):
+        arguments = scene(shift)
+        before = coarse_to_fine.minimise(*arguments, before)
+        cold = value(coarse_to_fine.minimise(*arguments), *arguments)
+        assert value(before, *arguments) <= 1.005 * cold
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_warm_start_from_another_scene_does_no_harm(seed):
+    arguments, _ = problem(seed)
+    other = coarse_to_fine.minimise(*problem(seed + 20)[0])
+    warm = coarse_to_fine.minimise(*arguments, other)
+    assert np.array_equal(warm, coarse_to_fine.minimise(*arguments))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
@@ -154,3 +155,39 @@ def test_dithering_repeats_with_its_seed():
     other = segment(corner(), replace(config, seed=1))
     np.testing.assert_array_equal(first.labels, again.labels)
     assert first.energy == again.energy != other.energy
+
+
+WARM = replace(NORMALS, warm_start=True)
+
+
+def noisy(seed):
+    return corner() + 0.01 * np.random.default_rng(seed).normal(size=CAMERA.shape)
+
+
+def image(seed, camera=CAMERA):
+    return RangeImage.from_depth(noisy(seed), camera)
+
+
+def test_without_warm_start_frames_do_not_depend_on_each_other():
+    segmenter = Segmenter(NORMALS)
+    for seed in (1, 2, 1):
+        assert np.array_equal(segmenter.segment(image(seed)).labels, segment(noisy(seed)).labels)
+
+
+def test_warm_start_begins_anew_with_the_first_frame_a_reset_and_another_camera():
+    cold = Segmenter(NORMALS).segment(image(1)).energy
+    segmenter = Segmenter(WARM)
+    assert segmenter.segment(image(1)).energy == cold
+    warm = [segmenter.segment(image(seed)).energy for seed in (2, 3, 1)]
+    assert warm[-1] <= 1.005 * cold
+    segmenter.reset()
+    assert segmenter.segment(image(1)).energy == cold
+    other = Camera(64, 48, 61.0, 61.0, 31.5, 23.5)
+    cold = Segmenter(NORMALS).segment(image(1, other)).energy
+    assert segmenter.segment(image(1, other)).energy == cold
+
+
+@pytest.mark.parametrize('options', [{'method': 'planes'}, {'method': 'normals', 'exact': True}])
+def test_warm_start_is_refused_where_nothing_could_begin_from_labels(options):
+    with pytest.raises(ConfigError, match='warm_start'):
+        Config(warm_start=True, **options)

@@ -15,10 +15,12 @@ from rangeseg_ros.core.energy import angles, mixed_angles, site_angle
 from rangeseg_ros.core.expansion import band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
 from rangeseg_ros.core.piece_moves import PieceLabelling
-from rangeseg_ros.core.pieces import Pieces, pieces
+from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
 
 # Pixels that labels advance in the end, not counting those that gain by so many degrees.
 _REACH, _ODD = 4, 15.0
+# Share of the pixels where the data may speak against the labels of the image before.
+_ANEW = 0.25
 
 
 def minimise(
@@ -27,6 +29,7 @@ def minimise(
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
     smoothness: float,
+    before: NDArray[np.integer] | None = None,
 ) -> NDArray[np.intp]:
     """Labelling of low energy, eq. 5.3 with the angle to the normals as data cost (eq. 5.5).
 
@@ -39,6 +42,9 @@ def minimise(
         Neighbourhood weights.
     smoothness : float
         Lambda.
+    before : (H, W) int, optional
+        Labelling of a similar image, such as the frame before, to begin from; where it does not
+        suit the data it is not used.
 
     Returns
     -------
@@ -46,21 +52,35 @@ def minimise(
         Index into `directions`.
     """
     parts = pieces(normals, directions, horizontal, vertical, smoothness)
-    # Any label will do where neither an edge nor a normal is.
-    labels = np.append(_label_pieces(parts, parts.votes), np.int32(0))[parts.image]
-    _refine(labels, normals, directions, horizontal, vertical, smoothness)
-    return labels.astype(np.intp)
-
-
-def _label_pieces(parts: Pieces, labels: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Labels (n,) of pieces, in place."""
-    labelling = PieceLabelling(parts, labels)
-    for _ in range(2):
+    warm = None if before is None else _warm(parts, before)
+    labelling = PieceLabelling(parts, parts.votes if warm is None else warm)
+    for _ in range(2 if warm is None else 1):
         labelling.settle()
         labelling.turn()
     labelling.expand()
     labelling.turn()
-    return labelling.labels
+    # Any label will do where neither an edge nor a normal is.
+    labels = np.append(labelling.labels, np.int32(0))[parts.image]
+    _refine(labels, normals, directions, horizontal, vertical, smoothness)
+    return labels.astype(np.intp)
+
+
+def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | None:
+    """Labels before (n,) of the pieces, but for those whose data speak against them.
+
+    Those are where the vote saves more than half of the links of the piece, as where something
+    moved. None if the scene looks like another one.
+    """
+    labels, every = parts.votes.copy(), np.arange(len(parts.votes))
+    inside = parts.image >= 0
+    labels[parts.image[inside]] = before[inside]
+    links = np.concatenate([[0.0], np.cumsum(parts.links, dtype=float)])
+    bound = (links[parts.start[1:]] - links[parts.start[:-1]]) / 2
+    lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
+    against = lost > bound
+    if against[parts.image[inside]].sum() > _ANEW * inside.sum():
+        return None
+    return np.where(against, parts.votes, labels)
 
 
 def _refine(

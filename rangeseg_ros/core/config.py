@@ -117,6 +117,11 @@ class Config:
         low=0,
         high=1000,
     )
+    warm_start: bool = option(
+        False,
+        'method normals: begin from the labels of the frame before, where its size and camera '
+        'are the same; a little faster, but results then depend on the frames before',
+    )
     noise_regions: str = option(
         'identify',
         'regions of less than two pixels per pixel of their perimeter: leave them, mark them as '
@@ -221,6 +226,8 @@ class Config:
             check_count(self.directions, self.direction_count)
         except DirectionsError as error:
             raise ConfigError(f'parameter direction_count: {error}') from None
+        if self.warm_start and (self.method != 'normals' or self.exact):
+            raise ConfigError('parameter warm_start is for method normals, without exact')
         if self.up_x == self.up_y == self.up_z == 0:
             raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
 

@@ -19,6 +19,7 @@ from rangeseg_ros.core.blocks import (
     slopes_and_residuals,
     weighted,
 )
+from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.curvature import curved
 from rangeseg_ros.core.directions import directions
@@ -80,6 +81,11 @@ class Segmenter:
         self._directions = directions(
             self.config.directions, self.config.direction_count, self.config.seed
         )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the frame before, from which `warm_start` begins."""
+        self._before: tuple[Camera | None, NDArray[np.intp]] | None = None
 
     def segment(self, image: RangeImage) -> Segmentation:
         """Label every pixel of `image` with the plane it belongs to."""
@@ -141,7 +147,9 @@ class Segmenter:
         if config.exact:
             labels = moves.minimise(*problem, config.cycles, config.moves)
         else:
-            labels = coarse_to_fine.minimise(*problem)
+            labels = coarse_to_fine.minimise(*problem, self._labels_before(image))
+            if config.warm_start:
+                self._before = image.camera, labels
         watch.lap('labels')
         regions = plane_regions(labels, image.valid, horizontal, vertical, config)
         watch.lap('regions')
@@ -152,6 +160,13 @@ class Segmenter:
             return energy(data, labels, horizontal, vertical, config.smoothness)
 
         return regions, SensorModel.from_config(config), value
+
+    def _labels_before(self, image: RangeImage) -> NDArray[np.intp] | None:
+        """Directions of the frame before, if it was taken like this one."""
+        if self._before is None:
+            return None
+        camera, labels = self._before
+        return labels if camera == image.camera and labels.shape == image.shape else None
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -29,6 +29,7 @@ class SequenceSegmenter:
     def __init__(self, config: Config | None = None) -> None:
         self._segmenter = Segmenter(config)
         self._tracker = Tracker(config)
+        self._stamp = 0
 
     @property
     def config(self) -> Config:
@@ -45,12 +46,16 @@ class SequenceSegmenter:
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         wall = np.full(camera.shape, 1000, np.uint16)
         self._segmenter.segment(RangeImage.from_depth(wall, camera))
+        self._segmenter.reset()
 
     def segment(self, image: RangeImage, stamp: int, up: ArrayLike | None = None) -> Segmentation:
         """Label the next frame, taken at `stamp` nanoseconds; ids and roles of its planes are set.
 
         `up` (3,) is the direction in the frame of the image, the configured one when not given.
         """
+        if stamp < self._stamp:
+            self._segmenter.reset()
+        self._stamp = stamp
         result = self._segmenter.segment(image)
         planes = self._tracker.track(result.labels, result.planes, stamp)
         return replace(result, planes=with_roles(planes, self.config, up))
