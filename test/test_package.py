@@ -30,7 +30,7 @@ def test_setup_and_package_xml_agree(setup_arguments):
     for tag in ('name', 'version', 'license'):
         assert package.findtext(tag) == setup_arguments[tag]
     assert package.findtext('export/build_type') == 'ament_python'
-    (wheel_only,) = re.findall(r'pip install ([\w ]+?) -->', (ROOT / 'package.xml').read_text())
+    (wheel_only,) = re.findall(r'pip install ([\w -]+?) -->', (ROOT / 'package.xml').read_text())
     keys = {
         element.text.removeprefix('python3-').lower() for element in package.iter('exec_depend')
     }
