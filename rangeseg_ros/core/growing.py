@@ -91,13 +91,14 @@ def _patches(
     blocks = moments[first:after].copy().reshape(-1, SIZE)
     right, below = right[first:after], below[first : max(after - 1, first)]
     theta = np.zeros(3)
+    residual = np.zeros(len(blocks))
     smooth = np.zeros(len(blocks), np.bool_)
     for a in range(len(blocks)):
-        count = blocks[a, COUNT]
-        smooth[a] = count > 0 and fit(blocks[a], theta) < _ROUGH * count
+        residual[a] = fit(blocks[a], theta)
+        smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     pairs = _pairs(smooth.reshape(shape), right, below)
-    parent = _quads(blocks, smooth.reshape(shape), right, below)
-    return _grow(blocks, smooth, pairs, parent, largest) + first * shape[1]
+    parent = _quads(blocks, residual, smooth.reshape(shape), right, below)
+    return _grow(blocks, residual, smooth, pairs, parent, largest) + first * shape[1]
 
 
 @njit(cache=True)
@@ -201,13 +202,15 @@ def _misfit(
 @njit(cache=True)
 def _quads(
     moments: NDArray[np.float64],
+    residual: NDArray[np.float64],
     smooth: NDArray[np.bool_],
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
 ) -> NDArray[np.intp]:
-    """Merge every 2 x 2 blocks that clearly lie on one plane; returns the parent of each block.
+    """Merge every 2 x 2 blocks that clearly lie on one plane; in place.
 
-    Most blocks do; merging these at once saves the queue of `_grow` most of its work.
+    Most blocks do; merging these at once saves the queue of `_grow` most of its work. Returns
+    the parent of each block.
     """
     rows, columns = smooth.shape
     parent = np.arange(rows * columns)
@@ -221,20 +224,22 @@ def _quads(
             if not (right[i, j] and right[i + 1, j] and below[i, j] and below[i, j + 1]):
                 continue
             a = i * columns + j
-            extra = 0.0
+            apart = 0.0
             total[:] = 0
             for b in (a, a + 1, a + columns, a + columns + 1):
                 total += moments[b]
-                extra -= fit(moments[b], theta)
-            extra += fit(total, theta)
-            if extra < _CLEAR:
+                apart += residual[b]
+            together = fit(total, theta)
+            if together - apart < _CLEAR:
                 parent[a + 1] = parent[a + columns] = parent[a + columns + 1] = a
+                moments[a], residual[a] = total, together
     return parent
 
 
 @njit(cache=True)
 def _grow(
     moments: NDArray[np.float64],
+    residual: NDArray[np.float64],
     nodes: NDArray[np.bool_],
     pairs: NDArray[np.intp],
     parent: NDArray[np.intp],
@@ -246,10 +251,6 @@ def _grow(
     Returns the root of each block's patch, itself for a block that is no node.
     """
     count = len(moments)
-    for a in range(count):
-        if parent[a] != a:
-            moments[parent[a]] += moments[a]
-    theta = np.zeros(3)
     # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
     head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
     link = np.full(2 * len(pairs), -1, np.int32)
@@ -260,13 +261,11 @@ def _grow(
         head[a] = e
         if tail[a] < 0:
             tail[a] = e
-    residual = np.zeros(count)
     version = np.zeros(count, np.int64)
     heap = [(0.0, 0, 0)]
     heap.pop()
     for a in range(count):
         if nodes[a] and parent[a] == a:
-            residual[a] = fit(moments[a], theta)
             heappush(heap, (residual[a] / moments[a, COUNT], a, 0))
     seen = np.full(count, -1, np.int32)
     turn = 0

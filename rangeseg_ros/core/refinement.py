@@ -124,7 +124,11 @@ def _descended(
     """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
     labels = np.zeros(len(problem.inverse), np.int32)
     cost = np.zeros(len(labels), np.float32)
-    strips(_take_nearest, len(surfaces), surfaces, problem, models, labels, cost)
+    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
+    exact = surfaces.astype(np.float32)
+    least = cv2.erode(exact, window)
+    settled = (least > 0) & (least == cv2.dilate(exact, window))
+    strips(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
     _descend(labels, cost, problem, models)
     return labels, cost
 
@@ -134,6 +138,7 @@ def _take_nearest(
     first: int,
     after: int,
     surfaces: NDArray[np.int32],
+    settled: NDArray[np.bool_],
     problem: Problem,
     models: Models,
     labels: NDArray[np.int32],
@@ -141,7 +146,7 @@ def _take_nearest(
 ) -> None:
     """Give each pixel of rows of blocks the cheapest label among those of the blocks around it.
 
-    Costs in the interior of surfaces, where no label competes, stay 0.
+    Costs in `settled` blocks, where no label competes, stay 0.
     """
     rows, columns = surfaces.shape
     width, block = problem.width, problem.block
@@ -150,24 +155,23 @@ def _take_nearest(
     candidates = np.empty(side * side, np.int32)
     for bi in range(first, after):
         for bj in range(columns):
-            count, settled = 0, True
-            for i in range(max(bi - _REACH, 0), min(bi + _REACH + 1, rows)):
-                for j in range(max(bj - _REACH, 0), min(bj + _REACH + 1, columns)):
+            count = 0
+            around = 0 if settled[bi, bj] else _REACH
+            for i in range(max(bi - around, 0), min(bi + around + 1, rows)):
+                for j in range(max(bj - around, 0), min(bj + around + 1, columns)):
                     label = surfaces[i, j]
                     known = label == 0
-                    settled &= label > 0
                     for k in range(count):
                         known |= candidates[k] == label
                     if not known:
                         candidates[count] = label
                         count += 1
-            settled &= count == 1
             for i in range(bi * block, min((bi + 1) * block, height)):
                 row = i * width
                 for p in range(row + bj * block, row + min((bj + 1) * block, width)):
                     if problem.weight[p] == 0:
                         continue
-                    if settled:
+                    if settled[bi, bj]:
                         labels[p] = candidates[0]
                         continue
                     best, least = 0, np.float32(NO_PLANE)
