@@ -55,8 +55,8 @@ def unary(problem, models):
 
 def prior(problem):
     """Costs of unlike labels to the right (H, W-1) and below (H-1, W)."""
-    links = problem.links.reshape(-1, problem.width, 4)
-    return links[:, :-1, 0], links[:-1, :, 1]
+    right, down = problem.links.reshape(2, -1, problem.width)
+    return right[:, :-1], down[:-1]
 
 
 def literal_energy(labels, problem, models):
@@ -97,14 +97,14 @@ def expand(alpha, labels, cost, problem, models, reach=12):
 
 def linked(problem, label, labels):
     """Pixels (H, W) of other labels that edges join to those of a label, directly or not."""
-    links = problem.links.reshape(*labels.shape, 4) > 0
+    right, down = prior(problem)
     reached = labels == label
     for _ in range(labels.size):
         before = reached.copy()
-        reached[:, 1:] |= before[:, :-1] & links[:, :-1, 0]
-        reached[:, :-1] |= before[:, 1:] & links[:, :-1, 0]
-        reached[1:] |= before[:-1] & links[:-1, :, 1]
-        reached[:-1] |= before[1:] & links[:-1, :, 1]
+        reached[:, 1:] |= before[:, :-1] & (right > 0)
+        reached[:, :-1] |= before[:, 1:] & (right > 0)
+        reached[1:] |= before[:-1] & (down > 0)
+        reached[:-1] |= before[1:] & (down > 0)
     return reached & (labels != label)
 
 
@@ -113,17 +113,14 @@ def test_links_are_the_weights_on_all_four_sides(shape):
     random = np.random.default_rng(sum(shape))
     horizontal = random.random((shape[0], shape[1] - 1)).astype(np.float32)
     vertical = random.random((shape[0] - 1, shape[1])).astype(np.float32)
-    links = expansion.grid_links(horizontal, vertical, 3.0).reshape(*shape, 4)
-    for side, (weight, border) in enumerate(
-        [
-            (links[:, :-1, 0] / 3, links[:, -1, 0]),
-            (links[:-1, :, 1] / 3, links[-1, :, 1]),
-            (links[:, 1:, 2] / 3, links[:, 0, 2]),
-            (links[1:, :, 3] / 3, links[0, :, 3]),
-        ]
-    ):
-        np.testing.assert_allclose(weight, vertical if side % 2 else horizontal, rtol=1e-6)
-        assert not border.any()
+    links = expansion.grid_links(horizontal, vertical, 3.0)
+    expected = np.zeros((4, *shape))
+    expected[0, :, :-1] = expected[2, :, 1:] = 3 * horizontal
+    expected[1, :-1] = expected[3, 1:] = 3 * vertical
+    for p in range(shape[0] * shape[1]):
+        for side, offset in enumerate((1, shape[1], -1, -shape[1])):
+            found = links[side % 2, min(p, p + offset)]
+            assert found == pytest.approx(expected[side].flat[p], rel=1e-6)
 
 
 def test_weights_are_inverse_variances():

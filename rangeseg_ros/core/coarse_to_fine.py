@@ -95,7 +95,7 @@ def _refine(
     width, labels = image.shape[1], image.reshape(-1)
     sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3, 1)
     vectors = directions.astype(np.float32)
-    links = grid_links(horizontal.astype(np.float32), vertical.astype(np.float32), smoothness)
+    links = grid_links(horizontal, vertical, smoothness)
     data = mixed_angles(labels, sites, vectors)
     position = np.full(len(labels), -1, np.int32)
     start, beside = fronts(labels, links, width, len(vectors))
@@ -138,7 +138,12 @@ def _onward(
         done += 1
         for k in range(4):
             q = p + offsets[k]
-            if links[p, k] == 0 or labels[q] == alpha or position[q] >= 0 or data[q] <= _ODD:
+            if (
+                links[k % 2, min(p, q)] == 0
+                or labels[q] == alpha
+                or position[q] >= 0
+                or data[q] <= _ODD
+            ):
                 continue
             cost = site_angle(normals[q], direction[0], direction[1], direction[2])
             if data[q] - cost > _ODD:

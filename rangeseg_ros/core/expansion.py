@@ -1,7 +1,6 @@
 """Expansion of one label by the sites around it: thesis 4.8 where the outcome is in question.
 
-Sites are pixels or blocks of them, numbered in raster order; every site has the weights of its
-edges to the right, down, to the left and up. A site whose data speak louder than all of its
+Sites are pixels, numbered in raster order. A site whose data speak louder than all of its
 neighbours together is decided without a cut, and what it decides often decides its neighbours:
 partial optimality, exact, and most of the band. The rest is a minimum cut (`moves`).
 """
@@ -20,28 +19,30 @@ Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
 
-@njit(cache=True, nogil=True)
 def grid_links(
-    horizontal: NDArray[np.float32], vertical: NDArray[np.float32], smoothness: float
+    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], smoothness: float
 ) -> NDArray[np.float32]:
-    """Weights (H * W, 4) of each pixel's edges times the smoothness; 0 at the border.
+    """Weights of all edges times the smoothness.
 
     Parameters
     ----------
-    horizontal, vertical : (H, W-1), (H-1, W) float32
+    horizontal, vertical : (H, W-1), (H-1, W) float
         Neighbourhood weights.
     smoothness : float
         Lambda.
+
+    Returns
+    -------
+    (2, H * W) float32
+        Of each pixel's edges to the right and down; 0 at the border. The edge between p and its
+        neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
+        the first pixel, where this counts from the end, there is a border as well.
     """
     height, width = len(horizontal), vertical.shape[1]
-    result = np.zeros((height, width, 4), np.float32)
-    for i in range(height):
-        for j in range(width):
-            if j + 1 < width:
-                result[i, j, 0] = result[i, j + 1, 2] = smoothness * horizontal[i, j]
-            if i + 1 < height:
-                result[i, j, 1] = result[i + 1, j, 3] = smoothness * vertical[i, j]
-    return result.reshape(-1, 4)
+    result = np.zeros((2, height, width), np.float32)
+    np.multiply(horizontal, np.float32(smoothness), out=result[0, :, :-1], casting='same_kind')
+    np.multiply(vertical, np.float32(smoothness), out=result[1, :-1], casting='same_kind')
+    return result.reshape(2, -1)
 
 
 @njit(cache=True)
@@ -51,7 +52,7 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
     Parameters
     ----------
     labels : (n,) int32
-    links : (n, 4) float32
+    links : (2, n) float32
     width : int
         Sites in a row.
     count : int
@@ -64,7 +65,7 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
         here = labels[p]
         for k in range(2):
             q = p + (1 if k == 0 else width)
-            if q < len(labels) and labels[q] != here and links[p, k] > 0:
+            if q < len(labels) and labels[q] != here and links[k, p] > 0:
                 pairs[found] = p, q
                 found += 1
     pairs = pairs[:found]
@@ -100,7 +101,7 @@ def band(
         Sites next to those of the label.
     reach : int
     labels : (n,) int32
-    links : (n, 4) float32
+    links : (2, n) float32
     width : int
     position : (n,) int32
         -1; receives the place of each site in the result.
@@ -124,7 +125,8 @@ def band(
             done += 1
             for k in range(4):
                 q = p + offsets[k]
-                if links[p, k] > 0 and labels[q] != alpha and position[q] < 0:
+                linked = links[k % 2, min(p, q)] > 0
+                if linked and labels[q] != alpha and position[q] < 0:
                     if count == len(sites):
                         sites = np.concatenate((sites, np.empty_like(sites)))
                     position[q] = count
@@ -215,7 +217,7 @@ def choice(
         Data cost of the label there.
     labels, data : (n,) int32, (n,) float32
         Labelling and its data costs.
-    links : (n, 4) float32
+    links : (2, n) float32
     width : int
     position : (n,) int32
         Place of each site in `sites`, -1 elsewhere; becomes -1 again.
@@ -232,10 +234,10 @@ def choice(
         here = labels[p]
         total = np.float64(new[s]) - np.float64(data[p])
         for k in range(4):
-            u = np.float64(links[p, k])
+            q = p + offsets[k]
+            u = np.float64(links[k % 2, min(p, q)])
             if u == 0:
                 continue
-            q = p + offsets[k]
             there, t = labels[q], position[q]
             if t >= 0:
                 if here != there:

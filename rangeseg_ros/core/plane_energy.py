@@ -39,8 +39,8 @@ class Problem(NamedTuple):
         Range image.
     weight : (n,) float32
         1 / random variance of the inverse range; 0 where nothing was measured.
-    links : (n, 4) float32
-        Cost of unlike labels across each pixel's edges: right, down, left, up.
+    links : (2, n) float32
+        Cost of unlike labels across the edges to the right and down, see `grid_links`.
     width : int
         Columns of the image.
     block : int
@@ -108,8 +108,8 @@ class Models(NamedTuple):
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
     """Value of eq. 5.3 for labels (n,): data costs and the costs of the edges between unlike."""
-    below = problem.links[: -problem.width, 1]
-    right = problem.links[:-1, 0]  # 0 from the end of one row to the next
+    below = problem.links[1, : -problem.width]
+    right = problem.links[0, :-1]  # 0 from the end of one row to the next
     unlike = right[labels[1:] != labels[:-1]].sum(dtype=np.float64)
     unlike += below[labels[problem.width :] != labels[: -problem.width]].sum(dtype=np.float64)
     return float(costs(labels, problem, models).sum(dtype=np.float64) + unlike)

@@ -194,6 +194,7 @@ def _descend(
     offsets = np.array([1, problem.width, -1, -problem.width])
     links = problem.links
     around = np.zeros(4, np.int32)
+    link = np.zeros(4)
     # A ring, long enough as no pixel is in it twice.
     queue = np.empty(len(labels), np.int32)
     queued = np.zeros(len(labels), np.bool_)
@@ -201,7 +202,7 @@ def _descend(
     for p in range(len(labels)):
         for k in range(2):
             q = p + offsets[k]
-            if q < len(labels) and labels[q] != labels[p] and links[p, k] > 0:
+            if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
                 for end in (p, q):
                     if not queued[end]:
                         queue[waiting] = end
@@ -216,9 +217,11 @@ def _descend(
         here = labels[p]
         least = np.float64(cost[p]) - _STEP
         for k in range(4):
-            around[k] = labels[p + offsets[k]] if links[p, k] > 0 else here
+            q = p + offsets[k]
+            link[k] = links[k % 2, min(p, q)]
+            around[k] = labels[q] if link[k] > 0 else here
             if around[k] != here:
-                least += links[p, k]
+                least += link[k]
         for k in range(5):
             label = around[k] if k < 4 else np.int32(0)
             if label == here:
@@ -227,14 +230,14 @@ def _descend(
             total = np.float64(data)
             for m in range(4):
                 if around[m] != label:
-                    total += links[p, m]
+                    total += link[m]
             if total < least:
                 least, labels[p], cost[p] = total, label, data
         if labels[p] == here:
             continue
         for k in range(4):
             q = p + offsets[k]
-            if links[p, k] > 0 and not queued[q]:
+            if link[k] > 0 and not queued[q]:
                 queued[q] = True
                 queue[last] = q
                 last = (last + 1) % len(queue)
