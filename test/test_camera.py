@@ -1,5 +1,7 @@
 """Pinhole intrinsics from every source, and what is refused."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -18,6 +20,17 @@ def test_rays_project_back_to_their_pixels():
     np.testing.assert_allclose(columns, np.tile(np.arange(7), (5, 1)), atol=1e-4)
     np.testing.assert_allclose(rows, np.tile(np.arange(5)[:, None], 7), atol=1e-4)
     assert (camera.rays[..., 2] == 1).all()
+
+
+def test_pickles_leave_the_rays_behind():
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    rays = camera.rays
+    pickled = pickle.dumps(camera)
+    assert len(pickled) < 1000
+    copy = pickle.loads(pickled)
+    assert copy == camera
+    assert not copy.rays.flags.writeable
+    np.testing.assert_array_equal(copy.rays, rays)
 
 
 def test_projection_matrix_wins_when_rectified():

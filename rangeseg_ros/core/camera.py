@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import cached_property
 from typing import Any
 
@@ -127,6 +127,11 @@ class Camera:
             raise CameraError(f'camera calibration lacks {error}') from None
         except (TypeError, AttributeError) as error:
             raise CameraError(f'malformed camera calibration: {error}') from None
+
+    def __reduce__(self) -> tuple[type[Camera], tuple[Any, ...]]:
+        # Without the rays: they are large, and would come back writeable, to compiled code a type
+        # of its own.
+        return Camera, astuple(self)
 
     @property
     def shape(self) -> tuple[int, int]:
