@@ -103,3 +103,12 @@ def test_ball_and_cylinder_make_no_planes_and_planes_survive():
     assert np.mean(shares) <= 0.35
     assert len(overlaps) >= 15
     assert np.mean(overlaps) >= 0.9
+
+
+def test_pixels_left_out_do_not_bend_the_rest():
+    """A strip of outliers tilts the plane of the fit, off which the rest then lies, but flat."""
+    inverse = np.full(CAMERA.shape, 0.5)
+    inverse[:, 130:136] += 0.04
+    regions = np.zeros(CAMERA.shape, int)
+    regions[90:150, 130:190] = 1
+    assert verdict(inverse, regions).tolist() == [False, False]

@@ -70,17 +70,24 @@ def curved(
     normal, right, square, area, scale = map(np.add, *parts)
     pixels = normal[:, 0, 0]
     size = np.maximum(pixels * _STRIDE**2, 1)
-    ridge = 1e-9 * np.maximum(pixels, 1)[:, None, None] * np.eye(6)
-    solution = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
-    bending = np.einsum('ki,kij,kj->k', solution, normal, solution) / np.maximum(pixels, 1)
+    # What the quadratic explains more than its constant and linear terms do.
+    whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
+    bending = (whole - flat) / np.maximum(pixels, 1)
     distortion = _SHARE * ratio * (size / _PIXELS) ** _EXPONENT
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
-    rest = square - (solution * right).sum(axis=1)
-    noise = np.maximum(rest / np.maximum(pixels, 1), 1)
+    noise = np.maximum((square - whole) / np.maximum(pixels, 1), 1)
     visible = bending > distortion + _NOISE * noise / size
     result = visible & (bending * (scale / np.maximum(pixels, 1)) ** 2 > _FLATNESS**2 * area)
     result[0] = False
     return result
+
+
+def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of squares (N,) that least-squares fits explain, of their normal equations."""
+    terms = normal.shape[1]
+    ridge = 1e-9 * np.maximum(normal[:, 0, 0], 1)[:, None, None] * np.eye(terms)
+    solution = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
+    return (solution * right).sum(axis=1)
 
 
 @njit(cache=True, nogil=True)
