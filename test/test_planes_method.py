@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -117,6 +118,16 @@ def test_two_runs_agree_bit_for_bit(fingerprint):
 
 def test_two_processes_agree_bit_for_bit(fingerprint):
     assert in_another_process(PYTHONHASHSEED='7') == [*fingerprint]
+
+
+@pytest.mark.parametrize('threads', [1, 2, 5])
+def test_any_number_of_threads_agrees_bit_for_bit(fingerprint, threads):
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(threads)
+    try:
+        assert small_fingerprint() == [*fingerprint]
+    finally:
+        cv2.setNumThreads(before)
 
 
 def test_compiled_code_gives_the_labels_of_the_plain_python(fingerprint):
