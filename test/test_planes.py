@@ -129,6 +129,16 @@ def test_what_determines_no_plane_is_left_out():
     assert fit_planes(np.zeros(CAMERA.shape, np.uint16), image, KINECT) == []
 
 
+def test_a_row_of_a_cloud_determines_no_plane():
+    """But that through the sensor, which is not what was seen."""
+    random = np.random.default_rng(0)
+    angle = np.linspace(-0.3, 0.3, 25)
+    rays = np.stack([np.sin(angle), -0.2 * np.cos(angle), np.cos(angle)], axis=1)
+    row = rays * random.normal(4, 0.02, (25, 1)) + random.normal(0, 1e-4, (25, 3))
+    image = RangeImage.from_points(row[None])
+    assert fit_planes(np.ones((1, 25), np.uint16), image, KINECT) == []
+
+
 def test_parts_of_one_plane_share_a_surface_and_steps_do_not():
     labels = boxes((100, 100, 200, 200), (100, 300, 200, 400), (100, 210, 200, 290))
     random = np.random.default_rng(2)

@@ -17,6 +17,9 @@ from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.core.uncertainty import plane_jacobians, theta_covariances
 
+# Sine of the angle at which no surface is seen any more.
+_GRAZING = 1e-3
+
 
 @dataclass(frozen=True, eq=False)
 class Plane:
@@ -202,11 +205,12 @@ def _total_least_squares(
     count = np.maximum(sums[:, COUNT], 1)
     mean = sums[:, POINT:SCATTER] / count[:, None]
     scatter = symmetric(sums[:, SCATTER:]) / count[:, None, None]
+    far = np.sqrt(np.trace(scatter, axis1=1, axis2=2))
     scatter -= mean[:, :, None] * mean[:, None, :]
     normal = np.linalg.eigh(scatter)[1][:, :, 0]
     distance = -(normal * mean).sum(axis=1)
-    # A plane through the sensor would be invisible.
-    seen = theta.any(axis=1) & (np.abs(distance) > 1e-9)
+    # A plane through the sensor would be invisible: it is that of a single row of points.
+    seen = theta.any(axis=1) & (np.abs(distance) > _GRAZING * far)
     return np.where(seen[:, None], -normal / np.where(seen, distance, 1)[:, None], 0)
 
 
