@@ -39,7 +39,8 @@ def frame(*regions):
     for label, (rows, columns, plane) in enumerate(regions, 1):
         labels[rows, columns] = label
         facing = -CAMERA.rays[rows, columns] @ np.array(plane[:3]) / plane[3]
-        inverse[rows, columns] = facing
+        # Nothing is seen of the part behind the camera.
+        inverse[rows, columns] = np.maximum(facing, 0)
     return labels, fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
 
 
