@@ -29,7 +29,8 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(_MOST, 'rangeseg')
 
 
-os.register_at_fork(after_in_child=_pool.cache_clear)
+if hasattr(os, 'register_at_fork'):  # not on Windows, which does not fork
+    os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
 def strips(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
