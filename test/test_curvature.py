@@ -7,8 +7,8 @@ from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.curvature import curved
 from rangeseg_ros.core.neighbourhood import weights
+from rangeseg_ros.core.plane_energy import Problem
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import Problem
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.evaluation.hoover import Overlap
