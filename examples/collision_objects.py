@@ -1,11 +1,8 @@
 """Planes for MoveIt: hulls as meshes, the floor as an endless plane, in its planning scene."""
 
-from contextlib import suppress
-
 import rclpy
 from geometry_msgs.msg import Pose
 from moveit_msgs.msg import CollisionObject
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh, MeshTriangle, Plane
@@ -63,5 +60,9 @@ class CollisionObjects(Node):
 
 if __name__ == '__main__':
     rclpy.init()
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
+    try:
         rclpy.spin(CollisionObjects())
+    except (KeyboardInterrupt, Exception):
+        # A signal ends rclpy between any two of its steps, with any of its errors.
+        if rclpy.ok():
+            raise

@@ -1,10 +1,7 @@
 """Print the largest planes once a second: how to read ~/planes in a node of one's own."""
 
-from contextlib import suppress
-
 import numpy as np
 import rclpy
-from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from sensor_msgs.msg import PointCloud2
 
@@ -32,5 +29,9 @@ class PrintPlanes(Node):
 
 if __name__ == '__main__':
     rclpy.init()
-    with suppress(KeyboardInterrupt, ExternalShutdownException):
+    try:
         rclpy.spin(PrintPlanes())
+    except (KeyboardInterrupt, Exception):
+        # A signal ends rclpy between any two of its steps, with any of its errors.
+        if rclpy.ok():
+            raise

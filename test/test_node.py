@@ -187,7 +187,7 @@ def test_the_example_of_the_readme_reads_the_planes(bench, tmp_path):
     assert '2 planes in camera_depth_optical_frame' in printed.read_text()
     run.terminate()
     bench.until(lambda: run.poll() is not None)
-    assert run.returncode == 0 and 'Traceback' not in printed.read_text()
+    assert run.returncode == 0 and 'Traceback' not in printed.read_text(), printed.read_text()
 
 
 def test_diagnostics_tell_where_the_time_goes(bench):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import zip_longest
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -25,6 +26,22 @@ _Binary = tuple[
 ]
 
 
+class Graph(NamedTuple):
+    """Edges between pieces, see `Pieces`, listed from both ends.
+
+    Attributes
+    ----------
+    start, neighbours, links : (n + 1,) int32, (m,) int32, (m,) float32
+    back : (m,) int32
+        Where each edge is listed from its other end.
+    """
+
+    start: NDArray[np.int32]
+    neighbours: NDArray[np.int32]
+    links: NDArray[np.float32]
+    back: NDArray[np.int32]
+
+
 class PieceLabelling:
     """A labelling of pieces while its energy is minimised.
 
@@ -42,8 +59,8 @@ class PieceLabelling:
     def __init__(self, pieces: Pieces, labels: NDArray[np.int32]) -> None:
         self.labels = labels
         self._costs = pieces.costs
-        self._graph = pieces.start, pieces.neighbours, pieces.links
-        self._back = _back(*self._graph[:2])
+        back = _back(pieces.start, pieces.neighbours)
+        self._graph = Graph(pieces.start, pieces.neighbours, pieces.links, back)
         n = len(labels)
         # Of two problems: place of a piece in it, height and flow of `_stuck`.
         self._scratch = [
@@ -61,15 +78,15 @@ class PieceLabelling:
 
     def settle(self) -> None:
         """Give every piece in turn the label, its own or a neighbour's, that costs least."""
-        _settle(self.labels, self._costs, *self._graph)
+        _settle(self.labels, self._costs, self._graph)
 
     def turn(self) -> None:
         """Give every region in turn the label that costs least, until that changes nothing."""
         before = self.labels.copy()
-        _turn(self.labels, self._costs, *self._graph)
+        _turn(self.labels, self._costs, self._graph)
         self._time += 1
         changed = np.flatnonzero(self.labels != before)
-        _mark(changed, self._changed, self._time, *self._graph[:2])
+        _mark(changed, self._changed, self._time, self._graph)
 
     def expand(self) -> None:
         """Expand every label in use, the most frequent first.
@@ -80,7 +97,7 @@ class PieceLabelling:
         frequency = np.bincount(self.labels, minlength=self._costs.shape[1])
         order = np.argsort(-frequency, kind='stable')[: np.count_nonzero(frequency)].tolist()
         self._data = _own(self.labels, self._costs)
-        self._unlike = _unlike(self.labels, *self._graph)
+        self._unlike = _unlike(self.labels, self._graph)
         for alpha, beta in zip_longest(order[::2], order[1::2]):
             pending = None if beta is None else aside(self._problem, beta, 1)
             self._switch(alpha, self._problem(alpha, 0))
@@ -98,8 +115,7 @@ class PieceLabelling:
             self._data,
             self._unlike,
             *self._scratch[place],
-            *self._graph,
-            self._back,
+            self._graph,
             self._changed,
             self._tried[alpha],
         )
@@ -116,9 +132,9 @@ class PieceLabelling:
         if value < -ROUNDING:
             switched = sites[chosen]
             _switch(
-                alpha, switched, self._costs, self.labels, self._data, self._unlike, *self._graph
+                alpha, switched, self._costs, self.labels, self._data, self._unlike, self._graph
             )
-            _mark(switched, self._changed, self._time, *self._graph[:2])
+            _mark(switched, self._changed, self._time, self._graph)
 
 
 @njit(cache=True)
@@ -146,11 +162,10 @@ def _own(labels: NDArray[np.int32], costs: NDArray[np.uint16]) -> NDArray[np.flo
 @njit(cache=True)
 def _unlike(
     labels: NDArray[np.int32],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
+    graph: Graph,
 ) -> NDArray[np.float32]:
     """Links of each piece to others of another label, summed."""
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
     total = np.zeros(len(labels), np.float32)
     for p in range(len(labels)):
         for e in range(start[p], start[p + 1]):
@@ -163,10 +178,9 @@ def _unlike(
 def _settle(
     labels: NDArray[np.int32],
     costs: NDArray[np.uint16],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
+    graph: Graph,
 ) -> None:
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
     for p in range(len(labels)):
         best, least = labels[p], np.float32(np.inf)
         for e in range(start[p] - 1, start[p + 1]):
@@ -183,13 +197,13 @@ def _settle(
 @njit(cache=True)
 def _regions(
     labels: NDArray[np.int32],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
+    graph: Graph,
     region: NDArray[np.int32],
     order: NDArray[np.int32],
     first: NDArray[np.int32],
 ) -> int:
     """Connected pieces of a label: region r is order[first[r] : first[r + 1]]; how many."""
+    start, neighbours = graph.start, graph.neighbours
     region[:] = -1
     count = last = 0
     for seed in range(len(labels)):
@@ -217,14 +231,13 @@ def _regions(
 def _turn(
     labels: NDArray[np.int32],
     costs: NDArray[np.uint16],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
+    graph: Graph,
 ) -> None:
     """Regions that took the same label grow together and then turn as one."""
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
     n, count = costs.shape
     region, order, first = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
-    regions = _regions(labels, start, neighbours, region, order, first)
+    regions = _regions(labels, graph, region, order, first)
     total = np.zeros((regions, count), np.float32)
     for p in range(n):
         row, sums = costs[p], total[region[p]]
@@ -254,7 +267,7 @@ def _turn(
         if not changed:
             return
         members = order[first[:regions]].copy()
-        regions = _regions(labels, start, neighbours, region, order, first)
+        regions = _regions(labels, graph, region, order, first)
         merged = np.zeros((regions, count), np.float32)
         for r in range(len(members)):
             row, sums = total[r], merged[region[members[r]]]
@@ -270,10 +283,7 @@ def _stuck(
     labels: NDArray[np.int32],
     height: NDArray[np.int32],
     flow: NDArray[np.float32],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
-    back: NDArray[np.int32],
+    graph: Graph,
     sites: NDArray[np.int32],
 ) -> int:
     """Pieces whose gain the pieces about them cannot take up, in `sites`; how many.
@@ -282,6 +292,7 @@ def _stuck(
     that lose (above 0), no more than `_STEPS` steps. A flow changes no minimum cut: where
     nothing is stuck, nothing switches. `flow` is 0 and becomes so again.
     """
+    start, neighbours, links, back = graph.start, graph.neighbours, graph.links, graph.back
     n = len(labels)
     active = np.empty(n, np.int32)
     waits = np.zeros(n, np.bool_)
@@ -354,10 +365,7 @@ def _expansion(
     position: NDArray[np.int32],
     height: NDArray[np.int32],
     flow: NDArray[np.float32],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
-    back: NDArray[np.int32],
+    graph: Graph,
     changed: NDArray[np.int32],
     tried: int,
 ) -> _Binary:
@@ -366,6 +374,7 @@ def _expansion(
     What gained too little when the label was tried last, and has not changed since, is not tried
     again.
     """
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
     n = len(labels)
     half = np.float32(0.5)
     excess = np.empty(n, np.float32)
@@ -380,7 +389,7 @@ def _expansion(
         if labels[p] == alpha or (gain[p] < 0 and changed[p] <= tried):
             gain[p] = 0
     sites = np.empty(n, np.int32)
-    count = _stuck(alpha, gain, labels, height, flow, start, neighbours, links, back, sites)
+    count = _stuck(alpha, gain, labels, height, flow, graph, sites)
     for s in range(count):
         position[sites[s]] = s
     done = room = 0
@@ -426,11 +435,10 @@ def _switch(
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
     unlike: NDArray[np.float32],
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
-    links: NDArray[np.float32],
+    graph: Graph,
 ) -> None:
     """Give pieces a label; keeps `data` and `unlike` up to date."""
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
     for p in sites:
         data[p] = UNIT * np.float32(costs[p, alpha])
         for e in range(start[p], start[p + 1]):
@@ -446,10 +454,10 @@ def _mark(
     sites: NDArray[np.integer],
     changed: NDArray[np.int32],
     time: int,
-    start: NDArray[np.int32],
-    neighbours: NDArray[np.int32],
+    graph: Graph,
 ) -> None:
     """Note that pieces changed, also for those within two steps."""
+    start, neighbours = graph.start, graph.neighbours
     for p in sites:
         changed[p] = time
         for e in range(start[p], start[p + 1]):

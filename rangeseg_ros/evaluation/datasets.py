@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -62,7 +63,7 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(ABC):
     """One image of a data set, not yet read.
 
     Attributes
@@ -92,8 +93,9 @@ class Case:
             raise EvaluationError(f'{self.truth}: truth is {sizes[0]}, its image {sizes[1]}')
         return sample
 
+    @abstractmethod
     def _read(self) -> Sample:
-        raise NotImplementedError
+        """What the files hold."""
 
 
 @dataclass(frozen=True)
