@@ -44,6 +44,15 @@ def full(height, width):
     return np.ones((height, width), bool)
 
 
+def without_rim(mask):
+    """Pixels that their diagonal neighbours two steps away, within the image, are like."""
+    above, below = np.maximum(np.arange(len(mask)) - 2, 0), np.arange(len(mask)) + 2
+    left, right = np.maximum(np.arange(mask.shape[1]) - 2, 0), np.arange(mask.shape[1]) + 2
+    below, right = np.minimum(below, len(mask) - 1), np.minimum(right, mask.shape[1] - 1)
+    corners = [mask[np.ix_(i, j)] for i in (above, below) for j in (left, right)]
+    return mask & np.logical_and.reduce(corners)
+
+
 @pytest.mark.parametrize('kind', models(1))
 @pytest.mark.parametrize(
     ('view', 'shape'),
@@ -62,6 +71,7 @@ def test_sums_over_cells_are_those_over_pixels(kind, view, shape):
     image = RangeImage(camera.rays, exact.astype(np.float32), camera)
     (plane,) = fit_planes(mask.astype(np.uint16), image, sensor)
 
+    mask = without_rim(mask)
     rows, columns = np.nonzero(mask)
     squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
     level = exact[mask] ** 4

@@ -24,6 +24,8 @@ WEIGHTED_RAY, WEIGHT, POINT, SCATTER, RECORD = 12, 15, 16, 19, 25
 p (3), p p^T (6); their number."""
 # Standard deviations of random and systematic error beyond which a pixel is an outlier.
 _OUTLIER = 4.0
+# Pixels from another region up to which a pixel may be its neighbour's.
+_RIM = 2
 
 
 class Cells(NamedTuple):
@@ -81,32 +83,37 @@ class Cells(NamedTuple):
         )
         return cells._replace(sums=upper + lower)
 
-    def without_outliers(
+    def without_doubtful(
         self,
         labels: NDArray[np.uint16],
         image: RangeImage,
         theta: NDArray[np.float64],
         variances: NDArray[np.float64],
-    ) -> NDArray[np.intp]:
-        """Take the pixels that the planes `theta` (M + 1, 3) do not explain out of the sums.
+    ) -> tuple[Cells, NDArray[np.intp], NDArray[np.float64]]:
+        """Leave out of the sums what may not belong to regions: outliers, then rims.
 
-        A region keeps all of its pixels where that would be more than half of them: then it is
-        the sensor model that does not fit.
+        Outliers are the pixels that the planes `theta` (M + 1, 3) do not explain. A region keeps
+        them where they are more than half of it, as it is then the sensor model that does not
+        fit, and its rim, where that would take the rest to less than half.
 
         Returns
         -------
-        (M + 1,) int
-            Number of outliers, whether taken out or kept.
+        cells : Cells
+        outliers : (M + 1,) int
+            Number of outliers, whether left out or kept.
+        explained : (M + 1, 25) float64
+            Sums over whole regions, with their rims.
         """
         central = image.camera is not None
         arrays = labels, image.inverse, image.rays
-        parts = halves(_find_outliers, len(labels), *arrays, len(self.size), variances, theta)
-        (found, outliers, pixels), (more, more_outliers, more_pixels) = parts
-        outliers += more_outliers
-        minority = 2 * outliers <= pixels + more_pixels
-        for some in (found, more):
-            _subtract(some, minority, *arrays, self, variances, central)
-        return outliers
+        parts = halves(_doubtful, len(labels), *arrays, self, variances, theta, central)
+        (pixels, outliers, rims), outlying, rim = (a + b for a, b in zip(*parts, strict=True))
+        region = np.repeat(np.arange(len(self.size)), np.diff(self.start))
+        few = 2 * outliers <= pixels
+        cells = self._replace(sums=self.sums - outlying * few[region, None])
+        explained = cells.regions()
+        few = 2 * (outliers + rims) <= pixels
+        return cells._replace(sums=cells.sums - rim * few[region, None]), outliers, explained
 
     def regions(self) -> NDArray[np.float64]:
         """Sums over whole regions, (M + 1, 25)."""
@@ -184,9 +191,8 @@ def _add(
     rays: NDArray[np.float32],
     variances: NDArray[np.float64],
     central: bool,
-    sign: float,
 ) -> None:
-    """Add pixels `first` to before `after` of row `i` to a cell, or take them out."""
+    """Add pixels `first` to before `after` of row `i` to a cell."""
     # In variables of their own: sums in an array would go through memory for every pixel.
     a = b = c = d = e = f = p = q = r = count = w0 = w1 = w2 = weight = 0.0
     z0 = z1 = z2 = z00 = z01 = z02 = z11 = z12 = z22 = 0.0
@@ -213,9 +219,9 @@ def _add(
         z11, z12, z22 = z11 + x1 * x1, z12 + x1 * x2, z22 + x2 * x2
     moments = (a, b, c, d, e, f, p, q, r, 0.0, count, 0.0, w0, w1, w2, weight)
     for entry, value in enumerate(moments):
-        record[entry] += sign * value
+        record[entry] += value
     for entry, value in enumerate((z0, z1, z2, z00, z01, z02, z11, z12, z22)):
-        record[POINT + entry] += sign * value
+        record[POINT + entry] += value
 
 
 @njit(cache=True, nogil=True)
@@ -242,61 +248,57 @@ def _sums(
                 j += 1
             if label > 0:
                 record = sums[_index(cells, label, i, first)]
-                _add(record, i, first, j, inverse, rays, variances, central, 1.0)
+                _add(record, i, first, j, inverse, rays, variances, central)
     return sums
 
 
 @njit(cache=True, nogil=True)
-def _find_outliers(
+def _doubtful(
     first: int,
     after: int,
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    regions: int,
+    cells: Cells,
     variances: NDArray[np.float64],
     theta: NDArray[np.float64],
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Outliers among some rows, their number and that of all pixels in each region."""
-    width = labels.shape[1]
-    outliers, pixels = np.zeros(regions, np.intp), np.zeros(regions, np.intp)
-    found = np.empty((after - first) * width, np.intp)
-    number = 0
+    central: bool,
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    """Outliers and the rest of the rims among some rows.
+
+    The numbers of all pixels, of outliers and of the rest of the rim, (3, M + 1), and the sums
+    over either, (N, 25).
+    """
+    height, width = labels.shape
+    count = np.zeros((3, len(theta)), np.intp)
+    outlying, rim = np.zeros_like(cells.sums), np.zeros_like(cells.sums)
     constant = _OUTLIER**2 * (variances[0] + variances[2])
     quartic = _OUTLIER**2 * (variances[1] + variances[3])
     for i in range(first, after):
+        above, below = max(i - _RIM, 0), min(i + _RIM, height - 1)
         for j in range(width):
             label = int(labels[i, j])
             y = float(inverse[i, j])
             if label == 0 or y == 0:
                 continue
-            pixels[label] += 1
+            count[0, label] += 1
             ray, plane = rays[i, j], theta[label]
             residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
             squared = y * y
+            left, right = max(j - _RIM, 0), min(j + _RIM, width - 1)
             if residual * residual > constant + quartic * squared * squared:
-                outliers[label] += 1
-                found[number] = i * width + j
-                number += 1
-    return found[:number], outliers, pixels
-
-
-@njit(cache=True)
-def _subtract(
-    pixels: NDArray[np.intp],
-    wanted: NDArray[np.bool_],
-    labels: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    cells: Cells,
-    variances: NDArray[np.float64],
-    central: bool,
-) -> None:
-    """Take pixels out of the cells of the wanted regions."""
-    width = labels.shape[1]
-    for index in pixels:
-        i, j = index // width, index % width
-        label = int(labels[i, j])
-        if wanted[label]:
-            record = cells.sums[_index(cells, label, i, j)]
-            _add(record, i, j, j + 1, inverse, rays, variances, central, -1.0)
+                count[1, label] += 1
+                sums = outlying
+            elif (
+                labels[above, left] != label
+                or labels[above, right] != label
+                or labels[below, left] != label
+                or labels[below, right] != label
+            ):
+                count[2, label] += 1
+                sums = rim
+            else:
+                continue
+            record = sums[_index(cells, label, i, j)]
+            _add(record, i, j, j + 1, inverse, rays, variances, central)
+    return count, outlying, rim

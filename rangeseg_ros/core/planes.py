@@ -1,4 +1,4 @@
-"""Planes of regions: fit, uncertainty, place and shape."""
+"""Planes of regions: uncertainty, place and shape."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY, Cells, variances
+from rangeseg_ros.core.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY, Cells
 from rangeseg_ros.core.coplanar import common_surfaces
 from rangeseg_ros.core.extents import areas_and_axes, rectangles
-from rangeseg_ros.core.moments import COUNT, SIZE, fit_all
+from rangeseg_ros.core.fits import Fits, symmetric
+from rangeseg_ros.core.moments import COUNT
 from rangeseg_ros.core.outlines import Outline
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.core.uncertainty import plane_jacobians, theta_covariances
-
-# Sine of the angle at which no surface is seen any more.
-_GRAZING = 1e-3
+from rangeseg_ros.core.uncertainty import plane_jacobians
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,13 +97,12 @@ class Plane:
 
 
 def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> list[Plane]:
-    """Plane of every region.
+    """Plane of every region, as `described`, fitted as by `Fits.of`."""
+    return described(labels, image, Fits.of(labels, image, sensor))
 
-    Weighted least squares in inverse range, where a plane is linear and the error of a camera
-    lies. An organised cloud tells neither its sensor's centre nor the direction of its errors;
-    there the plane is that of total least squares of the points. Either is fitted again
-    without the pixels that the first fit leaves beyond four standard deviations of the
-    sensor's errors, as borders of regions have them.
+
+def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:
+    """Uncertainty, place and shape of every region's plane.
 
     Parameters
     ----------
@@ -113,35 +110,24 @@ def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorMode
         1...M, 0 for no plane; labels whose pixels determine no plane are left out.
     image : RangeImage
         (H, W).
-    sensor : SensorModel
-        Errors of the image.
+    fits : Fits
+        Of these labels.
 
     Returns
     -------
     list of Plane
         In the order of the labels.
     """
-    errors = variances(sensor)
-    cells = Cells.of(labels, image, errors)
-    count = cells.regions()[:, COUNT].astype(int)
-    outliers = cells.without_outliers(labels, image, _theta(cells.regions()), errors)
-    sums = cells.regions()
-    theta = _theta(sums)
-    if image.camera is None:
-        theta = _total_least_squares(sums, theta)
+    cells, theta, sums = fits.cells, fits.theta, fits.explained
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []
-
     distance = np.zeros(len(theta))
     distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
     normal = -theta * distance[:, None]
-    inverse = np.zeros((len(theta), 3, 3))
-    inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
-    covariance = theta_covariances(cells, theta, inverse, sensor, errors)
-    surface = common_surfaces(cells, theta, covariance, inverse, errors, sensor.distortion_length)
+    surface = common_surfaces(fits)
     jacobian = plane_jacobians(normal, distance)
-    covariance = jacobian @ covariance @ jacobian.transpose(0, 2, 1)
+    covariance = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
 
     inliers = np.maximum(sums[:, COUNT], 1)
     centroid = sums[:, POINT:SCATTER] / inliers[:, None]
@@ -151,8 +137,8 @@ def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorMode
     square += distance * (2 * offset + distance)
     rms = np.sqrt(np.maximum(square, 0))
     centroid = centroid - (offset + distance)[:, None] * normal
-    expected = distance**2 * _expected_square(cells, theta, errors)
-    share = 1 - outliers / np.maximum(count, 1)
+    expected = distance**2 * _expected_square(cells, theta, fits.variances)
+    share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
     confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
 
     area, major = areas_and_axes(labels, image, theta, _tangents(normal))
@@ -173,7 +159,7 @@ def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorMode
             distance=float(distance[k]),
             covariance=covariance[k],
             centroid=centroid[k],
-            count=int(count[k]),
+            count=int(fits.pixels[k]),
             rms=float(rms[k]),
             confidence=float(confidence[k]),
             area=float(area[k]),
@@ -184,34 +170,6 @@ def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorMode
         )
         for index, k in enumerate(found)
     ]
-
-
-def symmetric(triangle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Matrices (N, 3, 3) of upper triangles (N, 6), row by row."""
-    return triangle[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-
-
-def _theta(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least-squares planes theta . ray = inverse range; zeros where there is none."""
-    theta, _ = fit_all(sums[:, :SIZE])
-    theta[sums[:, COUNT] < 3] = 0
-    return theta
-
-
-def _total_least_squares(
-    sums: NDArray[np.float64], theta: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Planes of the smallest mean square distance, in the place of those that `theta` has."""
-    count = np.maximum(sums[:, COUNT], 1)
-    mean = sums[:, POINT:SCATTER] / count[:, None]
-    scatter = symmetric(sums[:, SCATTER:]) / count[:, None, None]
-    far = np.sqrt(np.trace(scatter, axis1=1, axis2=2))
-    scatter -= mean[:, :, None] * mean[:, None, :]
-    normal = np.linalg.eigh(scatter)[1][:, :, 0]
-    distance = -(normal * mean).sum(axis=1)
-    # A plane through the sensor would be invisible: it is that of a single row of points.
-    seen = theta.any(axis=1) & (np.abs(distance) > _GRAZING * far)
-    return np.where(seen[:, None], -normal / np.where(seen, distance, 1)[:, None], 0)
 
 
 def _expected_square(

@@ -257,7 +257,14 @@ def without(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[
     return _translated(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
 
 
-def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
+def united(regions: NDArray[np.uint16], group: NDArray[np.intp]) -> NDArray[np.uint16]:
+    """Number groups of regions 0...M 1...N by falling size; `group` (M + 1,) is 0 for none."""
+    area = np.bincount(group, np.bincount(regions.ravel(), minlength=len(group)), len(group))
+    area[0] = 0
+    return _translated(regions, by_falling_size(area)[group])
+
+
+def by_falling_size(area: NDArray[np.number]) -> NDArray[np.uint16]:
     """New number of each region: 1...M by falling size, 0 for size 0; at most 65535."""
     order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]
     table = np.zeros(len(area), np.uint16)

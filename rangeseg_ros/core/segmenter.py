@@ -21,19 +21,21 @@ from rangeseg_ros.core.blocks import (
 )
 from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.coplanar import parts, touching
 from rangeseg_ros.core.curvature import curved
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle, energy
+from rangeseg_ros.core.fits import Fits
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.plane_energy import Problem
 from rangeseg_ros.core.plane_energy import energy as plane_energy
-from rangeseg_ros.core.planes import Plane, fit_planes
+from rangeseg_ros.core.planes import Plane, described
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.refinement import refine
-from rangeseg_ros.core.regions import plane_regions, rejoined, without
+from rangeseg_ros.core.regions import plane_regions, rejoined, united, without
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.core.threads import aside
 
@@ -95,8 +97,8 @@ class Segmenter:
         horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, sensor, value = method(image, horizontal, vertical, watch)
-        planes = fit_planes(regions, image, sensor)
+        regions, fits, value = method(image, horizontal, vertical, watch)
+        planes = described(regions, image, fits)
         watch.lap('planes')
         return Segmentation(regions, planes, watch.laps, _reason(image, planes), value)
 
@@ -106,8 +108,8 @@ class Segmenter:
         horizontal: NDArray[np.float32],
         vertical: NDArray[np.float32],
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], SensorModel, Callable[[], float]]:
-        """Regions, the sensor and the energy, with planes as labels."""
+    ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
+        """Regions, their planes and the energy, by planes as labels."""
         size = block_size(image.shape)
         blocks = block_moments(image.inverse, image.rays, horizontal, vertical, size)
         slope, residual = slopes_and_residuals(blocks, image.rays, size)
@@ -130,7 +132,8 @@ class Segmenter:
         regions = rejoined(regions, image_labels)
         regions = without(regions, curved(problem, regions, sensor))
         watch.lap('regions')
-        return regions, sensor, lambda: plane_energy(labels, problem, models)
+        regions, fits = _united(regions, image, sensor, horizontal, vertical)
+        return regions, fits, lambda: plane_energy(labels, problem, models)
 
     def _by_normals(
         self,
@@ -138,8 +141,8 @@ class Segmenter:
         horizontal: NDArray[np.float32],
         vertical: NDArray[np.float32],
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], SensorModel, Callable[[], float]]:
-        """Regions, the sensor and the energy, with discretised normals as labels (thesis 5.11)."""
+    ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
+        """The same by discretised normals as labels (thesis 5.11)."""
         config = self.config
         normals = observed_normals(image, horizontal, vertical, config)
         watch.lap('normals')
@@ -159,7 +162,7 @@ class Segmenter:
             data = angle(np.moveaxis(normals, 2, 0), chosen)
             return energy(data, labels, horizontal, vertical, config.smoothness)
 
-        return regions, SensorModel.from_config(config), value
+        return regions, Fits.of(regions, image, SensorModel.from_config(config)), value
 
     def _labels_before(self, image: RangeImage) -> NDArray[np.intp] | None:
         """Directions of the frame before, if it was taken like this one."""
@@ -167,6 +170,24 @@ class Segmenter:
             return None
         camera, labels = self._before
         return labels if camera == image.camera and labels.shape == image.shape else None
+
+
+def _united(
+    regions: NDArray[np.uint16],
+    image: RangeImage,
+    sensor: SensorModel,
+    horizontal: NDArray[np.float32],
+    vertical: NDArray[np.float32],
+) -> tuple[NDArray[np.uint16], Fits]:
+    """Unite regions that touch and whose planes agree; the regions and their planes."""
+    count = int(regions.max()) + 1
+    edges = aside(touching, regions, horizontal, vertical, count)
+    fits = Fits.of(regions, image, sensor)
+    group = parts(fits, edges.result())
+    if (group == np.arange(count)).all():
+        return regions, fits
+    regions = united(regions, group)
+    return regions, Fits.of(regions, image, sensor)
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -1,0 +1,118 @@
+"""Least-squares planes of regions, and how far they may be off."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.cells import POINT, SCATTER, Cells, variances
+from rangeseg_ros.core.moments import COUNT, SIZE, fit_all
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.uncertainty import Field, theta_covariances
+
+# Sine of the angle at which no surface is seen any more.
+_GRAZING = 1e-3
+
+
+class Fits(NamedTuple):
+    """Planes theta . ray = inverse range of regions 0...M; zeros where there is none.
+
+    Attributes
+    ----------
+    cells : Cells
+        Sums over the pixels that were fitted.
+    pixels : (M + 1,) int
+        Number of measured pixels.
+    outliers : (M + 1,) int
+        Number of those beyond four standard deviations of the sensor's errors.
+    explained : (M + 1, 25) float64
+        Sums, as of a cell, over the other pixels.
+    theta : (M + 1, 3) float64
+    inverse : (M + 1, 3, 3) float64
+        Of the sums of w r r^T.
+    covariance : (M + 1, 3, 3) float64
+        Of theta.
+    variances : (4,) float64
+        Of the sensor, see `cells.variances`.
+    systematic : Field
+        Its systematic errors.
+    """
+
+    cells: Cells
+    pixels: NDArray[np.intp]
+    outliers: NDArray[np.intp]
+    explained: NDArray[np.float64]
+    theta: NDArray[np.float64]
+    inverse: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    variances: NDArray[np.float64]
+    systematic: Field
+
+    @classmethod
+    def of(cls, labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> Fits:
+        """Fit a plane to every region.
+
+        Weighted least squares in inverse range, where a plane is linear and the error of a
+        camera lies. An organised cloud tells neither its sensor's centre nor the direction of
+        its errors; there the plane is that of total least squares of the points. Either is
+        fitted again without the pixels that the first fit leaves beyond four standard deviations
+        of the sensor's errors, as borders of regions have them, and without the rim of the
+        region, where pixels of its neighbours may pass for its own.
+
+        Parameters
+        ----------
+        labels : (H, W) uint16
+            0...M, 0 for no plane.
+        image : RangeImage
+            (H, W).
+        sensor : SensorModel
+            Errors of the image.
+        """
+        errors = variances(sensor)
+        cells = Cells.of(labels, image, errors)
+        sums = cells.regions()
+        pixels = sums[:, COUNT].astype(np.intp)
+        cells, outliers, explained = cells.without_doubtful(labels, image, _theta(sums), errors)
+        sums = cells.regions()
+        theta = _theta(sums)
+        if image.camera is None:
+            theta = _total_least_squares(sums, theta)
+        found = theta.any(axis=1)
+        inverse = np.zeros((len(theta), 3, 3))
+        inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
+        covariance = theta_covariances(cells, theta, inverse, sensor, errors)
+        systematic = Field(sensor.distortion_length, errors[2], errors[3])
+        return cls(
+            cells, pixels, outliers, explained, theta, inverse, covariance, errors, systematic
+        )
+
+
+def symmetric(triangle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrices (N, 3, 3) of upper triangles (N, 6), row by row."""
+    return triangle[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+
+
+def _theta(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least-squares planes theta . ray = inverse range; zeros where there is none."""
+    theta, _ = fit_all(sums[:, :SIZE])
+    theta[sums[:, COUNT] < 3] = 0
+    return theta
+
+
+def _total_least_squares(
+    sums: NDArray[np.float64], theta: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Planes of the smallest mean square distance, in the place of those that `theta` has."""
+    count = np.maximum(sums[:, COUNT], 1)
+    mean = sums[:, POINT:SCATTER] / count[:, None]
+    scatter = symmetric(sums[:, SCATTER:]) / count[:, None, None]
+    far = np.sqrt(np.trace(scatter, axis1=1, axis2=2))
+    scatter -= mean[:, :, None] * mean[:, None, :]
+    normal = np.linalg.eigh(scatter)[1][:, :, 0]
+    distance = -(normal * mean).sum(axis=1)
+    # A plane through the sensor would be invisible: it is that of a single row of points.
+    seen = theta.any(axis=1) & (np.abs(distance) > _GRAZING * far)
+    return np.where(seen[:, None], -normal / np.where(seen, distance, 1)[:, None], 0)

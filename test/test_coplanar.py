@@ -1,0 +1,81 @@
+"""Parts of one plane that touch, on exact planes."""
+
+from itertools import pairwise
+
+import numpy as np
+
+from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.coplanar import parts, touching
+from rangeseg_ros.core.fits import Fits
+from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.regions import united
+from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.simulation.kinect import QUANTUM
+
+KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)
+CAMERA = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
+WALL, SIDE = np.array([0.0, 0.0, 0.5]), np.array([-0.2, 0.0, 0.5])
+
+
+def inverse_range(theta):
+    return (CAMERA.rays @ theta).astype(np.float32)
+
+
+def linked():
+    return np.ones((120, 159), np.float32), np.ones((119, 160), np.float32)
+
+
+def groups(regions, inverse, horizontal, vertical):
+    fits = Fits.of(regions, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
+    edges = touching(regions, horizontal, vertical, int(regions.max()) + 1)
+    return parts(fits, edges).tolist()
+
+
+def stripes(*borders):
+    """Regions 1, 2, ... from left to right, each from one border to the next."""
+    regions = np.zeros(CAMERA.shape, np.uint16)
+    for label, (first, after) in enumerate(pairwise(borders), 1):
+        regions[:, first:after] = label
+    return regions
+
+
+def test_parts_of_a_plane_that_touch_are_one():
+    regions = stripes(0, 70, 120, 160)
+    assert groups(regions, inverse_range(WALL), *linked()) == [0, 1, 1, 1]
+    assert groups(stripes(0, 40, 160), inverse_range(WALL), *linked()) == [0, 2, 2]
+
+
+def test_what_a_jump_or_a_gap_parts_stays_apart():
+    regions, (horizontal, vertical) = stripes(0, 70, 160), linked()
+    horizontal[:, 69] = 0
+    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 1, 2]
+    horizontal[60, 69] = 1
+    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 2, 2]
+    regions[:, 69] = 0
+    assert groups(regions, inverse_range(WALL), *linked()) == [0, 1, 2]
+
+
+def test_faces_that_meet_in_a_crease_stay_apart():
+    regions = stripes(0, 80, 160)
+    inverse = np.where(regions == 1, inverse_range(WALL), inverse_range(SIDE))
+    assert groups(regions, inverse, *linked()) == [0, 1, 2]
+
+
+def test_a_row_of_parts_does_not_bend_a_plane_round():
+    """Each agrees with the next, but not the first with the last."""
+    regions = stripes(0, 40, 80, 120, 160)
+    # Chords of a parabola.
+    corners = CAMERA.rays[0, [0, 40, 80, 120, 159], 0]
+    bent = np.interp(CAMERA.rays[..., 0], corners, 0.5 + 0.05 * corners**2).astype(np.float32)
+    for first in range(1, 4):
+        pair = np.isin(regions, (first, first + 1))
+        two = np.where(pair, regions - first + 1, 0).astype(np.uint16)
+        assert groups(two, np.where(pair, bent, 0), *linked()) == [0, 1, 1]
+    assert len(set(groups(regions, bent, *linked()))) > 2
+
+
+def test_united_regions_are_numbered_by_size():
+    regions = np.array([[1, 1, 1, 0], [2, 2, 3, 3], [4, 4, 4, 0]], np.uint16)
+    group = np.array([0, 1, 2, 2, 0])
+    expected = [[2, 2, 2, 0], [1, 1, 1, 1], [0, 0, 0, 0]]
+    np.testing.assert_array_equal(united(regions, group), expected)
