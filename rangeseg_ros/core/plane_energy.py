@@ -20,12 +20,11 @@ from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import FLOOR, SensorModel
 from rangeseg_ros.core.threads import halves
 
-# Noise agrees over patches of about this many pixels, so that many count as one measurement.
-_PATCH = 3.0
+# For each pixel that has to agree with its neighbour to count as one measurement.
 _SMOOTHNESS = 1.2
-NO_PLANE = 6.0 / _PATCH
+NO_PLANE = 6.0
 """Data cost of label 0."""
-_CAP = 8.0 / _PATCH
+_CAP = 8.0
 # Systematic variances granted to the pixels of a plane.
 _GRANTED = 2.0
 
@@ -66,7 +65,7 @@ class Problem(NamedTuple):
         """Weigh the pixels of an image by the noise of its sensor."""
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor.noise, sensor.range_noise)
-        prior = grid_links(horizontal, vertical, _SMOOTHNESS)
+        prior = grid_links(horizontal, vertical, _SMOOTHNESS * sensor.patch)
         return cls(inverse, rays, weight, prior, image.shape[1], block)
 
 
@@ -103,7 +102,7 @@ class Models(NamedTuple):
         count = np.maximum(moments[:, COUNT], 1)
         ratio = moments[:, RATIO] / (count + DISTORTION_PIXELS)
         granted = 1 + moments[:, SLOPE] / count + _GRANTED * ratio
-        return cls(theta, 0.5 / _PATCH / granted)
+        return cls(theta, 0.5 / granted)
 
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:

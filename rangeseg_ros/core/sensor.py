@@ -69,6 +69,17 @@ class SensorModel:
             config.pixel_noise,
         )
 
+    @property
+    def patch(self) -> float:
+        """Pixels that count as one measurement of the labelling, which compares neighbours.
+
+        The variance of the mean of 2 x 2 pixels over that of white noise: 1 to 4.
+        """
+        if self.correlation == 0:
+            return 1.0
+        alike = (1 - self.white) * np.exp(-np.array([1, 2]) / (4 * self.correlation**2))
+        return float(1 + 2 * alike[0] + alike[1])
+
     def variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
         """Variance of the random error at an inverse range, (1/m)^2."""
         return _variance(self.noise, self.range_noise, inverse)
