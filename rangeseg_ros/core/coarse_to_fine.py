@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.energy import angles, mixed_angles, site_angle
 from rangeseg_ros.core.expansion import band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
-from rangeseg_ros.core.piece_moves import PieceLabelling
+from rangeseg_ros.core.piece_expansion import expand
 from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
+from rangeseg_ros.core.region_moves import settle, turn
 
 # Pixels that labels advance in the end, not counting those that gain by so many degrees.
 _REACH, _ODD = 4, 15.0
@@ -53,14 +54,14 @@ def minimise(
     """
     parts = pieces(normals, directions, horizontal, vertical, smoothness)
     warm = None if before is None else _warm(parts, before)
-    labelling = PieceLabelling(parts, parts.votes if warm is None else warm)
+    state = (parts.votes.copy() if warm is None else warm), parts.costs, parts.graph
     for _ in range(2 if warm is None else 1):
-        labelling.settle()
-        labelling.turn()
-    labelling.expand()
-    labelling.turn()
+        settle(*state)
+        turn(*state)
+    expand(*state)
+    turn(*state)
     # Any label will do where neither an edge nor a normal is.
-    labels = np.append(labelling.labels, np.int32(0))[parts.image]
+    labels = np.append(state[0], np.int32(0))[parts.image]
     _refine(labels, normals, directions, horizontal, vertical, smoothness)
     return labels.astype(np.intp)
 
@@ -74,8 +75,8 @@ def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | Non
     labels, every = parts.votes.copy(), np.arange(len(parts.votes))
     inside = parts.image >= 0
     labels[parts.image[inside]] = before[inside]
-    links = np.concatenate([[0.0], np.cumsum(parts.links, dtype=float)])
-    bound = (links[parts.start[1:]] - links[parts.start[:-1]]) / 2
+    links = np.concatenate([[0.0], np.cumsum(parts.graph.links, dtype=float)])
+    bound = (links[parts.graph.start[1:]] - links[parts.graph.start[:-1]]) / 2
     lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
     against = lost > bound
     if against[parts.image[inside]].sum() > _ANEW * inside.sum():

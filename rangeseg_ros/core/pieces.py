@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.piece_graph import Graph, adjacency
 from rangeseg_ros.core.threads import halves, strips
 
 # Cells of the octahedral map (Meyer et al., "On floating-point normal vectors", EGSR 2010) along
@@ -41,19 +42,13 @@ class Pieces(NamedTuple):
         Data cost of each label, summed over the pixels of each piece; `UNIT` degrees.
     votes : (n,) int32
         Label nearest to the mean normal of each piece.
-    start : (n + 1,) int32
-        Neighbours of piece p are those from start[p] to start[p + 1].
-    neighbours : (m,) int32
-    links : (m,) float32
-        Weights of the edges to each neighbour times the smoothness.
+    graph : Graph
     """
 
     image: NDArray[np.int32]
     costs: NDArray[np.uint16]
     votes: NDArray[np.int32]
-    start: NDArray[np.int32]
-    neighbours: NDArray[np.int32]
-    links: NDArray[np.float32]
+    graph: Graph
 
 
 def pieces(
@@ -96,8 +91,8 @@ def pieces(
     below = image[tiles // 2 * TILE :]
     below[below >= 0] += len(upper)
     costs = np.concatenate([upper, lower])
-    graph = _graph(image, len(costs), horizontal, vertical, smoothness)
-    return Pieces(image, costs, np.concatenate([above, under]), *graph)
+    graph = adjacency(image, len(costs), horizontal, vertical, smoothness)
+    return Pieces(image, costs, np.concatenate([above, under]), graph)
 
 
 @lru_cache(maxsize=4)
@@ -304,52 +299,3 @@ def _cut(
                             sums[k] += row[k]
     return result[:count], votes[:count]
 
-
-@njit(cache=True, nogil=True)
-def _graph(
-    image: NDArray[np.int32],
-    count: int,
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
-    smoothness: float,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
-    """Neighbours of each piece and the links to them, sorted by piece: see `Pieces`."""
-    height, width = image.shape
-    room = np.zeros(count + 1, np.int32)
-    for filling in range(2):
-        if filling:
-            room = np.cumsum(room).astype(np.int32)
-            neighbours = np.empty(room[count], np.int32)
-            links = np.empty(room[count], np.float32)
-            used = room[:-1].copy()
-        for i in range(height):
-            for j in range(width):
-                for k in range(2):
-                    if (j + 1 == width) if k == 0 else (i + 1 == height):
-                        continue
-                    u = horizontal[i, j] if k == 0 else vertical[i, j]
-                    p = image[i, j]
-                    q = image[i, j + 1] if k == 0 else image[i + 1, j]
-                    if p == q or not u > 0:
-                        continue
-                    if not filling:
-                        room[p + 1] += 1
-                        room[q + 1] += 1
-                        continue
-                    for _ in range(2):
-                        e = room[p]
-                        while e < used[p] and neighbours[e] != q:
-                            e += 1
-                        if e == used[p]:
-                            neighbours[e], links[e] = q, 0
-                            used[p] += 1
-                        links[e] += np.float32(smoothness) * u
-                        p, q = q, p
-    start = np.zeros(count + 1, np.int32)
-    for p in range(count):
-        n = used[p] - room[p]
-        start[p + 1] = start[p] + n
-        for e in range(n):
-            neighbours[start[p] + e] = neighbours[room[p] + e]
-            links[start[p] + e] = links[room[p] + e]
-    return start, neighbours[: start[count]].copy(), links[: start[count]].copy()

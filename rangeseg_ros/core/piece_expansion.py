@@ -1,0 +1,372 @@
+"""Expansion of one label over the pieces of an image.
+
+Only where the label could gain is a problem set up: within some steps of the pieces that have it,
+and at strays, which it suits much better than their own label. From there gains flow to the
+pieces about that lose; where nothing is left over, nothing switches, and only about the rest is
+the minimum cut in question (`moves`).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.expansion import Sites, grouped
+from rangeseg_ros.core.moves import ROUNDING, minimum_cut
+from rangeseg_ros.core.piece_graph import Graph
+from rangeseg_ros.core.pieces import UNIT
+
+# Steps from the pieces of a label that it is tried within.
+_NEAR = 4
+# What a label must save at a stray, as a share of its links.
+_STRAY = np.float32(0.1)
+# Steps that a gain may flow, and from where it is stuck to pieces that may switch with it.
+_STEPS, _REACH = 4, 3
+
+
+class _State(NamedTuple):
+    """Labelling of pieces, and what was worked out about it.
+
+    Attributes
+    ----------
+    labels : (n,) int32
+    data : (n,) float32
+        Data cost of each piece's label, degrees.
+    unlike : (n,) float32
+        Links of each piece to others of another label, summed.
+    """
+
+    labels: NDArray[np.int32]
+    data: NDArray[np.float32]
+    unlike: NDArray[np.float32]
+
+
+class _Scratch(NamedTuple):
+    """Kept from one problem to the next; each leaves `place` at -1 and `flow` at 0.
+
+    Attributes
+    ----------
+    place : (n,) int32
+    flow : (m,) float32
+    pushed : (m,) int32
+    """
+
+    place: NDArray[np.int32]
+    flow: NDArray[np.float32]
+    pushed: NDArray[np.int32]
+
+
+def expand(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> None:
+    """Expand every label in use, the most frequent first.
+
+    Parameters
+    ----------
+    labels : (n,) int32
+        In place.
+    costs : (n, K) uint16
+        Of each label at each piece, in `UNIT`.
+    graph : Graph
+    """
+    n, count = costs.shape
+    m = len(graph.links)
+    scratch = _Scratch(np.full(n, -1, np.int32), np.zeros(m, np.float32), np.empty(m, np.int32))
+    state = _State(labels, *_sums(labels, costs, graph))
+    frequency = np.bincount(labels, minlength=count)
+    order = np.argsort(-frequency, kind='stable')[: np.count_nonzero(frequency)]
+    start, strays = _strays(labels, costs, graph)
+    columns = _columns(costs, order)
+    for alpha, column in zip(order.tolist(), columns, strict=True):
+        excess = _excess(alpha, column, state, graph)
+        tried = _tried(alpha, strays[start[alpha] : start[alpha + 1]], labels, graph, scratch.place)
+        stuck = _stuck(alpha, tried, excess, labels, graph, scratch)
+        if not len(stuck):
+            continue
+        sites, price, first, second, link = _problem(
+            alpha, stuck, excess, labels, graph, scratch.place
+        )
+        chosen = minimum_cut(price, first, second, link)
+        value = price[chosen].sum() + link[chosen[first] != chosen[second]].sum()
+        if value < -ROUNDING:
+            _switch(alpha, sites[chosen], column, state, graph)
+
+
+@njit(cache=True)
+def _columns(costs: NDArray[np.uint16], labels: NDArray[np.integer]) -> NDArray[np.uint16]:
+    """Costs of some labels (k,) at every piece, (k, n): each read at a stretch later."""
+    n = len(costs)
+    columns = np.empty((len(labels), n), np.uint16)
+    for p0 in range(0, n, 32):
+        for k in range(len(labels)):
+            for p in range(p0, min(p0 + 32, n)):
+                columns[k, p] = costs[p, labels[k]]
+    return columns
+
+
+@njit(cache=True)
+def _sums(
+    labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Data cost of each piece's label, and its links to other labels."""
+    data, unlike = np.empty(len(labels), np.float32), np.zeros(len(labels), np.float32)
+    for p in range(len(labels)):
+        data[p] = UNIT * np.float32(costs[p, labels[p]])
+        for e in range(graph.start[p], graph.start[p + 1]):
+            if labels[graph.neighbours[e]] != labels[p]:
+                unlike[p] += graph.links[e]
+    return data, unlike
+
+
+@njit(cache=True)
+def _strays(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> Sites:
+    """Pieces that each label suits much better than their own."""
+    n, count = costs.shape
+    suits, pieces = np.empty(4 * n + count, np.int32), np.empty(4 * n + count, np.int32)
+    found = 0
+    for p in range(n):
+        row = costs[p]
+        links = np.float32(0)
+        for e in range(graph.start[p], graph.start[p + 1]):
+            links += graph.links[e]
+        limit = np.float32(row[labels[p]]) - _STRAY * links / UNIT
+        least = row[0]
+        for k in range(count):
+            least = min(least, row[k])
+        if not least < limit:
+            continue
+        if found + count > len(suits):
+            suits = np.concatenate((suits, np.empty_like(suits)))
+            pieces = np.concatenate((pieces, np.empty_like(pieces)))
+        for k in range(count):
+            if row[k] < limit:
+                suits[found], pieces[found] = k, p
+                found += 1
+    return grouped(suits[:found], pieces[:found], count)
+
+
+@njit(cache=True)
+def _excess(
+    alpha: int, column: NDArray[np.uint16], state: _State, graph: Graph
+) -> NDArray[np.float32]:
+    """What switching costs each piece more than staying, in the terms of `moves`."""
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
+    half = np.float32(0.5)
+    excess = np.empty(len(column), np.float32)
+    for p in range(len(column)):
+        excess[p] = UNIT * np.float32(column[p]) - state.data[p] - half * state.unlike[p]
+    for p in range(len(column)):
+        if state.labels[p] == alpha:
+            for e in range(start[p], start[p + 1]):
+                excess[neighbours[e]] -= half * links[e]
+    return excess
+
+
+@njit(cache=True)
+def _widen(
+    alpha: int,
+    steps: int,
+    sites: NDArray[np.int32],
+    count: int,
+    place: NDArray[np.int32],
+    labels: NDArray[np.int32],
+    graph: Graph,
+) -> int:
+    """Add the pieces of other labels within some steps to `sites`; how many they are then.
+
+    `place` is that of each site, -1 elsewhere.
+    """
+    start, neighbours = graph.start, graph.neighbours
+    done = 0
+    for _ in range(steps):
+        ring = count
+        while done < ring:
+            p = sites[done]
+            done += 1
+            for e in range(start[p], start[p + 1]):
+                q = neighbours[e]
+                if place[q] < 0 and labels[q] != alpha:
+                    place[q] = count
+                    sites[count] = q
+                    count += 1
+    return count
+
+
+@njit(cache=True)
+def _tried(
+    alpha: int,
+    strays: NDArray[np.int32],
+    labels: NDArray[np.int32],
+    graph: Graph,
+    place: NDArray[np.int32],
+) -> NDArray[np.int32]:
+    """Pieces of other labels that are near to a label, and its strays."""
+    start, neighbours = graph.start, graph.neighbours
+    sites = np.empty(len(labels), np.int32)
+    count = 0
+    for p in range(len(labels)):
+        if labels[p] == alpha:
+            for e in range(start[p], start[p + 1]):
+                q = neighbours[e]
+                if place[q] < 0 and labels[q] != alpha:
+                    place[q] = count
+                    sites[count] = q
+                    count += 1
+    count = _widen(alpha, _NEAR - 1, sites, count, place, labels, graph)
+    for p in strays:
+        if place[p] < 0 and labels[p] != alpha:
+            place[p] = count
+            sites[count] = p
+            count += 1
+    for p in sites[:count]:
+        place[p] = -1
+    return sites[:count]
+
+
+@njit(cache=True)
+def _stuck(
+    alpha: int,
+    tried: NDArray[np.int32],
+    excess: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    graph: Graph,
+    scratch: _Scratch,
+) -> NDArray[np.int32]:
+    """Pieces of those tried whose gain the pieces about them cannot take up.
+
+    Gains (excess below 0) flow by push and relabel (Goldberg and Tarjan, JACM 1988) to pieces
+    that lose (above 0), no more than `_STEPS` steps. A flow changes no minimum cut: where
+    nothing is stuck, nothing switches.
+    """
+    start, neighbours, links, back = graph.start, graph.neighbours, graph.links, graph.back
+    flow, pushed = scratch.flow, scratch.pushed
+    n = len(labels)
+    result, active = np.empty(n, np.int32), np.empty(n, np.int32)
+    waits, height = np.zeros(n, np.bool_), np.empty(n, np.int8)
+    first = waiting = count = pushes = 0
+    # Gains that are not tried count nothing.
+    rest = np.maximum(excess, np.float32(0))
+    for p in range(n):
+        height[p] = rest[p] <= 0
+    for p in tried:
+        if excess[p] < 0:
+            rest[p] = excess[p]
+            active[waiting] = p
+            waits[p] = True
+            waiting += 1
+    while waiting:
+        p = active[first]
+        first = first + 1 if first + 1 < n else 0
+        waiting -= 1
+        waits[p] = False
+        while rest[p] < 0:
+            low = _STEPS
+            for e in range(start[p], start[p + 1]):
+                q = neighbours[e]
+                if labels[q] == alpha:
+                    continue
+                room = links[e] * np.float32(1 if labels[p] == labels[q] else 0.5) - flow[e]
+                if room <= np.float32(ROUNDING):
+                    continue
+                if height[q] >= height[p]:
+                    low = min(low, height[q] + 1)
+                    continue
+                amount = min(room, -rest[p])
+                if height[q] == 0:
+                    amount = min(amount, rest[q])
+                if flow[e] == 0 and flow[back[e]] == 0:
+                    pushed[pushes] = e
+                    pushes += 1
+                flow[e] += amount
+                flow[back[e]] -= amount
+                rest[p] += amount
+                rest[q] -= amount
+                if rest[q] <= 0:
+                    height[q] = max(height[q], 1)
+                    if rest[q] < 0 and not waits[q]:
+                        active[(first + waiting) % n] = q
+                        waiting += 1
+                        waits[q] = True
+                if rest[p] > np.float32(-ROUNDING):
+                    rest[p] = 0
+                    break
+                if room > amount:
+                    low = min(low, height[q] + 1)
+            if rest[p] == 0 or low <= height[p]:
+                continue
+            height[p] = low
+            if low >= _STEPS:
+                result[count] = p
+                count += 1
+                break
+    for e in pushed[:pushes]:
+        flow[e] = flow[back[e]] = 0
+    return result[:count]
+
+
+@njit(cache=True)
+def _problem(
+    alpha: int,
+    stuck: NDArray[np.int32],
+    excess: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    graph: Graph,
+    place: NDArray[np.int32],
+) -> tuple[
+    NDArray[np.int32],
+    NDArray[np.float64],
+    NDArray[np.int32],
+    NDArray[np.int32],
+    NDArray[np.float64],
+]:
+    """Pieces that may switch, their excess, ends of the edges between them, and their links."""
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
+    sites = np.empty(len(labels), np.int32)
+    for s in range(len(stuck)):
+        sites[s] = stuck[s]
+        place[stuck[s]] = s
+    count = _widen(alpha, _REACH, sites, len(stuck), place, labels, graph)
+    room = 0
+    for p in sites[:count]:
+        room += start[p + 1] - start[p]
+    price = np.empty(count)
+    first, second, link = np.empty(room, np.int32), np.empty(room, np.int32), np.empty(room)
+    edges = 0
+    for s in range(count):
+        p = sites[s]
+        price[s] = excess[p]
+        for e in range(start[p], start[p + 1]):
+            q = neighbours[e]
+            if labels[q] == alpha:
+                continue
+            u = np.float64(links[e]) * (1 if labels[p] == labels[q] else 0.5)
+            if place[q] < 0:
+                price[s] += u
+            elif s < place[q]:
+                first[edges], second[edges], link[edges] = s, place[q], u
+                edges += 1
+    for p in sites[:count]:
+        place[p] = -1
+    return sites[:count], price, first[:edges], second[:edges], link[:edges]
+
+
+@njit(cache=True)
+def _switch(
+    alpha: int,
+    sites: NDArray[np.int32],
+    column: NDArray[np.uint16],
+    state: _State,
+    graph: Graph,
+) -> None:
+    """Give pieces a label."""
+    labels, data, unlike = state.labels, state.data, state.unlike
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
+    for p in sites:
+        data[p] = UNIT * np.float32(column[p])
+        for e in range(start[p], start[p + 1]):
+            q = neighbours[e]
+            change = np.float32(labels[q] != alpha) - np.float32(labels[q] != labels[p])
+            unlike[p] += change * links[e]
+            unlike[q] += change * links[e]
+        labels[p] = alpha
