@@ -17,7 +17,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.piece_graph import Graph, adjacency
-from rangeseg_ros.core.threads import halves, strips
+from rangeseg_ros.core.threads import aside, halves, strips
 
 # Cells of the octahedral map (Meyer et al., "On floating-point normal vectors", EGSR 2010) along
 # each axis: normals of a cell count as its centre, within two degrees.
@@ -70,13 +70,14 @@ def pieces(
     smoothness : float
         Lambda.
     """
-    horizontal, vertical = horizontal.astype(np.float32), vertical.astype(np.float32)
+    horizontal = horizontal.astype(np.float32, copy=False)
+    vertical = vertical.astype(np.float32, copy=False)
     table, nearest = _table(directions.astype(np.float32).tobytes(), len(directions))
     cells = np.empty(normals.shape[:2], np.int32)
     strips(_cells, len(cells), normals, cells)
     image = np.full(cells.shape, -1, np.int32)
     tiles = -(-len(cells) // TILE)
-    (upper, above), (lower, under) = halves(
+    above, under = halves(
         _cut,
         tiles,
         cells,
@@ -89,10 +90,12 @@ def pieces(
         image,
     )
     below = image[tiles // 2 * TILE :]
-    below[below >= 0] += len(upper)
-    costs = np.concatenate([upper, lower])
-    graph = adjacency(image, len(costs), horizontal, vertical, smoothness)
-    return Pieces(image, costs, np.concatenate([above, under]), graph)
+    np.add(below, len(above), out=below, where=below >= 0)
+    votes = np.concatenate([above, under])
+    graph = aside(adjacency, image, len(votes), horizontal, vertical, smoothness)
+    costs = np.empty((len(votes), len(directions)), np.uint16)
+    strips(_sum_up, tiles, image, cells, table, costs)
+    return Pieces(image, costs, votes, graph.result())
 
 
 @lru_cache(maxsize=4)
@@ -134,47 +137,188 @@ def _cells(first: int, after: int, normals: NDArray[np.float32], cells: NDArray[
             cells[i, j] = _cell(normals[i, j, 0], normals[i, j, 1], normals[i, j, 2])
 
 
+class _Tile(NamedTuple):
+    """A tile, its pixels in raster order and its components at three levels.
+
+    A component is named by its first pixel: [level, p] tells of the component of the whole tile
+    (level 0), of a quarter (1) or of a quarter's quarter (2) that begins at pixel p.
+
+    Attributes
+    ----------
+    cell : (64,) int32
+        -1 for pixels without normal.
+    free : (64,) bool
+        Whether there is an edge or a normal.
+    right, below : (64,) float32
+        Links to the next pixel of the tile in the row and in the column.
+    whole : (3, 64) int32
+        First pixel of the component that each pixel is in.
+    first : (3, 64) int32
+        Names of the components of each level.
+    number : (3,) int32
+        How many they are.
+    normal : (3, 64, 3) float32
+        Sum over the component.
+    label : (3, 64) int32
+        Nearest to that.
+    cost, parts : (3, 64) int32
+        Of the label, and of the labels of the parts at the next level, in `UNIT`.
+    spared : (3, 64) float32
+        Links between the parts at the next level.
+    split : (3, 64) bool
+        Whether the parts have labels of their own.
+    """
+
+    cell: NDArray[np.int32]
+    free: NDArray[np.bool_]
+    right: NDArray[np.float32]
+    below: NDArray[np.float32]
+    whole: NDArray[np.int32]
+    first: NDArray[np.int32]
+    number: NDArray[np.int32]
+    normal: NDArray[np.float32]
+    label: NDArray[np.int32]
+    cost: NDArray[np.int32]
+    parts: NDArray[np.int32]
+    spared: NDArray[np.float32]
+    split: NDArray[np.bool_]
+
+
 @njit(cache=True, nogil=True)
-def _components(
+def _load(
     i0: int,
     j0: int,
-    size: int,
+    cells: NDArray[np.int32],
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
-    found: NDArray[np.int32],
-    first: int,
-    stack: NDArray[np.int32],
-) -> int:
-    """Number the components of a tile from `first` in `found` (TILE, TILE); the next number.
+    smoothness: np.float32,
+    tile: _Tile,
+) -> bool:
+    """Fill in cells, links and what is free; whether anything is."""
+    height, width = cells.shape
+    cell, free, right, below = tile.cell, tile.free, tile.right, tile.below
+    linked = False
+    for a in range(TILE * TILE):
+        i, j = i0 + a // TILE, j0 + a % TILE
+        cell[a], free[a], right[a], below[a] = -1, False, 0, 0
+        if i >= height or j >= width:
+            continue
+        cell[a] = cells[i, j]
+        u = horizontal[i, j] if j + 1 < width else np.float32(0)
+        v = vertical[i, j] if i + 1 < height else np.float32(0)
+        if (
+            cells[i, j] >= 0
+            or u > 0
+            or v > 0
+            or (j > 0 and horizontal[i, j - 1] > 0)
+            or (i > 0 and vertical[i - 1, j] > 0)
+        ):
+            free[a] = linked = True
+        if a % TILE < TILE - 1:
+            right[a] = smoothness * u
+        if a // TILE < TILE - 1:
+            below[a] = smoothness * v
+    return linked
 
-    Pixels with `found` -2 are left out.
+
+@njit(cache=True, nogil=True)
+def _connect(tile: _Tile) -> None:
+    """Find the components of all levels, the smallest first, and the links between their parts.
+
+    A union-find whose parents come before their children.
     """
-    height, width = len(horizontal), vertical.shape[1]
-    below, right = min(i0 + size, height), min(j0 + size, width)
-    for i in range(i0, below):
-        for j in range(j0, right):
-            if found[i % TILE, j % TILE] != -1:
-                continue
-            found[i % TILE, j % TILE] = first
-            stack[0] = i * width + j
-            top = 1
-            while top:
-                top -= 1
-                y, x = stack[top] // width, stack[top] % width
-                for k in range(4):
-                    b = y + (k == 1) - (k == 3)
-                    a = x + (k == 0) - (k == 2)
-                    if b < i0 or b >= below or a < j0 or a >= right:
-                        continue
-                    if found[b % TILE, a % TILE] != -1:
-                        continue
-                    u = horizontal[y, min(a, x)] if k % 2 == 0 else vertical[min(b, y), x]
-                    if u > 0:
-                        found[b % TILE, a % TILE] = first
-                        stack[top] = b * width + a
-                        top += 1
-            first += 1
-    return first
+    free, right, below = tile.free, tile.right, tile.below
+    whole, first, spared = tile.whole, tile.first, tile.spared
+    for level in range(2, -1, -1):
+        for a in range(TILE * TILE):
+            whole[level, a] = a if level == 2 else whole[level + 1, a]
+            spared[level, a] = 0
+        # Links between the halves of blocks of this size.
+        size = TILE >> level
+        for x in range(size // 2 - 1, TILE, size):
+            for y in range(TILE):
+                a, b = y * TILE + x, x * TILE + y
+                if right[a] > 0:
+                    _unite(whole, level, a, a + 1)
+                if below[b] > 0:
+                    _unite(whole, level, b, b + TILE)
+        count = 0
+        for a in range(TILE * TILE):
+            whole[level, a] = whole[level, whole[level, a]]
+            if whole[level, a] == a and free[a]:
+                first[level, count] = a
+                count += 1
+        tile.number[level] = count
+        for x in range(size // 2 - 1, TILE, size):
+            for y in range(TILE):
+                a, b = y * TILE + x, x * TILE + y
+                spared[level, whole[level, a]] += right[a]
+                spared[level, whole[level, b]] += below[b]
+
+
+@njit(cache=True, nogil=True)
+def _unite(parent: NDArray[np.int32], level: int, a: int, b: int) -> None:
+    while parent[level, a] != a:
+        a = parent[level, a]
+    while parent[level, b] != b:
+        b = parent[level, b]
+    parent[level, max(a, b)] = min(a, b)
+
+
+@njit(cache=True, nogil=True)
+def _vote(
+    i0: int,
+    j0: int,
+    normals: NDArray[np.float32],
+    nearest: NDArray[np.int32],
+    tile: _Tile,
+) -> None:
+    """Label of the mean normal of each component."""
+    cell, whole, first, number = tile.cell, tile.whole, tile.first, tile.number
+    total, label = tile.normal, tile.label
+    for level in range(3):
+        for s in range(number[level]):
+            for c in range(3):
+                total[level, first[level, s], c] = 0
+    for a in range(TILE * TILE):
+        if cell[a] >= 0:
+            for c in range(3):
+                total[2, whole[2, a], c] += normals[i0 + a // TILE, j0 + a % TILE, c]
+    for level in range(2, -1, -1):
+        for s in range(number[level]):
+            p = first[level, s]
+            found = _cell(total[level, p, 0], total[level, p, 1], total[level, p, 2])
+            label[level, p] = nearest[max(found, 0)]
+            if level:
+                for c in range(3):
+                    total[level - 1, whole[level - 1, p], c] += total[level, p, c]
+
+
+@njit(cache=True, nogil=True)
+def _judge(table: NDArray[np.uint16], tile: _Tile) -> None:
+    """Tell which components fall into their parts."""
+    cell, whole, first, number = tile.cell, tile.whole, tile.first, tile.number
+    label, cost, parts, split = tile.label, tile.cost, tile.parts, tile.split
+    for level in range(3):
+        for s in range(number[level]):
+            p = first[level, s]
+            cost[level, p] = parts[level, p] = 0
+            split[level, p] = False
+    for a in range(TILE * TILE):
+        if cell[a] >= 0:
+            for level in range(3):
+                p = whole[level, a]
+                cost[level, p] += table[cell[a], label[level, p]]
+    for level in range(1, -1, -1):
+        for s in range(number[level + 1]):
+            a = first[level + 1, s]
+            p = whole[level, a]
+            parts[level, p] += cost[level + 1, a]
+            split[level, p] |= split[level + 1, a]
+        for s in range(number[level]):
+            p = first[level, s]
+            more = cost[level, p] - parts[level, p]
+            split[level, p] |= more > _SPLIT * tile.spared[level, p]
 
 
 @njit(cache=True, nogil=True)
@@ -189,113 +333,76 @@ def _cut(
     vertical: NDArray[np.floating],
     smoothness: float,
     image: NDArray[np.int32],
-) -> tuple[NDArray[np.uint16], NDArray[np.int32]]:
+) -> NDArray[np.int32]:
     """Number the pieces of some rows of tiles from 0 in `image`, which is -1.
 
-    Pixels without any edge or normal stay -1. Returns costs (n, K) and, for each piece, the label
-    nearest to its mean normal (n,).
+    Pixels without any edge or normal stay -1. Returns the label (n,) nearest to the mean normal
+    of each piece.
     """
     height, width = cells.shape
-    labels = table.shape[1]
-    result = np.empty((2048, labels), np.uint16)
-    votes = np.empty(2048, np.int32)
-    count = 0
     most = TILE * TILE
-    # Components of the tile, of its quarters and of their quarters.
-    found = np.empty((3, TILE, TILE), np.int32)
-    number = np.empty(3, np.int32)
-    total = np.empty((3, most, 3), np.float32)
-    label = np.empty((3, most), np.int32)
-    cost = np.empty((3, most), np.float32)
-    spared = np.empty((3, most), np.float32)
-    split = np.empty((3, most), np.bool_)
-    parent = np.empty((3, most), np.int32)
-    name = np.empty((3, most), np.int32)
-    stack = np.empty(most, np.int32)
+    tile = _Tile(
+        np.empty(most, np.int32),
+        np.empty(most, np.bool_),
+        np.empty(most, np.float32),
+        np.empty(most, np.float32),
+        np.empty((3, most), np.int32),
+        np.empty((3, most), np.int32),
+        np.empty(3, np.int32),
+        np.empty((3, most, 3), np.float32),
+        np.empty((3, most), np.int32),
+        np.empty((3, most), np.int32),
+        np.empty((3, most), np.int32),
+        np.empty((3, most), np.float32),
+        np.empty((3, most), np.bool_),
+    )
+    votes = np.empty(height * width, np.int32)
+    name = np.empty(most, np.int32)
+    count = 0
     for i0 in range(first * TILE, min(after * TILE, height), TILE):
         for j0 in range(0, width, TILE):
-            below, right = min(i0 + TILE, height), min(j0 + TILE, width)
-            linked = False
-            for i in range(i0, below):
-                for j in range(j0, right):
-                    free = (
-                        cells[i, j] >= 0
-                        or (j + 1 < width and horizontal[i, j] > 0)
-                        or (j > 0 and horizontal[i, j - 1] > 0)
-                        or (i + 1 < height and vertical[i, j] > 0)
-                        or (i > 0 and vertical[i - 1, j] > 0)
-                    )
-                    linked |= free
-                    for level in range(3):
-                        found[level, i - i0, j - j0] = -1 if free else -2
-            if not linked:
+            if not _load(i0, j0, cells, horizontal, vertical, np.float32(smoothness), tile):
                 continue
-            for level in range(3):
-                size, n = TILE >> level, 0
-                for i in range(i0, below, size):
-                    for j in range(j0, right, size):
-                        n = _components(i, j, size, horizontal, vertical, found[level], n, stack)
-                number[level] = n
-                total[level, :n], cost[level, :n], spared[level, :n] = 0, 0, 0
-                split[level, :n], name[level, :n] = False, -1
-            for i in range(i0, below):
-                for j in range(j0, right):
-                    a, b = i - i0, j - j0
-                    if found[0, a, b] < 0:
-                        continue
-                    for level in range(3):
-                        p = found[level, a, b]
-                        if level:
-                            parent[level, p] = found[level - 1, a, b]
-                        if cells[i, j] >= 0:
-                            for c in range(3):
-                                total[level, p, c] += normals[i, j, c]
-                    # Edges between the parts of a component.
-                    for level in range(2):
-                        p = found[level, a, b]
-                        whole, part = found[level], found[level + 1]
-                        if j + 1 < right and whole[a, b + 1] == p and part[a, b + 1] != part[a, b]:
-                            spared[level, p] += np.float32(smoothness) * horizontal[i, j]
-                        if i + 1 < below and whole[a + 1, b] == p and part[a + 1, b] != part[a, b]:
-                            spared[level, p] += np.float32(smoothness) * vertical[i, j]
-            for level in range(3):
-                for p in range(number[level]):
-                    x, y, z = total[level, p]
-                    label[level, p] = nearest[max(_cell(x, y, z), 0)]
-            for i in range(i0, below):
-                for j in range(j0, right):
-                    cell = cells[i, j]
-                    if cell >= 0 and found[0, i - i0, j - j0] >= 0:
-                        for level in range(3):
-                            p = found[level, i - i0, j - j0]
-                            cost[level, p] += np.float32(table[cell, label[level, p]])
-            for level in range(1, -1, -1):
-                limit = _SPLIT * spared[level]
-                for p in range(number[level + 1]):
-                    limit[parent[level + 1, p]] += cost[level + 1, p]
-                    split[level, parent[level + 1, p]] |= split[level + 1, p]
-                for p in range(number[level]):
-                    split[level, p] |= cost[level, p] > limit[p]
-            for i in range(i0, below):
-                for j in range(j0, right):
-                    a, b = i - i0, j - j0
-                    if found[0, a, b] < 0:
-                        continue
-                    level = 0
-                    while split[level, found[level, a, b]]:
-                        level += 1
-                    p = found[level, a, b]
-                    if name[level, p] < 0:
-                        if count == len(result):
-                            result = np.concatenate((result, np.empty_like(result)))
-                            votes = np.concatenate((votes, np.empty_like(votes)))
-                        name[level, p] = count
-                        result[count], votes[count] = 0, label[level, p]
-                        count += 1
-                    image[i, j] = name[level, p]
-                    if cells[i, j] >= 0:
-                        row, sums = table[cells[i, j]], result[name[level, p]]
-                        for k in range(labels):
-                            sums[k] += row[k]
-    return result[:count], votes[:count]
+            _connect(tile)
+            _vote(i0, j0, normals, nearest, tile)
+            _judge(table, tile)
+            for a in range(most):
+                if not tile.free[a]:
+                    continue
+                level = 0
+                while tile.split[level, tile.whole[level, a]]:
+                    level += 1
+                p = tile.whole[level, a]
+                if p == a:
+                    name[p] = count
+                    votes[count] = tile.label[level, p]
+                    count += 1
+                image[i0 + a // TILE, j0 + a % TILE] = name[p]
+    return votes[:count].copy()
 
+
+@njit(cache=True, nogil=True)
+def _sum_up(
+    first: int,
+    after: int,
+    image: NDArray[np.int32],
+    cells: NDArray[np.int32],
+    table: NDArray[np.uint16],
+    costs: NDArray[np.uint16],
+) -> None:
+    """Costs of the pieces of some rows of tiles."""
+    height, width = image.shape
+    last = -1
+    for i0 in range(first * TILE, min(after * TILE, height), TILE):
+        for j0 in range(0, width, TILE):
+            for i in range(i0, min(i0 + TILE, height)):
+                for j in range(j0, min(j0 + TILE, width)):
+                    p = image[i, j]
+                    # Numbers rise from tile to tile and in a tile.
+                    if p > last:
+                        costs[p] = 0
+                        last = p
+                    if cells[i, j] >= 0 and p >= 0:
+                        row, sums = table[cells[i, j]], costs[p]
+                        for k in range(len(row)):
+                            sums[k] += row[k]
