@@ -29,9 +29,15 @@ def settle(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -
     """
     start, neighbours, links = graph.start, graph.neighbours, graph.links
     for p in range(len(labels)):
-        best, least = labels[p], np.float32(np.inf)
-        for e in range(start[p] - 1, start[p + 1]):
-            label = labels[p] if e < start[p] else labels[neighbours[e]]
+        own = best = labels[p]
+        least = UNIT * np.float32(costs[p, own])
+        for f in range(start[p], start[p + 1]):
+            if labels[neighbours[f]] != own:
+                least += links[f]
+        for e in range(start[p], start[p + 1]):
+            label = labels[neighbours[e]]
+            if label == own:
+                continue
             value = UNIT * np.float32(costs[p, label])
             for f in range(start[p], start[p + 1]):
                 if labels[neighbours[f]] != label:
@@ -86,43 +92,96 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
         Of each label at each piece, in `UNIT`.
     graph : Graph
     """
-    start, neighbours, links = graph.start, graph.neighbours, graph.links
     n, count = costs.shape
     region, order, first = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
     regions = _regions(labels, graph, region, order, first)
-    total = np.zeros((regions, count), np.float32)
+    total = np.zeros((regions, count), np.int32)
     for p in range(n):
-        row, sums = costs[p], total[region[p]]
-        for k in range(count):
-            sums[k] += UNIT * np.float32(row[k])
+        _add(costs[p], total[region[p]])
+    # The sums of each region, the label that is cheapest by itself, and whether to look again.
+    row, cheapest = np.arange(regions), np.empty(regions, np.int32)
+    for r in range(regions):
+        cheapest[r] = _cheapest(total[r])
+    dirty = np.ones(regions, np.bool_)
     beside = np.zeros(count, np.float32)
-    while regions:
+    changed = True
+    while changed:
         changed = False
         for r in range(regions):
-            sites, row = order[first[r] : first[r + 1]], total[r]
-            for p in sites:
-                for e in range(start[p], start[p + 1]):
-                    if region[neighbours[e]] != r:
-                        beside[labels[neighbours[e]]] += links[e]
-            before = best = labels[sites[0]]
-            least = row[best] - beside[best] - np.float32(ROUNDING)
-            for k in range(count):
-                if row[k] - beside[k] < least:
-                    best, least = k, row[k] - beside[k]
-            for p in sites:
-                for e in range(start[p], start[p + 1]):
-                    beside[labels[neighbours[e]]] = 0
-            if best != before:
+            if not dirty[r]:
+                continue
+            dirty[r] = False
+            sites = order[first[r] : first[r + 1]]
+            best = _best(r, sites, region, total[row[r]], cheapest[row[r]], labels, graph, beside)
+            if best != labels[sites[0]]:
                 changed = True
                 for p in sites:
                     labels[p] = best
-        if not changed:
-            return
+                    for e in range(graph.start[p], graph.start[p + 1]):
+                        there = region[graph.neighbours[e]]
+                        dirty[there] |= there != r
         members = order[first[:regions]].copy()
         regions = _regions(labels, graph, region, order, first)
-        merged = np.zeros((regions, count), np.float32)
-        for r in range(len(members)):
-            row, sums = total[r], merged[region[members[r]]]
-            for k in range(count):
-                sums[k] += row[k]
-        total = merged
+        row_before, dirty_before = row, dirty
+        row, dirty = np.full(regions, -1), np.zeros(regions, np.bool_)
+        for before in range(len(members)):
+            r = region[members[before]]
+            if row[r] < 0:
+                row[r], dirty[r] = row_before[before], dirty_before[before]
+            else:
+                _add(total[row_before[before]], total[row[r]])
+                cheapest[row[r]] = _cheapest(total[row[r]])
+                dirty[r] = True
+
+
+@njit(cache=True)
+def _add(costs: NDArray[np.integer], total: NDArray[np.int32]) -> None:
+    for k in range(len(costs)):
+        total[k] += costs[k]
+
+
+@njit(cache=True)
+def _cheapest(costs: NDArray[np.int32]) -> int:
+    least = costs[0]
+    for k in range(len(costs)):
+        least = min(least, costs[k])
+    k = 0
+    while costs[k] > least:
+        k += 1
+    return k
+
+
+@njit(cache=True)
+def _best(
+    r: int,
+    sites: NDArray[np.int32],
+    region: NDArray[np.int32],
+    costs: NDArray[np.int32],
+    cheapest: int,
+    labels: NDArray[np.int32],
+    graph: Graph,
+    beside: NDArray[np.float32],
+) -> int:
+    """Label that costs a region least: its own, its neighbours' or the cheapest of all.
+
+    `beside` is 0.
+    """
+    start, neighbours, links = graph.start, graph.neighbours, graph.links
+    own = labels[sites[0]]
+    for p in sites:
+        for e in range(start[p], start[p + 1]):
+            if region[neighbours[e]] != r:
+                beside[labels[neighbours[e]]] += links[e]
+    best, least = own, UNIT * np.float32(costs[own]) - beside[own] - np.float32(ROUNDING)
+    value = UNIT * np.float32(costs[cheapest]) - beside[cheapest]
+    if value < least:
+        best, least = cheapest, value
+    for p in sites:
+        for e in range(start[p], start[p + 1]):
+            k = labels[neighbours[e]]
+            if beside[k] > 0:
+                value = UNIT * np.float32(costs[k]) - beside[k]
+                if value < least:
+                    best, least = k, value
+                beside[k] = 0
+    return best
