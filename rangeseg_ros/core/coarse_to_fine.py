@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.energy import angles, mixed_angles, site_angle
-from rangeseg_ros.core.expansion import band, choice, fronts, grid_links
+from rangeseg_ros.core.expansion import Choice, band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
 from rangeseg_ros.core.piece_expansion import expand
 from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
@@ -102,11 +102,27 @@ def _refine(
     start, beside = fronts(labels, links, width, len(vectors))
     for alpha in np.flatnonzero(np.diff(start)).tolist():
         front = beside[start[alpha] : start[alpha + 1]]
-        front = _onward(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
-        near = band(alpha, front, _REACH, labels, links, width, position)
-        new = angles(near, sites, vectors[alpha])
-        move = choice(alpha, near, new, labels, data, links, width, position)
+        move = _move(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
         move.make(alpha, labels, data, ROUNDING)
+
+
+@njit(cache=True)
+def _move(
+    alpha: int,
+    front: NDArray[np.int32],
+    normals: NDArray[np.float32],
+    direction: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    data: NDArray[np.float32],
+    links: NDArray[np.float32],
+    width: int,
+    position: NDArray[np.int32],
+) -> Choice:
+    """Expansion of a label by the pixels about its front."""
+    front = _onward(alpha, front, normals, direction, labels, data, links, width, position)
+    near = band(alpha, front, _REACH, labels, links, width, position)
+    new = angles(near, normals, direction)
+    return choice(alpha, near, new, labels, data, links, width, position)
 
 
 @njit(cache=True)

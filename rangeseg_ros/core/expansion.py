@@ -79,9 +79,9 @@ def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> 
         start[label + 2] += 1
     start = np.cumsum(start)
     result = np.empty_like(sites)
-    for label, site in zip(labels, sites):
-        result[start[label + 1]] = site
-        start[label + 1] += 1
+    for s in range(len(sites)):
+        result[start[labels[s] + 1]] = sites[s]
+        start[labels[s] + 1] += 1
     return start[: count + 1], result
 
 

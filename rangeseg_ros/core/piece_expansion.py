@@ -21,10 +21,10 @@ from rangeseg_ros.core.pieces import UNIT
 
 # Steps from the pieces of a label that it is tried within.
 _NEAR = 4
-# What a label must save at a stray, as a share of its links.
+# What a label must save at a stray, as a share of its links; and half of what the best one saves.
 _STRAY = np.float32(0.1)
 # Steps that a gain may flow, and from where it is stuck to pieces that may switch with it.
-_STEPS, _REACH = 4, 3
+_STEPS, _REACH = 3, 3
 
 
 class _State(NamedTuple):
@@ -77,18 +77,13 @@ def expand(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -
     frequency = np.bincount(labels, minlength=count)
     order = np.argsort(-frequency, kind='stable')[: np.count_nonzero(frequency)]
     start, strays = _strays(labels, costs, graph)
-    columns = _columns(costs, order)
-    for alpha, column in zip(order.tolist(), columns, strict=True):
-        excess = _excess(alpha, column, state, graph)
-        tried = _tried(alpha, strays[start[alpha] : start[alpha + 1]], labels, graph, scratch.place)
-        stuck = _stuck(alpha, tried, excess, labels, graph, scratch)
-        if not len(stuck):
+    for alpha, column in zip(order.tolist(), _columns(costs, order), strict=True):
+        suited = strays[start[alpha] : start[alpha + 1]]
+        sites, excess, first, second, link = _problem(alpha, column, suited, state, graph, scratch)
+        if not len(sites):
             continue
-        sites, price, first, second, link = _problem(
-            alpha, stuck, excess, labels, graph, scratch.place
-        )
-        chosen = minimum_cut(price, first, second, link)
-        value = price[chosen].sum() + link[chosen[first] != chosen[second]].sum()
+        chosen = minimum_cut(excess, first, second, link)
+        value = excess[chosen].sum() + link[chosen[first] != chosen[second]].sum()
         if value < -ROUNDING:
             _switch(alpha, sites[chosen], column, state, graph)
 
@@ -130,10 +125,11 @@ def _strays(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) 
         links = np.float32(0)
         for e in range(graph.start[p], graph.start[p + 1]):
             links += graph.links[e]
-        limit = np.float32(row[labels[p]]) - _STRAY * links / UNIT
         least = row[0]
         for k in range(count):
             least = min(least, row[k])
+        own = np.float32(row[labels[p]])
+        limit = min(own - _STRAY * links / UNIT, (own + np.float32(least)) / np.float32(2))
         if not least < limit:
             continue
         if found + count > len(suits):
@@ -308,11 +304,11 @@ def _stuck(
 @njit(cache=True)
 def _problem(
     alpha: int,
-    stuck: NDArray[np.int32],
-    excess: NDArray[np.float32],
-    labels: NDArray[np.int32],
+    column: NDArray[np.uint16],
+    strays: NDArray[np.int32],
+    state: _State,
     graph: Graph,
-    place: NDArray[np.int32],
+    scratch: _Scratch,
 ) -> tuple[
     NDArray[np.int32],
     NDArray[np.float64],
@@ -322,7 +318,11 @@ def _problem(
 ]:
     """Pieces that may switch, their excess, ends of the edges between them, and their links."""
     start, neighbours, links = graph.start, graph.neighbours, graph.links
-    sites = np.empty(len(labels), np.int32)
+    labels, place = state.labels, scratch.place
+    excess = _excess(alpha, column, state, graph)
+    tried = _tried(alpha, strays, labels, graph, place)
+    stuck = _stuck(alpha, tried, excess, labels, graph, scratch)
+    sites = np.empty(len(labels) if len(stuck) else 0, np.int32)
     for s in range(len(stuck)):
         sites[s] = stuck[s]
         place[stuck[s]] = s

@@ -104,8 +104,7 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
         cheapest[r] = _cheapest(total[r])
     dirty = np.ones(regions, np.bool_)
     beside = np.zeros(count, np.float32)
-    changed = True
-    while changed:
+    while regions:
         changed = False
         for r in range(regions):
             if not dirty[r]:
@@ -120,6 +119,8 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
                     for e in range(graph.start[p], graph.start[p + 1]):
                         there = region[graph.neighbours[e]]
                         dirty[there] |= there != r
+        if not changed:
+            break
         members = order[first[:regions]].copy()
         regions = _regions(labels, graph, region, order, first)
         row_before, dirty_before = row, dirty
