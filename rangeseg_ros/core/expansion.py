@@ -71,7 +71,7 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
     return grouped(beside[:found], sites[:found], count)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
     """Sort sites (N,) by their labels (N,), which are below `count`; of a label in order."""
     start = np.zeros(count + 2, np.int64)

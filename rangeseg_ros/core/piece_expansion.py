@@ -18,6 +18,7 @@ from rangeseg_ros.core.expansion import Sites, grouped
 from rangeseg_ros.core.moves import ROUNDING, minimum_cut
 from rangeseg_ros.core.piece_graph import Graph
 from rangeseg_ros.core.pieces import UNIT
+from rangeseg_ros.core.threads import aside
 
 # Steps from the pieces of a label that it is tried within.
 _NEAR = 4
@@ -76,8 +77,9 @@ def expand(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -
     state = _State(labels, *_sums(labels, costs, graph))
     frequency = np.bincount(labels, minlength=count)
     order = np.argsort(-frequency, kind='stable')[: np.count_nonzero(frequency)]
+    pending = aside(_columns, costs, order)
     start, strays = _strays(labels, costs, graph)
-    for alpha, column in zip(order.tolist(), _columns(costs, order), strict=True):
+    for alpha, column in zip(order.tolist(), pending.result(), strict=True):
         suited = strays[start[alpha] : start[alpha + 1]]
         sites, excess, first, second, link = _problem(alpha, column, suited, state, graph, scratch)
         if not len(sites):
@@ -88,7 +90,7 @@ def expand(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -
             _switch(alpha, sites[chosen], column, state, graph)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _columns(costs: NDArray[np.uint16], labels: NDArray[np.integer]) -> NDArray[np.uint16]:
     """Costs of some labels (k,) at every piece, (k, n): each read at a stretch later."""
     n = len(costs)
@@ -114,7 +116,7 @@ def _sums(
     return data, unlike
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _strays(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> Sites:
     """Pieces that each label suits much better than their own."""
     n, count = costs.shape

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.moves import ROUNDING
 from rangeseg_ros.core.piece_graph import Graph
 from rangeseg_ros.core.pieces import UNIT
+from rangeseg_ros.core.threads import strips
 
 
 @njit(cache=True)
@@ -80,7 +81,6 @@ def _regions(
     return count
 
 
-@njit(cache=True)
 def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> None:
     """Give every region in turn the label that costs least, until that changes nothing.
 
@@ -95,17 +95,48 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
     n, count = costs.shape
     region, order, first = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
     regions = _regions(labels, graph, region, order, first)
-    total = np.zeros((regions, count), np.int32)
-    for p in range(n):
-        _add(costs[p], total[region[p]])
+    total = np.empty((regions, count), np.int32)
+    strips(_sum_up, count, costs, region, total)
+    _turn(labels, region, order, first, total, graph)
+
+
+@njit(cache=True, nogil=True)
+def _sum_up(
+    begin: int,
+    after: int,
+    costs: NDArray[np.uint16],
+    region: NDArray[np.int32],
+    total: NDArray[np.int32],
+) -> None:
+    """Costs of some labels, summed over each region."""
+    total[:, begin:after] = 0
+    for p in range(len(costs)):
+        row, sums = costs[p, begin:after], total[region[p], begin:after]
+        for k in range(len(row)):
+            sums[k] += row[k]
+
+
+@njit(cache=True)
+def _turn(
+    labels: NDArray[np.int32],
+    region: NDArray[np.int32],
+    order: NDArray[np.int32],
+    first: NDArray[np.int32],
+    total: NDArray[np.int32],
+    graph: Graph,
+) -> None:
+    """Turn the regions of `_regions`, whose costs are `total`; all in place."""
+    start, neighbours = graph.start, graph.neighbours
+    regions, count = total.shape
     # The sums of each region, the label that is cheapest by itself, and whether to look again.
     row, cheapest = np.arange(regions), np.empty(regions, np.int32)
     for r in range(regions):
         cheapest[r] = _cheapest(total[r])
     dirty = np.ones(regions, np.bool_)
     beside = np.zeros(count, np.float32)
-    while regions:
-        changed = False
+    turned = np.empty(regions, np.int32)
+    while True:
+        turns = 0
         for r in range(regions):
             if not dirty[r]:
                 continue
@@ -113,32 +144,76 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
             sites = order[first[r] : first[r + 1]]
             best = _best(r, sites, region, total[row[r]], cheapest[row[r]], labels, graph, beside)
             if best != labels[sites[0]]:
-                changed = True
+                turned[turns] = r
+                turns += 1
                 for p in sites:
                     labels[p] = best
-                    for e in range(graph.start[p], graph.start[p + 1]):
-                        there = region[graph.neighbours[e]]
+                    for e in range(start[p], start[p + 1]):
+                        there = region[neighbours[e]]
                         dirty[there] |= there != r
-        if not changed:
-            break
-        members = order[first[:regions]].copy()
-        regions = _regions(labels, graph, region, order, first)
-        row_before, dirty_before = row, dirty
-        row, dirty = np.full(regions, -1), np.zeros(regions, np.bool_)
-        for before in range(len(members)):
-            r = region[members[before]]
-            if row[r] < 0:
-                row[r], dirty[r] = row_before[before], dirty_before[before]
+        if turns == 0:
+            return
+        number = _joined(turned[:turns], labels, region, order, first, graph)
+        before, regions = regions, 0
+        for r in range(before):
+            now = number[r]
+            if now == regions:
+                regions += 1
+                row[now], dirty[now] = row[r], dirty[r]
             else:
-                _add(total[row_before[before]], total[row[r]])
-                cheapest[row[r]] = _cheapest(total[row[r]])
-                dirty[r] = True
+                source, target = total[row[r]], total[row[now]]
+                for k in range(count):
+                    target[k] += source[k]
+                cheapest[row[now]] = _cheapest(total[row[now]])
+                dirty[now] = True
 
 
 @njit(cache=True)
-def _add(costs: NDArray[np.integer], total: NDArray[np.int32]) -> None:
-    for k in range(len(costs)):
-        total[k] += costs[k]
+def _joined(
+    turned: NDArray[np.int32],
+    labels: NDArray[np.int32],
+    region: NDArray[np.int32],
+    order: NDArray[np.int32],
+    first: NDArray[np.int32],
+    graph: Graph,
+) -> NDArray[np.int32]:
+    """Join regions that turned to those of the same label beside them: new number of each.
+
+    Keeps their order, and `region`, `order` and `first` as `_regions` would have them.
+    """
+    regions = region.max() + 1
+    # The first of the regions that each one is joined to, a root of trees.
+    parent = np.arange(regions)
+    for r in turned:
+        for p in order[first[r] : first[r + 1]]:
+            for e in range(graph.start[p], graph.start[p + 1]):
+                q = graph.neighbours[e]
+                if labels[q] == labels[p]:
+                    a, b = r, region[q]
+                    while parent[a] != a:
+                        a = parent[a]
+                    while parent[b] != b:
+                        b = parent[b]
+                    parent[max(a, b)] = min(a, b)
+    number = np.empty(regions, np.int32)
+    count = 0
+    for r in range(regions):
+        if parent[r] == r:
+            number[r] = count
+            count += 1
+        else:
+            number[r] = number[parent[r]]
+    first[: count + 1] = 0
+    for p in range(len(region)):
+        region[p] = number[region[p]]
+        first[region[p] + 1] += 1
+    for r in range(count):
+        first[r + 1] += first[r]
+    place = first[:count].copy()
+    for p in range(len(region)):
+        order[place[region[p]]] = p
+        place[region[p]] += 1
+    return number
 
 
 @njit(cache=True)
