@@ -29,7 +29,7 @@ TILE = 8
 # What quarters may save and yet be one piece, as a share of the prior of the edges between them.
 _KEEP = 0.16
 # Borders of pieces run in steps: so much shorter are those that pixels draw in the end.
-_SHORTER = 0.95
+SHORTER = 0.95
 _SPLIT = np.float32(_KEEP / UNIT)
 
 
@@ -94,7 +94,7 @@ def pieces(
     below = image[tiles // 2 * TILE :]
     np.add(below, len(above), out=below, where=below >= 0)
     votes = np.concatenate([above, under])
-    graph = aside(adjacency, image, len(votes), horizontal, vertical, _SHORTER * smoothness)
+    graph = aside(adjacency, image, len(votes), horizontal, vertical, SHORTER * smoothness)
     costs = np.empty((len(votes), len(directions)), np.uint16)
     strips(_sum_up, tiles, image, cells, table, costs)
     return Pieces(image, costs, votes, graph.result())
