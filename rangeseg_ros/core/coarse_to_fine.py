@@ -18,6 +18,9 @@ from rangeseg_ros.core.piece_expansion import expand
 from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
 from rangeseg_ros.core.region_moves import settle, turn
 
+# Shares of the smoothness under which regions grow, one after the other: under all of it at once,
+# those that come first swallow what would have grown together beside them.
+_SHARES = 0.5, 0.75, 1.0
 # Pixels that labels advance in the end, not counting those that gain by so many degrees.
 _REACH, _ODD = 4, 15.0
 # Share of the pixels where the data may speak against the labels of the image before.
@@ -54,16 +57,17 @@ def minimise(
     """
     parts = pieces(normals, directions, horizontal, vertical, smoothness)
     warm = None if before is None else _warm(parts, before)
-    state = (parts.votes.copy() if warm is None else warm), parts.costs, parts.graph
-    for _ in range(2 if warm is None else 1):
-        settle(*state)
-        turn(*state)
-    expand(*state)
-    turn(*state)
+    labels, costs, graph = parts.votes.copy() if warm is None else warm, parts.costs, parts.graph
+    for share in _SHARES if warm is None else _SHARES[-1:]:
+        eased = graph._replace(links=np.float32(share) * graph.links)
+        settle(labels, costs, eased)
+        turn(labels, costs, eased)
+    expand(labels, costs, graph)
+    turn(labels, costs, graph)
     # Any label will do where neither an edge nor a normal is.
-    labels = np.append(state[0], np.int32(0))[parts.image]
-    _refine(labels, normals, directions, horizontal, vertical, smoothness)
-    return labels.astype(np.intp)
+    result = np.append(labels, np.int32(0))[parts.image]
+    _refine(result, normals, directions, horizontal, vertical, smoothness)
+    return result.astype(np.intp)
 
 
 def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | None:
