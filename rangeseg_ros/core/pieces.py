@@ -27,7 +27,7 @@ UNIT = np.float32(0.25)
 # Pixels across the tiles.
 TILE = 8
 # What quarters may save and yet be one piece, as a share of the prior of the edges between them.
-_KEEP = 0.16
+_KEEP = 0.18
 # Borders of pieces run in steps: so much shorter are those that pixels draw in the end.
 SHORTER = 0.95
 _SPLIT = np.float32(_KEEP / UNIT)
