@@ -24,6 +24,9 @@ from rangeseg_ros.core.threads import aside
 _NEAR = 4
 # What a label must save at a stray, as a share of its links; and half of what the best one saves.
 _STRAY = np.float32(0.1)
+# Gains that are stuck are as much as an expansion can save: it is left if they come to less than
+# this share of the energy.
+_LEAST = 3e-5
 # Steps that a gain may flow, and from where it is stuck to pieces that may switch with it.
 _STEPS, _REACH = 3, 3
 
@@ -75,13 +78,16 @@ def expand(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -
     m = len(graph.links)
     scratch = _Scratch(np.full(n, -1, np.int32), np.zeros(m, np.float32), np.empty(m, np.int32))
     state = _State(labels, *_sums(labels, costs, graph))
+    least = _LEAST * float(state.data.sum() + state.unlike.sum() / 2)
     frequency = np.bincount(labels, minlength=count)
     order = np.argsort(-frequency, kind='stable')[: np.count_nonzero(frequency)]
     pending = aside(_columns, costs, order)
     start, strays = _strays(labels, costs, graph)
     for alpha, column in zip(order.tolist(), pending.result(), strict=True):
         suited = strays[start[alpha] : start[alpha + 1]]
-        sites, excess, first, second, link = _problem(alpha, column, suited, state, graph, scratch)
+        sites, excess, first, second, link = _problem(
+            alpha, column, suited, least, state, graph, scratch
+        )
         if not len(sites):
             continue
         chosen = minimum_cut(excess, first, second, link)
@@ -230,8 +236,8 @@ def _stuck(
     labels: NDArray[np.int32],
     graph: Graph,
     scratch: _Scratch,
-) -> NDArray[np.int32]:
-    """Pieces of those tried whose gain the pieces about them cannot take up.
+) -> tuple[NDArray[np.int32], float]:
+    """Pieces of those tried whose gain the pieces about them cannot take up, and what is left.
 
     Gains (excess below 0) flow by push and relabel (Goldberg and Tarjan, JACM 1988) to pieces
     that lose (above 0), no more than `_STEPS` steps. A flow changes no minimum cut: where
@@ -300,7 +306,10 @@ def _stuck(
                 break
     for e in pushed[:pushes]:
         flow[e] = flow[back[e]] = 0
-    return result[:count]
+    gain = 0.0
+    for p in result[:count]:
+        gain -= rest[p]
+    return result[:count], gain
 
 
 @njit(cache=True)
@@ -308,6 +317,7 @@ def _problem(
     alpha: int,
     column: NDArray[np.uint16],
     strays: NDArray[np.int32],
+    least: float,
     state: _State,
     graph: Graph,
     scratch: _Scratch,
@@ -318,12 +328,17 @@ def _problem(
     NDArray[np.int32],
     NDArray[np.float64],
 ]:
-    """Pieces that may switch, their excess, ends of the edges between them, and their links."""
+    """Pieces that may switch, their excess, ends of the edges between them, and their links.
+
+    None where no more than `least` can be gained.
+    """
     start, neighbours, links = graph.start, graph.neighbours, graph.links
     labels, place = state.labels, scratch.place
     excess = _excess(alpha, column, state, graph)
     tried = _tried(alpha, strays, labels, graph, place)
-    stuck = _stuck(alpha, tried, excess, labels, graph, scratch)
+    stuck, gain = _stuck(alpha, tried, excess, labels, graph, scratch)
+    if gain < least:
+        stuck = stuck[:0]
     sites = np.empty(len(labels) if len(stuck) else 0, np.int32)
     for s in range(len(stuck)):
         sites[s] = stuck[s]
