@@ -5,8 +5,9 @@ import pytest
 
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.expansion import grouped
+from rangeseg_ros.core.octahedral import UNIT
 from rangeseg_ros.core.piece_expansion import expand
-from rangeseg_ros.core.pieces import UNIT, pieces
+from rangeseg_ros.core.pieces import pieces
 from rangeseg_ros.core.region_moves import turn
 
 DIRECTIONS = directions('platonic', 73)

@@ -12,9 +12,11 @@ import pytest
 from rangeseg_ros.core import coarse_to_fine
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle
+from rangeseg_ros.core.octahedral import UNIT
 from rangeseg_ros.core.piece_expansion import expand
-from rangeseg_ros.core.pieces import SHORTER, TILE, UNIT, pieces
+from rangeseg_ros.core.pieces import SHORTER, pieces
 from rangeseg_ros.core.region_moves import settle, turn
+from rangeseg_ros.core.tiles import TILE
 
 DIRECTIONS = directions('platonic', 73)
 

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.energy import angles, degrees, mixed_angles, site_angle
 from rangeseg_ros.core.expansion import Choice, band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
+from rangeseg_ros.core.octahedral import UNIT
 from rangeseg_ros.core.piece_expansion import expand
-from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
+from rangeseg_ros.core.pieces import Pieces, pieces
 from rangeseg_ros.core.region_moves import settle, turn
 from rangeseg_ros.core.threads import halves
 

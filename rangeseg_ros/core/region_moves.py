@@ -11,8 +11,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.moves import ROUNDING
+from rangeseg_ros.core.octahedral import UNIT
 from rangeseg_ros.core.piece_graph import Graph
-from rangeseg_ros.core.pieces import UNIT
 from rangeseg_ros.core.threads import strips
 
 
