@@ -118,3 +118,22 @@ def test_warm_start_from_another_scene_does_no_harm(seed):
     other = coarse_to_fine.minimise(*problem(seed + 20)[0])
     warm = coarse_to_fine.minimise(*arguments, other)
     assert np.array_equal(warm, coarse_to_fine.minimise(*arguments))
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_labels_give_way_to_those_beside_them_that_suit_all_their_pixels_better(seed):
+    (normals, *_), label = problem(seed)
+    before = np.random.default_rng(seed).integers(0, len(DIRECTIONS), 7).astype(np.int32)[label]
+    image = before.copy()
+    coarse_to_fine._replace(image, normals, DIRECTIONS)
+    vectors = DIRECTIONS.astype(np.float32)
+    # Which of those equally far are among them is left open.
+    cosines = vectors @ vectors.T
+    reach = np.sort(cosines, axis=1)[:, -8]
+    for old in np.unique(before):
+        own = before == old
+        costs = np.array([angle(normals[own].T, v).sum(dtype=float) for v in vectors])
+        new = np.unique(image[own])
+        assert len(new) == 1 and cosines[old, new[0]] >= reach[old] - 1e-6
+        nearer = cosines[old] > reach[old] + 1e-6
+        assert costs[new[0]] <= costs[nearer].min() + 1e-4 * own.sum()

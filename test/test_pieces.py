@@ -12,8 +12,11 @@ import pytest
 from rangeseg_ros.core import coarse_to_fine
 from rangeseg_ros.core.directions import directions
 from rangeseg_ros.core.energy import angle
-from rangeseg_ros.core.piece_moves import PieceLabelling
-from rangeseg_ros.core.pieces import TILE, UNIT, pieces
+from rangeseg_ros.core.octahedral import UNIT
+from rangeseg_ros.core.piece_expansion import expand
+from rangeseg_ros.core.pieces import SHORTER, pieces
+from rangeseg_ros.core.region_moves import settle, turn
+from rangeseg_ros.core.tiles import TILE
 
 DIRECTIONS = directions('platonic', 73)
 
@@ -68,13 +71,16 @@ def test_links_are_sums_over_the_borders_and_costs_over_the_pixels(seed):
         (vertical, image[:-1], image[1:]),
     ):
         border = (weight > 0) & (one != other)
-        np.add.at(links, (one[border], other[border]), smoothness * weight[border])
+        np.add.at(links, (one[border], other[border]), SHORTER * smoothness * weight[border])
     links += links.T
-    listed = np.zeros_like(links)
+    listed, graph = np.zeros_like(links), parts.graph
     for p in range(count):
-        for e in range(parts.start[p], parts.start[p + 1]):
-            assert listed[p, parts.neighbours[e]] == 0
-            listed[p, parts.neighbours[e]] = parts.links[e]
+        for e in range(graph.start[p], graph.start[p + 1]):
+            q = graph.neighbours[e]
+            assert listed[p, q] == 0
+            assert graph.neighbours[graph.back[e]] == p
+            assert graph.start[q] <= graph.back[e] < graph.start[q + 1]
+            listed[p, q] = graph.links[e]
     np.testing.assert_allclose(listed, links, rtol=1e-5)
     inside, sizes = image >= 0, np.bincount(image[image >= 0], minlength=count)
     for k in (0, 17, 72):
@@ -87,18 +93,19 @@ def test_links_are_sums_over_the_borders_and_costs_over_the_pixels(seed):
 
 def value(parts, labels):
     data = UNIT * parts.costs[np.arange(len(labels)), labels].astype(float)
-    one = np.repeat(np.arange(len(labels)), np.diff(parts.start))
-    return data.sum() + parts.links[labels[one] != labels[parts.neighbours]].sum(dtype=float) / 2
+    graph = parts.graph
+    one = np.repeat(np.arange(len(labels)), np.diff(graph.start))
+    return data.sum() + graph.links[labels[one] != labels[graph.neighbours]].sum(dtype=float) / 2
 
 
 @pytest.mark.parametrize('seed', range(10))
 def test_no_step_raises_the_energy(seed):
     parts = pieces(*problem(seed))
-    labelling = PieceLabelling(parts, parts.votes.copy())
-    last = value(parts, labelling.labels)
-    for step in ('settle', 'turn', 'expand', 'turn', 'expand', 'settle', 'expand'):
-        getattr(labelling, step)()
-        now = value(parts, labelling.labels)
+    labels = parts.votes.copy()
+    last = value(parts, labels)
+    for step in (settle, turn, expand, turn, expand, settle, expand):
+        step(labels, parts.costs, parts.graph)
+        now = value(parts, labels)
         assert now <= last + 0.01
         last = now
 
@@ -106,16 +113,15 @@ def test_no_step_raises_the_energy(seed):
 @pytest.mark.parametrize('seed', range(10))
 def test_regions_take_the_best_label_of_all(seed):
     parts = pieces(*problem(seed))
-    labelling = PieceLabelling(parts, parts.votes.copy())
-    labelling.turn()
-    settled = labelling.labels.copy()
+    settled, graph = parts.votes.copy(), parts.graph
+    turn(settled, parts.costs, graph)
     best = value(parts, settled)
     # Each connected piece of a label, grown from a few seeds.
     for seed_piece in range(0, len(settled), 7):
         region, front = {seed_piece}, [seed_piece]
         while front:
             p = front.pop()
-            for q in parts.neighbours[parts.start[p] : parts.start[p + 1]]:
+            for q in graph.neighbours[graph.start[p] : graph.start[p + 1]]:
                 if q not in region and settled[q] == settled[p]:
                     region.add(q)
                     front.append(q)
@@ -133,19 +139,19 @@ def test_expansion_of_two_labels_on_few_pieces_is_the_optimum(seed):
     parts = pieces(normals, found[[3, 40]], horizontal, vertical, smoothness)
     count = len(parts.votes)
     assert count <= 16
-    labelling = PieceLabelling(parts, parts.votes.copy())
+    labels, graph = parts.votes.copy(), parts.graph
     for _ in range(4):
-        labelling.turn()
-        labelling.expand()
+        turn(labels, parts.costs, graph)
+        expand(labels, parts.costs, graph)
     every = (np.arange(2**count)[:, None] >> np.arange(count)) & 1
     data = UNIT * parts.costs.astype(float)
     total = np.where(every, data[:, 1], data[:, 0]).sum(axis=1)
     for p in range(count):
-        for e in range(parts.start[p], parts.start[p + 1]):
-            q = parts.neighbours[e]
+        for e in range(graph.start[p], graph.start[p + 1]):
+            q = graph.neighbours[e]
             if q > p:
-                total += parts.links[e] * (every[:, p] != every[:, q])
-    assert value(parts, labelling.labels) == pytest.approx(total.min(), abs=0.01)
+                total += graph.links[e] * (every[:, p] != every[:, q])
+    assert value(parts, labels) == pytest.approx(total.min(), abs=0.01)
 
 
 def labels_of_a_small_problem():

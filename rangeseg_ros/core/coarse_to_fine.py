@@ -11,14 +11,22 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.energy import angles, mixed_angles, site_angle
-from rangeseg_ros.core.expansion import band, choice, fronts, grid_links
+from rangeseg_ros.core.energy import angles, degrees, mixed_angles, site_angle
+from rangeseg_ros.core.expansion import Choice, band, choice, fronts, grid_links
 from rangeseg_ros.core.moves import ROUNDING
-from rangeseg_ros.core.piece_moves import PieceLabelling
-from rangeseg_ros.core.pieces import UNIT, Pieces, pieces
+from rangeseg_ros.core.octahedral import UNIT
+from rangeseg_ros.core.piece_expansion import expand
+from rangeseg_ros.core.pieces import Pieces, pieces
+from rangeseg_ros.core.region_moves import settle, turn
+from rangeseg_ros.core.threads import halves
 
+# Shares of the smoothness under which regions grow, one after the other: under all of it at once,
+# those that come first swallow what would have grown together beside them.
+_SHARES = 0.4, 0.6, 0.8, 1.0
 # Pixels that labels advance in the end, not counting those that gain by so many degrees.
 _REACH, _ODD = 4, 15.0
+# A label and those beside it.
+_BESIDE = 8
 # Share of the pixels where the data may speak against the labels of the image before.
 _ANEW = 0.25
 
@@ -53,16 +61,18 @@ def minimise(
     """
     parts = pieces(normals, directions, horizontal, vertical, smoothness)
     warm = None if before is None else _warm(parts, before)
-    labelling = PieceLabelling(parts, parts.votes if warm is None else warm)
-    for _ in range(2 if warm is None else 1):
-        labelling.settle()
-        labelling.turn()
-    labelling.expand()
-    labelling.turn()
+    labels, costs, graph = parts.votes.copy() if warm is None else warm, parts.costs, parts.graph
+    for share in _SHARES if warm is None else _SHARES[-1:]:
+        eased = graph._replace(links=np.float32(share) * graph.links)
+        settle(labels, costs, eased)
+        turn(labels, costs, eased)
+    expand(labels, costs, graph)
+    turn(labels, costs, graph)
     # Any label will do where neither an edge nor a normal is.
-    labels = np.append(labelling.labels, np.int32(0))[parts.image]
-    _refine(labels, normals, directions, horizontal, vertical, smoothness)
-    return labels.astype(np.intp)
+    result = np.append(labels, np.int32(0))[parts.image]
+    _refine(result, normals, directions, horizontal, vertical, smoothness)
+    _replace(result, normals, directions)
+    return result.astype(np.intp)
 
 
 def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | None:
@@ -74,8 +84,8 @@ def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | Non
     labels, every = parts.votes.copy(), np.arange(len(parts.votes))
     inside = parts.image >= 0
     labels[parts.image[inside]] = before[inside]
-    links = np.concatenate([[0.0], np.cumsum(parts.links, dtype=float)])
-    bound = (links[parts.start[1:]] - links[parts.start[:-1]]) / 2
+    links = np.concatenate([[0.0], np.cumsum(parts.graph.links, dtype=float)])
+    bound = (links[parts.graph.start[1:]] - links[parts.graph.start[:-1]]) / 2
     lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
     against = lost > bound
     if against[parts.image[inside]].sum() > _ANEW * inside.sum():
@@ -101,11 +111,64 @@ def _refine(
     start, beside = fronts(labels, links, width, len(vectors))
     for alpha in np.flatnonzero(np.diff(start)).tolist():
         front = beside[start[alpha] : start[alpha + 1]]
-        front = _onward(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
-        near = band(alpha, front, _REACH, labels, links, width, position)
-        new = angles(near, sites, vectors[alpha])
-        move = choice(alpha, near, new, labels, data, links, width, position)
+        move = _move(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
         move.make(alpha, labels, data, ROUNDING)
+
+
+def _replace(
+    image: NDArray[np.int32], normals: NDArray[np.float32], directions: NDArray[np.floating]
+) -> None:
+    """Replace labels by those beside them where that suits all of their pixels better, in place.
+
+    The costs of pieces, which are those of cells, cannot tell labels so close from each other.
+    """
+    vectors = directions.astype(np.float32)
+    near = np.argsort(-(vectors @ vectors.T), axis=1, kind='stable')[:, :_BESIDE]
+    # (K, 3, m): the labels beside one next to each other, for the compiler to take all at a time.
+    beside = np.ascontiguousarray(vectors[near].transpose(0, 2, 1))
+    upper, lower = halves(_costs_beside, len(image), image, normals, beside)
+    best = (upper + lower).argmin(axis=1)
+    image[...] = near[np.arange(len(near)), best].astype(np.int32)[image]
+
+
+@njit(cache=True, nogil=True)
+def _costs_beside(
+    first: int,
+    after: int,
+    image: NDArray[np.int32],
+    normals: NDArray[np.float32],
+    beside: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Data costs (K, m) of directions (K, 3, m) at the pixels that have each label."""
+    total = np.zeros((len(beside), beside.shape[2]))
+    for i in range(first, after):
+        for j in range(image.shape[1]):
+            x, y, z = normals[i, j, 0], normals[i, j, 1], normals[i, j, 2]
+            if x == x:
+                k = np.uint32(image[i, j])
+                for m in range(beside.shape[2]):
+                    cosine = x * beside[k, 0, m] + y * beside[k, 1, m] + z * beside[k, 2, m]
+                    total[k, m] += degrees(cosine)
+    return total
+
+
+@njit(cache=True)
+def _move(
+    alpha: int,
+    front: NDArray[np.int32],
+    normals: NDArray[np.float32],
+    direction: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    data: NDArray[np.float32],
+    links: NDArray[np.float32],
+    width: int,
+    position: NDArray[np.int32],
+) -> Choice:
+    """Expansion of a label by the pixels about its front."""
+    front = _onward(alpha, front, normals, direction, labels, data, links, width, position)
+    near = band(alpha, front, _REACH, labels, links, width, position)
+    new = angles(near, normals, direction)
+    return choice(alpha, near, new, labels, data, links, width, position)
 
 
 @njit(cache=True)

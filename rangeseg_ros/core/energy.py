@@ -63,7 +63,7 @@ class AngularCost:
 
 
 @njit(cache=True, inline='always')
-def _degrees(cosine: np.float32) -> np.float32:
+def degrees(cosine: np.float32) -> np.float32:
     """Arc cosine in degrees, 0 for NaN; Abramowitz and Stegun 4.4.46, to 2e-8 rad.
 
     Without branches and calls, so that the compiler can make eight at a time.
@@ -87,14 +87,14 @@ def site_angle(normals: NDArray[np.float32], a: float, b: float, c: float) -> np
     """Angles of the direction (a, b, c) to the normals (3, m) of a site, degrees, summed."""
     total = np.float32(0)
     for k in range(normals.shape[1]):
-        total += _degrees(normals[0, k] * a + normals[1, k] * b + normals[2, k] * c)
+        total += degrees(normals[0, k] * a + normals[1, k] * b + normals[2, k] * c)
     return total
 
 
 @njit(cache=True)
 def _to_degrees(cosine: NDArray[np.float32]) -> None:
     for k in range(len(cosine)):
-        cosine[k] = _degrees(cosine[k])
+        cosine[k] = degrees(cosine[k])
 
 
 @njit(cache=True)

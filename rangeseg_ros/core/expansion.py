@@ -58,28 +58,31 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
     count : int
         Number of labels.
     """
-    # Pairs (p, q), then sorted by counting.
-    pairs = np.empty((2 * len(labels), 2), np.int32)
+    beside, sites = np.empty(4 * len(labels), np.int32), np.empty(4 * len(labels), np.int32)
     found = 0
     for p in range(len(labels)):
         here = labels[p]
         for k in range(2):
             q = p + (1 if k == 0 else width)
             if q < len(labels) and labels[q] != here and links[k, p] > 0:
-                pairs[found] = p, q
-                found += 1
-    pairs = pairs[:found]
+                beside[found], sites[found] = here, q
+                beside[found + 1], sites[found + 1] = labels[q], p
+                found += 2
+    return grouped(beside[:found], sites[:found], count)
+
+
+@njit(cache=True, nogil=True)
+def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
+    """Sort sites (N,) by their labels (N,), which are below `count`; of a label in order."""
     start = np.zeros(count + 2, np.int64)
-    for p, q in pairs:
-        start[labels[p] + 2] += 1
-        start[labels[q] + 2] += 1
+    for label in labels:
+        start[label + 2] += 1
     start = np.cumsum(start)
-    sites = np.empty(2 * found, np.int32)
-    for p, q in pairs:
-        for here, there in ((p, q), (q, p)):
-            sites[start[labels[here] + 1]] = there
-            start[labels[here] + 1] += 1
-    return start[: count + 1], sites
+    result = np.empty_like(sites)
+    for s in range(len(sites)):
+        result[start[labels[s] + 1]] = sites[s]
+        start[labels[s] + 1] += 1
+    return start[: count + 1], result
 
 
 @njit(cache=True)

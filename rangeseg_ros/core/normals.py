@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.threads import strips
 
 
 def observed_normals(
@@ -62,17 +63,26 @@ def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
     (H, W, 3) float32
         NaN where the pixel or one of its neighbours was not measured or lies outside the image.
     """
-    return _cross_product(image.inverse, image.rays, baseline)
+    normals = np.empty(image.rays.shape, np.float32)
+    strips(_cross_product, len(normals), image.inverse, image.rays, baseline, normals)
+    return normals
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cross_product(
-    inverse: NDArray[np.float32], rays: NDArray[np.float32], reach: int
-) -> NDArray[np.float32]:
-    normals = np.full(rays.shape, np.nan, np.float32)
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    reach: int,
+    normals: NDArray[np.float32],
+) -> None:
+    """Normals of some rows."""
+    height, width = inverse.shape
+    normals[first:after] = np.float32(np.nan)
     u, v = np.empty(3), np.empty(3)
-    for i in range(reach, inverse.shape[0] - reach):
-        for j in range(reach, inverse.shape[1] - reach):
+    for i in range(max(first, reach), min(after, height - reach)):
+        for j in range(reach, width - reach):
             left, right = inverse[i, j - reach], inverse[i, j + reach]
             upper, lower = inverse[i - reach, j], inverse[i + reach, j]
             if min(left, right, upper, lower, inverse[i, j]) <= 0:
@@ -90,7 +100,6 @@ def _cross_product(
                 normals[i, j, 0] = x * scale
                 normals[i, j, 1] = y * scale
                 normals[i, j, 2] = z * scale
-    return normals
 
 
 def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
