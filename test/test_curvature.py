@@ -50,6 +50,13 @@ def test_planes_are_not_curved():
         assert verdict(inverse, regions, 0.5, seed).tolist() == [False] * 3
 
 
+def test_regions_of_too_few_pixels_for_a_plane_are_not_curved():
+    regions = np.zeros(CAMERA.shape, int)
+    regions[100, 100], regions[110, 110:118], regions[111, 111] = 1, 2, 3
+    inverse = CAMERA.rays @ np.array([0.1, 0, 0.5])
+    assert verdict(inverse, regions).tolist() == [False] * 4
+
+
 @pytest.mark.parametrize('radius', [0.15, 0.3])
 def test_cylinders_are_curved(radius):
     inverse = cylinder(radius)

@@ -123,12 +123,14 @@ def _normal_equations(
         j = 0
         while j < width:
             label = regions[i, j]
-            if label == 0:
+            plane = theta[label]
+            slope = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+            # No region, or one of too few pixels for a plane.
+            if slope == 0:
                 j += 1
                 continue
             # Along a run of the row only x varies: its powers are all there is to sum.
-            plane = theta[label]
-            distance = 1 / np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
+            distance = 1 / slope
             p0 = p1 = p2 = p3 = p4 = v0 = v1 = v2 = squares = metres = deviations = 0.0
             while j < width and regions[i, j] == label:
                 ray = rays[i, j]
