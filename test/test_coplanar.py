@@ -8,7 +8,6 @@ from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.coplanar import parts, touching
 from rangeseg_ros.core.fits import Fits
 from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.regions import united
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import QUANTUM
 
@@ -74,8 +73,19 @@ def test_a_row_of_parts_does_not_bend_a_plane_round():
     assert len(set(groups(regions, bent, *linked()))) > 2
 
 
-def test_united_regions_are_numbered_by_size():
-    regions = np.array([[1, 1, 1, 0], [2, 2, 3, 3], [4, 4, 4, 0]], np.uint16)
-    group = np.array([0, 1, 2, 2, 0])
-    expected = [[2, 2, 2, 0], [1, 1, 1, 1], [0, 0, 0, 0]]
-    np.testing.assert_array_equal(united(regions, group), expected)
+def test_the_plane_of_united_parts_is_that_of_the_whole():
+    regions = stripes(0, 70, 120, 160)
+    regions[:40, :40] = 0
+    regions[80:, 130:] = 4
+    noise = 0.45 * QUANTUM * np.random.default_rng(3).standard_normal(CAMERA.shape)
+    inverse = inverse_range(SIDE) + noise.astype(np.float32)
+    image = RangeImage(CAMERA.rays, inverse, CAMERA)
+    whole = Fits.of((regions > 0).astype(np.uint16), image, KINECT)
+    united = Fits.of(regions, image, KINECT).united(np.array([0, 1, 1, 1, 1]), True)
+    np.testing.assert_array_equal(united.pixels, whole.pixels)
+    np.testing.assert_array_equal(united.boxes(), whole.boxes())
+    np.testing.assert_allclose(united.explained, whole.explained, rtol=1e-3, atol=1e-3)
+    # The seams are no rims of the whole, and noise does not end there.
+    sigma = np.sqrt(np.diag(whole.covariance[1]))
+    assert (np.abs(united.theta[1] - whole.theta[1]) < 0.2 * sigma).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(united.covariance[1])), sigma, rtol=0.1)

@@ -153,7 +153,10 @@ def _difference(fits: Fits, k: int, m: int, limit: float) -> float:
     value = _chi_squared(apart, both)
     if value > limit:
         return value
-    common = pairs(fits.cells, k, fits.theta[k], m, fits.theta[m], fits.systematic)
+    common = np.zeros((3, 3))
+    for a in fits.parts[fits.start[k] : fits.start[k + 1]]:
+        for b in fits.parts[fits.start[m] : fits.start[m + 1]]:
+            common += pairs(fits.cells, a, fits.theta[k], b, fits.theta[m], fits.systematic)
     common = _product(_product(fits.inverse[k], common), fits.inverse[m])
     return _chi_squared(apart, both - common - common.T)
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from rangeseg_ros.core.cells import POINT, SCATTER, Cells, variances
 from rangeseg_ros.core.moments import COUNT, SIZE, fit_all
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.core.uncertainty import Field, theta_covariances
+from rangeseg_ros.core.uncertainty import Field, pairs, theta_covariances
 
 # Sine of the angle at which no surface is seen any more.
 _GRAZING = 1e-3
@@ -23,7 +24,9 @@ class Fits(NamedTuple):
     Attributes
     ----------
     cells : Cells
-        Sums over the pixels that were fitted.
+        Sums over the pixels that were fitted, of the parts that the regions consist of.
+    parts, start : (P,), (M + 2,) int
+        Region k consists of the parts from start[k] to start[k + 1].
     pixels : (M + 1,) int
         Number of measured pixels.
     outliers : (M + 1,) int
@@ -42,6 +45,8 @@ class Fits(NamedTuple):
     """
 
     cells: Cells
+    parts: NDArray[np.intp]
+    start: NDArray[np.intp]
     pixels: NDArray[np.intp]
     outliers: NDArray[np.intp]
     explained: NDArray[np.float64]
@@ -77,17 +82,78 @@ class Fits(NamedTuple):
         pixels = sums[:, COUNT].astype(np.intp)
         cells, outliers, explained = cells.without_doubtful(labels, image, _theta(sums), errors)
         sums = cells.regions()
-        theta = _theta(sums)
-        if image.camera is None:
-            theta = _total_least_squares(sums, theta)
-        found = theta.any(axis=1)
-        inverse = np.zeros((len(theta), 3, 3))
-        inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
+        theta, inverse = _solved(sums, image.camera is not None)
         covariance = theta_covariances(cells, theta, inverse, sensor, errors)
         systematic = Field(sensor.distortion_length, errors[2], errors[3])
-        return cls(
-            cells, pixels, outliers, explained, theta, inverse, covariance, errors, systematic
+        parts, start = np.arange(len(theta)), np.arange(len(theta) + 1)
+        counts = pixels, outliers, explained
+        return cls(cells, parts, start, *counts, theta, inverse, covariance, errors, systematic)
+
+    def united(self, group: NDArray[np.integer], central: bool) -> Fits:
+        """Planes of regions united to groups.
+
+        Parameters
+        ----------
+        group : (M + 1,) int
+            Group of each region, 0...N; 0 for none.
+        central : bool
+            Whether the image was seen from one centre, as by a camera.
+        """
+        count = int(group.max(initial=0)) + 1
+        sums = _total(self.cells.regions(), group, count)
+        theta, inverse = _solved(sums, central)
+        normal = symmetric(self.cells.regions()[:, :6])
+        middle = _total(normal @ self.covariance @ normal, group, count)
+        for k in np.flatnonzero(np.bincount(group)[1:] > 1) + 1:
+            for a, b in combinations(np.flatnonzero(group == k).tolist(), 2):
+                # The errors of two regions agree where they are smooth.
+                common = pairs(self.cells, a, self.theta[a], b, self.theta[b], self.systematic)
+                middle[k] += common + common.T
+        return self._replace(
+            parts=np.argsort(group, kind='stable'),
+            start=np.concatenate([[0], np.cumsum(np.bincount(group, minlength=count))]),
+            pixels=_total(self.pixels, group, count),
+            outliers=_total(self.outliers, group, count),
+            explained=_total(self.explained, group, count),
+            theta=theta,
+            inverse=inverse,
+            covariance=inverse @ middle @ inverse,
         )
+
+    def regions_of_parts(self) -> NDArray[np.intp]:
+        """Region (P,) that each part belongs to."""
+        region = np.empty_like(self.parts)
+        region[self.parts] = np.repeat(np.arange(len(self.theta)), np.diff(self.start))
+        return region
+
+    def boxes(self) -> NDArray[np.intp]:
+        """Bounding boxes (M + 1, 4), see `Cells.box`."""
+        box, first = self.cells.box[self.parts], self.start[:-1]
+        return np.concatenate(
+            [np.minimum.reduceat(box[:, :2], first), np.maximum.reduceat(box[:, 2:], first)],
+            axis=1,
+        )
+
+
+def _total(values: NDArray[Any], group: NDArray[np.integer], count: int) -> NDArray[Any]:
+    """Sums over groups; zeros for group 0."""
+    result = np.zeros((count, *values.shape[1:]), values.dtype)
+    np.add.at(result, group, values)
+    result[0] = 0
+    return result
+
+
+def _solved(
+    sums: NDArray[np.float64], central: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Planes (M + 1, 3) of sums (M + 1, 25), and the inverses of their normal matrices."""
+    theta = _theta(sums)
+    if not central:
+        theta = _total_least_squares(sums, theta)
+    found = theta.any(axis=1)
+    inverse = np.zeros((len(theta), 3, 3))
+    inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
+    return theta, inverse
 
 
 def symmetric(triangle: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY, Cells
+from rangeseg_ros.core.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
 from rangeseg_ros.core.coplanar import common_surfaces
 from rangeseg_ros.core.extents import areas_and_axes, rectangles
 from rangeseg_ros.core.fits import Fits, symmetric
@@ -118,7 +118,7 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     list of Plane
         In the order of the labels.
     """
-    cells, theta, sums = fits.cells, fits.theta, fits.explained
+    theta, sums = fits.theta, fits.explained
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []
@@ -137,7 +137,7 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     square += distance * (2 * offset + distance)
     rms = np.sqrt(np.maximum(square, 0))
     centroid = centroid - (offset + distance)[:, None] * normal
-    expected = distance**2 * _expected_square(cells, theta, fits.variances)
+    expected = distance**2 * _expected_square(fits)
     share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
     confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
 
@@ -150,6 +150,7 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     frames = np.stack([axes[found, 0], axes[found, 1], normal[found]], axis=2)
     orientation = Rotation.from_matrix(frames).as_quat()
     orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
+    boxes = fits.boxes()
     return [
         Plane(
             label=int(k),
@@ -166,17 +167,16 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
             extents=extents[index],
             centre=centre[index],
             orientation=orientation[index],
-            outline=_outline(int(k), labels, image, cells.box[k], theta[k]),
+            outline=_outline(int(k), labels, image, boxes[k], theta[k]),
         )
         for index, k in enumerate(found)
     ]
 
 
-def _expected_square(
-    cells: Cells, theta: NDArray[np.float64], errors: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _expected_square(fits: Fits) -> NDArray[np.float64]:
     """Mean square distance from the planes, over distance^2, that the sensor's errors make."""
-    region = np.repeat(np.arange(len(theta)), np.diff(cells.start))
+    cells, theta, errors = fits.cells, fits.theta, fits.variances
+    region = np.repeat(fits.regions_of_parts(), np.diff(cells.start))
     count, weight = cells.sums[:, COUNT], cells.sums[:, WEIGHT]
     ray = cells.sums[:, WEIGHTED_RAY:WEIGHT]
     level = (ray * theta[region]).sum(axis=1) / np.where(count > 0, weight, 1)

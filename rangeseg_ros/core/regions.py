@@ -43,7 +43,7 @@ def plane_regions(
             area = np.bincount(regions.ravel(), minlength=len(area))
         area = np.where(noise, 0, area)
     area[0] = 0
-    return _translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
+    return translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
 
 
 @njit(cache=True)
@@ -254,17 +254,10 @@ def without(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[
     """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
     kept = ~dropped
     kept[0] = False
-    return _translated(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
+    return translated(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
 
 
-def united(regions: NDArray[np.uint16], group: NDArray[np.intp]) -> NDArray[np.uint16]:
-    """Number groups of regions 0...M 1...N by falling size; `group` (M + 1,) is 0 for none."""
-    area = np.bincount(group, np.bincount(regions.ravel(), minlength=len(group)), len(group))
-    area[0] = 0
-    return _translated(regions, by_falling_size(area)[group])
-
-
-def by_falling_size(area: NDArray[np.number]) -> NDArray[np.uint16]:
+def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
     """New number of each region: 1...M by falling size, 0 for size 0; at most 65535."""
     order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]
     table = np.zeros(len(area), np.uint16)
@@ -273,7 +266,8 @@ def by_falling_size(area: NDArray[np.number]) -> NDArray[np.uint16]:
 
 
 @njit(cache=True)
-def _translated(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def translated(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Regions (H, W) by another name: `table` (M + 1,) uint16 has the new number of each."""
     result = np.empty(regions.shape, np.uint16)
     for i in range(regions.shape[0]):
         for j in range(regions.shape[1]):

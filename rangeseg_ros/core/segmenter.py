@@ -28,6 +28,7 @@ from rangeseg_ros.core.energy import angle, energy
 from rangeseg_ros.core.fits import Fits
 from rangeseg_ros.core.growing import surfaces
 from rangeseg_ros.core.jump_edges import jump_edges
+from rangeseg_ros.core.memory import keep_freed_memory
 from rangeseg_ros.core.neighbourhood import weights
 from rangeseg_ros.core.normals import observed_normals
 from rangeseg_ros.core.plane_energy import Problem
@@ -35,7 +36,7 @@ from rangeseg_ros.core.plane_energy import energy as plane_energy
 from rangeseg_ros.core.planes import Plane, described
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.refinement import refine
-from rangeseg_ros.core.regions import plane_regions, rejoined, united, without
+from rangeseg_ros.core.regions import by_falling_size, plane_regions, rejoined, translated, without
 from rangeseg_ros.core.sensor import SensorModel
 from rangeseg_ros.core.threads import aside
 
@@ -84,6 +85,7 @@ class Segmenter:
             self.config.directions, self.config.direction_count, self.config.seed
         )
         self.reset()
+        keep_freed_memory()
 
     def reset(self) -> None:
         """Forget the frame before, from which `warm_start` begins."""
@@ -186,8 +188,11 @@ def _united(
     group = parts(fits, edges.result())
     if (group == np.arange(count)).all():
         return regions, fits
-    regions = united(regions, group)
-    return regions, Fits.of(regions, image, sensor)
+    pixels = np.zeros(count, np.intp)
+    np.add.at(pixels, group, fits.pixels)
+    pixels[0] = 0
+    table = by_falling_size(pixels)[group]
+    return translated(regions, table), fits.united(table, image.camera is not None)
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:
