@@ -11,7 +11,7 @@ from rangeseg_ros.core.plane_energy import Problem
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.simulation.kinect import QUANTUM, simulate_kinect, smooth_field
 from rangeseg_ros.simulation.scenes import curved_scene
 from rangeseg_ros.simulation.truth import NOT_PLANAR

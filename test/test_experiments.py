@@ -11,8 +11,8 @@ from test_evaluate import CAMERA, depth_and_truth, segcomp_set
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import experiments, plots
-from rangeseg_ros.evaluation.hoover import Overlap
 from rangeseg_ros.evaluation.measure import Measurement, Task
+from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.params import read_config, read_params
 

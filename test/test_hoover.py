@@ -5,15 +5,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rangeseg_ros.evaluation.hoover import (
-    ComparisonError,
-    Overlap,
-    RegionClass,
-    angle_errors,
-    classify,
-    overlap_figures,
-    plane_errors,
-)
+from rangeseg_ros.evaluation.hoover import RegionClass, classify
+from rangeseg_ros.evaluation.overlap import ComparisonError, Overlap, overlap_figures
+from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
 
 def overlap(*runs):

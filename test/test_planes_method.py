@@ -14,8 +14,9 @@ from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.evaluation.hoover import classify, overlap_figures
+from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
+from rangeseg_ros.evaluation.overlap import overlap_figures
 from rangeseg_ros.io.images import read_depth, write_image
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room

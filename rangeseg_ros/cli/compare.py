@@ -8,7 +8,6 @@ import click
 
 from rangeseg_ros.cli import measures, options
 from rangeseg_ros.evaluation.figures import Compared, compared, table
-from rangeseg_ros.evaluation.hoover import ComparisonError
 from rangeseg_ros.evaluation.label_files import (
     as_truth,
     pair_files,
@@ -16,6 +15,7 @@ from rangeseg_ros.evaluation.label_files import (
     read_label_image,
     read_normals_beside,
 )
+from rangeseg_ros.evaluation.overlap import ComparisonError
 
 
 @click.command(cls=measures.ToleranceCommand)

@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from rangeseg_ros.evaluation.figures import TOLERANCES, as_json
-from rangeseg_ros.evaluation.hoover import check_tolerance
+from rangeseg_ros.evaluation.overlap import check_tolerance
 from rangeseg_ros.io.files import replacing
 
 

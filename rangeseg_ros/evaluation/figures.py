@@ -9,15 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rangeseg_ros.evaluation.hoover import (
-    Classification,
-    Overlap,
-    angle_errors,
-    classify,
-    overlap_figures,
-    plane_errors,
-)
+from rangeseg_ros.evaluation.hoover import Classification, classify
 from rangeseg_ros.evaluation.measure import Measurement
+from rangeseg_ros.evaluation.overlap import Overlap, overlap_figures
+from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
 TOLERANCES = (0.51, 0.6, 0.7, 0.8, 0.9, 0.95)
 COUNTS = ('regions', 'correct', 'over', 'under', 'missed', 'noise')

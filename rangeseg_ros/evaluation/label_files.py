@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.segcomp import (
     FIRST_REGION,
     RegionAngle,

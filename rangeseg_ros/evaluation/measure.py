@@ -14,7 +14,8 @@ import rangeseg_ros.core
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
-from rangeseg_ros.evaluation.hoover import Overlap, classify
+from rangeseg_ros.evaluation.hoover import classify
+from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
 from rangeseg_ros.evaluation.segcomp import (
     MAX_REGIONS,

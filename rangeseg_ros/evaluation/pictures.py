@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.evaluation.datasets import Sample
-from rangeseg_ros.evaluation.hoover import Classification, Overlap, RegionClass
+from rangeseg_ros.evaluation.hoover import Classification, RegionClass
+from rangeseg_ros.evaluation.overlap import Overlap
 
 # White, green and grey are those of figures C.1 and 6.6; the others are ours.
 CORRECT, OVER, UNDER = (255, 255, 255), (80, 200, 80), (90, 130, 255)

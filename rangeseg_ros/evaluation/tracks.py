@@ -21,7 +21,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.tracking import Tracker
-from rangeseg_ros.evaluation.hoover import Overlap
+from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
