@@ -39,8 +39,8 @@ def random_case(seed, height, width, count=3):
     edges = weights(image)
     for edge in edges:
         edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
-    # Half of chi-squared, three pixels counting as one measurement, one to four variances granted.
-    models = Models(theta, 0.5 / 3 / np.concatenate([[1.0], random.uniform(1, 4, count)]))
+    # Half of chi-squared, one to four variances granted.
+    models = Models(theta, 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)]))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
     return Problem.of(image, SENSOR, *edges, BLOCK), models, labels.astype(np.int32)
 
@@ -48,8 +48,8 @@ def random_case(seed, height, width, count=3):
 def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
     residual = problem.inverse - models.theta @ problem.rays.T
-    cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0 / 3)
-    cost[0] = 6.0 / 3
+    cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0)
+    cost[0] = 6.0
     return np.where(problem.weight > 0, cost, 0).reshape(len(cost), -1, problem.width)
 
 

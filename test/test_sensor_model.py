@@ -84,3 +84,13 @@ def test_never_below_the_stated(inverse, residual, noise, range_noise):
     assert sensor.noise >= noise and sensor.range_noise >= range_noise
     assert np.isfinite(sensor.variance(inverse)).all()
     assert sensor == replace(stated, noise=sensor.noise, range_noise=sensor.range_noise)
+
+
+@pytest.mark.parametrize(('white', 'width'), [(1.0, 2.0), (0.33, 2.0), (0.0, 0.7), (0.5, 0.0)])
+def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width):
+    sensor = replace(STATED, white=white, correlation=width)
+    rows, columns = np.indices((2, 2)).reshape(2, 4)
+    squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
+    field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
+    covariance = white * np.eye(4) + (1 - white) * field
+    assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)
