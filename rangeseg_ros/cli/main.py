@@ -7,6 +7,8 @@ from importlib import import_module
 
 import click
 
+from rangeseg_ros.cli import interrupts
+
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
     'segment': 'Segment depth images into planes.',
@@ -46,6 +48,7 @@ def rangeseg() -> None:
 
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
+    interrupts.watch()
     try:
         # Without its standalone mode click returns the code that a command exits with.
         sys.exit(rangeseg.main(prog_name='rangeseg', standalone_mode=False))
@@ -55,5 +58,7 @@ def main() -> None:
     except (ValueError, OSError) as error:
         print(f'rangeseg: {error}', file=sys.stderr)
         sys.exit(2)
-    except (KeyboardInterrupt, click.Abort):
+    except (KeyboardInterrupt, SystemError, click.Abort) as error:
+        if isinstance(error, SystemError) and not interrupts.received():
+            raise
         sys.exit(130)

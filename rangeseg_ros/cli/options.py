@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import click
 from tqdm import tqdm
 
+from rangeseg_ros.cli import interrupts
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.params import read_config
 
@@ -49,8 +50,10 @@ depth_scale: Callable[..., Any] = click.option(
 
 def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
     """Show the progress through `items` on a terminal, and nothing elsewhere."""
-    bar: Iterable[T] = tqdm(items, total=total, unit=unit, disable=None)
-    return bar
+    with tqdm(items, total=total, unit=unit, disable=None) as bar:
+        for item in bar:
+            yield item
+            interrupts.check()
 
 
 def read_parameters(params_file: Path | None, exact: bool) -> Config:

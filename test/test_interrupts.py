@@ -1,0 +1,42 @@
+"""Ctrl-C ends commands, whatever becomes of the exception it raises."""
+
+import subprocess
+import sys
+from textwrap import dedent
+
+import pytest
+
+PRELUDE = """
+    import os, signal
+    import click
+    from rangeseg_ros.cli import main, options
+    def loop():
+        for item in options.progress(range(3), 3, 'item'):
+            print(item, flush=True)
+            BODY
+    main.rangeseg = click.Command('rangeseg', callback=loop)
+    main.main()
+"""
+LOST = """try: os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt: pass"""
+WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt as error: raise SystemError('in a kernel') from error"""
+NONE = "raise SystemError('without a reason')"
+
+
+def run(body):
+    script = dedent(PRELUDE.replace('BODY', body))
+    return subprocess.run(
+        [sys.executable, '-c', script], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+@pytest.mark.parametrize('body', [LOST, WRAPPED], ids=['lost', 'wrapped'])
+def test_an_interrupt_ends_the_command(body):
+    done = run(body)
+    assert (done.returncode, done.stdout, done.stderr) == (130, '0\n', '')
+
+
+def test_other_system_errors_are_shown():
+    done = run(NONE)
+    assert done.returncode == 1 and 'without a reason' in done.stderr
