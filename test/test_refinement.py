@@ -1,5 +1,6 @@
 """Planes as labels: energy, descent and expansions against literal sums and exhaustive search."""
 
+from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -128,6 +129,17 @@ def test_weights_are_inverse_variances():
     measured = problem.inverse > 0
     np.testing.assert_allclose(problem.weight[measured], 1 / NOISE**2, rtol=1e-5)
     assert not problem.weight[~measured].any()
+
+
+def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
+    image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
+    white = replace(SENSOR, correlation=0.0)
+    links, of_white = (
+        Problem.of(image, sensor, *weights(image), BLOCK).links for sensor in (SENSOR, white)
+    )
+    assert SENSOR.patch > 2 and white.patch == 1
+    np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
+    assert of_white.max() > 0
 
 
 @pytest.mark.parametrize('seed', range(5))
