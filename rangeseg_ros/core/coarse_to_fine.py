@@ -2,7 +2,7 @@
 
 The energy of labellings that are constant on pieces is minimised: regions of pieces take labels
 as wholes, then the labels in use are expanded. Last, labels are expanded by some pixels about
-their boundaries.
+their boundaries, and give way to those beside them where these suit better.
 """
 
 from __future__ import annotations
