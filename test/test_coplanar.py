@@ -48,7 +48,9 @@ def test_what_a_jump_or_a_gap_parts_stays_apart():
     regions, (horizontal, vertical) = stripes(0, 70, 160), linked()
     horizontal[:, 69] = 0
     assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 1, 2]
-    horizontal[60, 69] = 1
+    horizontal[:40, 69] = 1  # a gap in the jump
+    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 1, 2]
+    horizontal[:60, 69] = 1
     assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 2, 2]
     regions[:, 69] = 0
     assert groups(regions, inverse_range(WALL), *linked()) == [0, 1, 2]

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.fits import Fits
 from rangeseg_ros.core.uncertainty import pairs
 
+# Pairs of regions and how much links them, see `touching`.
+Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
+
 # Quantile 0.99 of chi-squared with the three degrees of freedom of a plane, and what the parts of
 # a face differ by beyond their errors, as factor of variances: the residue of bands, of grazing
 # views and of ragged borders, from 239 pairs of parts in simulated rooms (median 2.9). Of 725
@@ -48,8 +51,8 @@ def touching(
     horizontal: NDArray[np.floating],
     vertical: NDArray[np.floating],
     count: int,
-) -> NDArray[np.intp]:
-    """Which regions touch across an edge that is no jump.
+) -> Stretches:
+    """Where regions touch, and whether jumps are between them.
 
     Parameters
     ----------
@@ -62,47 +65,70 @@ def touching(
 
     Returns
     -------
-    (N,) int
+    pairs : (N,) int
         k * count + m for regions k and m, both ways round; some repeatedly.
+    balance : (N,) int
+        Edges that link the two less those that a jump cuts, along a stretch of their border.
     """
     height, width = regions.shape
-    # Along a border most pixels tell what the one before has told.
-    told = np.zeros((2, count), np.intp)
-    found = [0]
-    found.clear()
+    # What the stretch at hand leads to: along a border most pixels lead where the one before does.
+    other, links = np.zeros((2, count), np.intp), np.zeros((2, count), np.intp)
+    pairs, balance = [0], [0]
+    pairs.clear()
+    balance.clear()
     for i in range(height):
         for j in range(width):
             k = int(regions[i, j])
             for axis in range(2):
                 if axis == 0:
-                    linked = j + 1 < width and horizontal[i, j] > 0
-                    m = int(regions[i, j + 1]) if linked else k
+                    m = int(regions[i, j + 1]) if j + 1 < width else k
+                    linked = m != k and horizontal[i, j] > 0
                 else:
-                    linked = i + 1 < height and vertical[i, j] > 0
-                    m = int(regions[i + 1, j]) if linked else k
-                if m != k and min(k, m) > 0 and told[axis, k] != m:
-                    told[axis, k] = m
-                    found.append(k * count + m)
-                    found.append(m * count + k)
-    return np.array(found, np.intp)
+                    m = int(regions[i + 1, j]) if i + 1 < height else k
+                    linked = m != k and vertical[i, j] > 0
+                if m == k or min(k, m) == 0:
+                    continue
+                if other[axis, k] != m:
+                    _tell(k, other[axis, k], links[axis, k], count, pairs, balance)
+                    other[axis, k], links[axis, k] = m, 0
+                links[axis, k] += 1 if linked else -1
+    for axis in range(2):
+        for k in range(count):
+            _tell(k, other[axis, k], links[axis, k], count, pairs, balance)
+    return np.array(pairs, np.intp), np.array(balance, np.intp)
 
 
-def parts(fits: Fits, edges: NDArray[np.intp]) -> NDArray[np.intp]:
+@njit(cache=True, nogil=True)
+def _tell(k: int, m: int, links: int, count: int, pairs: list[int], balance: list[int]) -> None:
+    """Note a stretch of border between regions k and m, 0 for none."""
+    if m > 0:
+        pairs.append(k * count + m)
+        pairs.append(m * count + k)
+        balance.append(links)
+        balance.append(links)
+
+
+def parts(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """Group regions that touch and whose planes agree, as `common_surfaces` does.
+
+    Regions touch where jumps cut no more than half of their common border: between a step and
+    what is behind it there may be gaps in the jump.
 
     Parameters
     ----------
     fits : Fits
         Of M + 1 regions.
-    edges : (N,) int
-        Which of them touch, see `touching`.
+    stretches : two (N,) int
+        Of their borders, see `touching`.
 
     Returns
     -------
     (M + 1,) int
         Label of the largest region of the group; 0 where there is no plane.
     """
-    return _groups_of_touching(_by_falling_size(fits), fits, np.unique(edges))
+    edges, place = np.unique(stretches[0], return_inverse=True)
+    links = np.bincount(place, stretches[1], len(edges))
+    return _groups_of_touching(_by_falling_size(fits), fits, edges[links >= 0])
 
 
 def _by_falling_size(fits: Fits) -> NDArray[np.intp]:
