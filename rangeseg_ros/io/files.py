@@ -22,7 +22,12 @@ def replacing(path: Path) -> Iterator[Path]:
         yield folder / path.name
         os.replace(folder / path.name, path)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            shutil.rmtree(folder, ignore_errors=True)
+        except KeyboardInterrupt:
+            # It may come just here.
+            shutil.rmtree(folder, ignore_errors=True)
+            raise
 
 
 def natural_order(path: Path) -> list[str | int]:
