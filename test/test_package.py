@@ -91,3 +91,24 @@ def test_launcher_takes_the_python_of_its_prefix(tmp_path):
         env={'PATH': '/bin:/usr/bin'},
     )
     assert done.stdout.startswith('Usage: rangeseg'), done.stderr
+
+
+def test_the_digest_follows_every_source_of_the_package(tmp_path):
+    package = tmp_path / 'rangeseg_ros'
+    shutil.copytree(
+        ROOT / 'rangeseg_ros', package, ignore=shutil.ignore_patterns('*.nb*', '*.pyc')
+    )
+
+    def digest():
+        code = 'from rangeseg_ros.digest import code_digest; print(code_digest().hex())'
+        command = [sys.executable, '-c', code]
+        return subprocess.run(
+            command, cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout
+
+    seen = {digest()}
+    for name in ('core/config.py', 'io/planes.py', 'report/templates/replay.html'):
+        with (package / name).open('a') as file:
+            file.write('\n')
+        seen.add(digest())
+    assert len(seen) == 4

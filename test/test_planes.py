@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.confidence import confidence
 from rangeseg_ros.core.planes import fit_planes
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.sensor import SensorModel
@@ -165,21 +164,6 @@ def test_parts_of_one_plane_share_a_surface_and_steps_do_not():
     inverse = np.where(labels == 3, step, image.inverse)
     planes = fit_planes(labels, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
     assert [p.surface for p in planes] == [1, 1, 3]
-
-
-def test_confidence_is_low_at_creases_and_off_the_plane():
-    left, right = plane_image((0.6, 0, -0.8), 2.0), plane_image((-0.6, 0, -0.8), 2.0)
-    image = RangeImage(CAMERA.rays, np.maximum(left.inverse, right.inverse), CAMERA)
-    middle = CAMERA.width // 2
-    labels = boxes((0, 0, CAMERA.height, middle), (0, middle, CAMERA.height, CAMERA.width))
-    image.inverse[100, 100] += 20 * QUANTUM
-    image.inverse[100, 110] = 0
-    planes = fit_planes(labels, image, KINECT)
-    result = confidence(labels, image, planes, KINECT)
-    assert result[240, 200] == 252
-    assert result[100, 100] == 0 and result[100, 110] == 0
-    assert 120 <= result[240, middle] <= 135
-    assert confidence(np.zeros_like(labels), image, [], KINECT).max() == 0
 
 
 def test_camera_of_another_size():

@@ -15,8 +15,8 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.evaluation.measure import code_digest
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthFrame
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image

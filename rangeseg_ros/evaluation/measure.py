@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import asdict, dataclass, fields
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
-import rangeseg_ros.core
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.digest import code_digest
 from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
@@ -147,12 +146,3 @@ class Task:
         for path in (self.case.image, self.case.truth):
             digest.update(path.read_bytes())
         return digest.hexdigest()[:16]
-
-
-@cache
-def code_digest() -> bytes:
-    """Digest of the source of `core`, which decides every result."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(rangeseg_ros.core.__path__[0]).glob('*.py')):
-        digest.update(path.read_bytes())
-    return digest.digest()
