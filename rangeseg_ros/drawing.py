@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.core.description.planes import Plane
 
 
 def colours(ids: Sequence[int] | NDArray) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from rangeseg_ros.ros.messages import make_rclpy
+from rangeseg_ros.messages.make import make_rclpy
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import SUFFIXES, Recording, depth_images, record
 
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthBagWriter
 
 STORAGES = tuple(SUFFIXES)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.blocks import (
+from rangeseg_ros.core.by_planes.blocks import (
     block_links,
     block_moments,
     residual_noise,
@@ -11,8 +11,8 @@ from rangeseg_ros.core.blocks import (
     weighted,
 )
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.moments import COUNT, RATIO, SIZE, fit_all
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
 def grid(height, width, seed=0):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera
-from rangeseg_ros.core.camera import CameraError
+from rangeseg_ros.core.sensing.camera import CameraError
 
 K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
 P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core import coarse_to_fine, moves
-from rangeseg_ros.core.directions import directions
-from rangeseg_ros.core.energy import angle, angles, energy
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.graphcut import moves
+from rangeseg_ros.core.graphcut.energy import angle, angles, energy
 
 DIRECTIONS = directions('platonic', 73)
 

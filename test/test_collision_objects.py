@@ -16,8 +16,8 @@ from std_msgs.msg import Header
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.ros.messages import make_rclpy
-from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.messages.make import make_rclpy
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import kinect_camera
 
 REPOSITORY = Path(__file__).parents[1]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.evaluation import segcomp
+from rangeseg_ros.segcomp import files as segcomp
 
 
 @pytest.fixture

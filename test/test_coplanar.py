@@ -4,11 +4,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.coplanar import parts, touching
-from rangeseg_ros.core.fits import Fits
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.fitting.coplanar import parts, touching
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import QUANTUM
 
 KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.by_planes.curvature import curved
+from rangeseg_ros.core.by_planes.plane_energy import Problem
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.curvature import curved
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.plane_energy import Problem
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.simulation.kinect import QUANTUM, simulate_kinect, smooth_field
 from rangeseg_ros.simulation.scenes import curved_scene

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rangeseg_ros.io.depth_encodings import EncodingError, decode_compressed, decode_image
+from rangeseg_ros.messages.images import EncodingError, decode_compressed, decode_image
 
 
 @pytest.mark.parametrize('bigendian', [False, True])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.directions import DirectionsError, directions, platonic, regular
+from rangeseg_ros.core.by_normals.directions import DirectionsError, directions, platonic, regular
 
 
 @pytest.mark.parametrize(('subdivisions', 'count'), list(enumerate([4, 17, 73, 305, 1249])))

@@ -10,7 +10,7 @@ import pytest
 from test_replay_bags import record_walls, replay, results
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.parallel import run_on_cluster
+from rangeseg_ros.tasks import run_on_cluster
 
 COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 

@@ -9,9 +9,8 @@ import pytest
 from test_pcd import literal_lzf
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation import segcomp
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.evaluation.datasets import ScanCase, SegcompCase, find_cases
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.measure import Measurement, Task
@@ -23,9 +22,10 @@ from rangeseg_ros.evaluation.pictures import (
     OVER,
     class_picture,
 )
-from rangeseg_ros.evaluation.segcomp_geometry import abw_calibration
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.parallel import run_all
+from rangeseg_ros.segcomp import files as segcomp
+from rangeseg_ros.segcomp.geometry import abw_calibration
+from rangeseg_ros.tasks import run_all
 
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 # Two walls that meet in the vertical line x = 0, z = 2.

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.blocks import block_links, block_moments, weighted
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.by_planes.blocks import block_links, block_moments, weighted
+from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.growing import surfaces
-from rangeseg_ros.core.jump_edges import plane_deviation
-from rangeseg_ros.core.moments import COUNT, fit_all
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.jump_edges import plane_deviation
+from rangeseg_ros.core.sensing.moments import COUNT, fit_all
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 CAMERA = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
 ROWS, COLUMNS = np.indices(CAMERA.shape)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from message_classes import header, make_rosbags, needs_rclpy
 
 from rangeseg_ros import CameraError, RangeImage, planes_from_message
-from rangeseg_ros.ros.clouds import CloudError, points_from_message
-from rangeseg_ros.ros.messages import (
+from rangeseg_ros.messages.clouds import CloudError, points_from_message
+from rangeseg_ros.messages.make import (
     camera_from_message,
 )
 

@@ -4,9 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.jump_edges import beside, bridged, plane_deviation, sobel
-from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.jump_edges import beside, bridged, plane_deviation, sobel
+from rangeseg_ros.core.sensing.range_image import RangeImage
 
 STEP = 0.0044
 CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.kinect import (

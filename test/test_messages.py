@@ -8,15 +8,15 @@ from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import RangeImage, Segmentation, planes_from_message
-from rangeseg_ros.core.roles import ROLES
+from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
-from rangeseg_ros.ros.clouds import planes_message
-from rangeseg_ros.ros.markers import ARROW_LENGTH, markers_message
-from rangeseg_ros.ros.messages import (
+from rangeseg_ros.messages.clouds import planes_message
+from rangeseg_ros.messages.make import (
     depth_from_message,
     image_message,
 )
-from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.messages.markers import ARROW_LENGTH, markers_message
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import kinect_camera
 
 SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.moments import CHI2, COUNT, SIZE, fit, fit_all
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, SIZE, fit, fit_all
 
 
 def pixels(seed, count=200):

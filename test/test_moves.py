@@ -5,8 +5,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.energy import energy
-from rangeseg_ros.core.moves import Labelling
+from rangeseg_ros.core.graphcut.energy import energy
+from rangeseg_ros.core.graphcut.moves import Labelling
 
 
 class Grid:

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
 def image_of(depth):

@@ -15,10 +15,10 @@ from sensor_msgs.msg import Imu
 
 from rangeseg_ros import Camera, Config, RangeImage, planes_from_message
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.roles import ROLES
-from rangeseg_ros.ros.clouds import points_from_message
+from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.messages.clouds import points_from_message
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
-from rangeseg_ros.ros.outputs import OUTPUTS
 
 HEIGHT, WALL = 0.8, 3.0
 GRAVITY = 9.81

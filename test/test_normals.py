@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.normals import cross_product, observed_normals, plane_fit
-from rangeseg_ros.core.range_image import RangeImage
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
 
 CAMERA = Camera(40, 30, 50.0, 55.0, 19.0, 15.5)
 

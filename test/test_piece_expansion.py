@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.directions import directions
-from rangeseg_ros.core.expansion import grouped
-from rangeseg_ros.core.octahedral import UNIT
-from rangeseg_ros.core.piece_expansion import expand
-from rangeseg_ros.core.pieces import pieces
-from rangeseg_ros.core.region_moves import turn
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.octahedral import UNIT
+from rangeseg_ros.core.by_normals.piece_expansion import expand
+from rangeseg_ros.core.by_normals.pieces import pieces
+from rangeseg_ros.core.by_normals.region_moves import turn
+from rangeseg_ros.core.graphcut.expansion import grouped
 
 DIRECTIONS = directions('platonic', 73)
 

@@ -9,14 +9,14 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core import coarse_to_fine
-from rangeseg_ros.core.directions import directions
-from rangeseg_ros.core.energy import angle
-from rangeseg_ros.core.octahedral import UNIT
-from rangeseg_ros.core.piece_expansion import expand
-from rangeseg_ros.core.pieces import SHORTER, pieces
-from rangeseg_ros.core.region_moves import settle, turn
-from rangeseg_ros.core.tiles import TILE
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.octahedral import UNIT
+from rangeseg_ros.core.by_normals.piece_expansion import expand
+from rangeseg_ros.core.by_normals.pieces import SHORTER, pieces
+from rangeseg_ros.core.by_normals.region_moves import settle, turn
+from rangeseg_ros.core.by_normals.tiles import TILE
+from rangeseg_ros.core.graphcut.energy import angle
 
 DIRECTIONS = directions('platonic', 73)
 

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.planes import fit_planes
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import QUANTUM, kinect_camera
 
 KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)

@@ -10,10 +10,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import overlap_figures

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, RangeImage
-from rangeseg_ros.core.range_image import RangeImageError
+from rangeseg_ros.core.sensing.range_image import RangeImageError
 
 CAMERA = Camera(4, 3, 2.0, 3.0, 1.5, 1.0)
 

@@ -7,16 +7,17 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core import expansion, refinement
-from rangeseg_ros.core.blocks import block_links, block_moments, weighted
+from rangeseg_ros.core.by_planes import labelling as refinement
+from rangeseg_ros.core.by_planes.blocks import block_links, block_moments, weighted
+from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
+from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.growing import surfaces
-from rangeseg_ros.core.moments import RATIO
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.plane_energy import Models, Problem, costs, energy, region_moments
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import refine
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.graphcut import expansion
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.moments import RATIO
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 

@@ -18,8 +18,8 @@ from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.bags import BagError, DepthBag
 from rangeseg_ros.io.images import read_labels
-from rangeseg_ros.ros.clouds import planes_from_message
-from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.messages.clouds import planes_from_message
+from rangeseg_ros.messages.outputs import OUTPUTS
 
 DELAY = 5_000_000
 """Nanoseconds from the stamp of a message to its recording."""
@@ -124,7 +124,7 @@ def test_the_bag_is_readable_by_mcap(done):
 
 def test_messages_are_those_of_the_node(done):
     serialization = pytest.importorskip('rclpy.serialization')
-    from rangeseg_ros.ros.messages import make_rclpy
+    from rangeseg_ros.messages.make import make_rclpy
 
     written = [data for *_, data in read(done / 'plain/bag')]
     published = []

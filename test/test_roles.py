@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config, ConfigError
-from rangeseg_ros.core.planes import fit_planes
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.roles import ROLES, RolesError, roles
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.meaning.roles import ROLES, RolesError, roles
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.solids import box, half_space

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rangeseg_ros.evaluation import segcomp
-from rangeseg_ros.evaluation import segcomp_geometry as geometry
-from rangeseg_ros.evaluation.segcomp import SegcompError
+from rangeseg_ros.segcomp import files as segcomp
+from rangeseg_ros.segcomp import geometry as geometry
+from rangeseg_ros.segcomp.files import SegcompError
 
 READERS = (
     segcomp.read_raster,

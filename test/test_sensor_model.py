@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from rangeseg_ros.core.blocks import block_moments, residual_noise, slopes_and_residuals
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.by_planes.blocks import block_moments, residual_noise, slopes_and_residuals
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 CAMERA = Camera(320, 240, 290.0, 290.0, 159.5, 119.5)
 STATED = SensorModel.from_config(Config(noise=1e-5, range_noise=0.0))

@@ -5,10 +5,10 @@ import pytest
 from click.testing import CliRunner
 
 from rangeseg_ros.cli.simulate import command
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.evaluation import segcomp
-from rangeseg_ros.evaluation import segcomp_geometry as geometry
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.datasets import find_cases
+from rangeseg_ros.segcomp import files as segcomp
+from rangeseg_ros.segcomp import geometry as geometry
 from rangeseg_ros.simulation.scanners import (
     ABW_NOISE,
     ABW_PROJECTOR,

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.threads import aside, halves, strips
+from rangeseg_ros.core.runtime.threads import aside, halves, strips
 
 
 @pytest.fixture(params=[1, 2, 7])

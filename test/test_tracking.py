@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.planes import fit_planes
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.core.tracking import Tracker
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import Scene, kinect_room

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.camera import Camera
-from rangeseg_ros.core.planes import fit_planes
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.core.uncertainty import plane_jacobians
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import QUANTUM, smooth_field
 
 NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0

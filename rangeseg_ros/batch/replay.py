@@ -12,8 +12,8 @@ from pathlib import Path
 
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import overlay

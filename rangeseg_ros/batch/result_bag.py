@@ -14,11 +14,11 @@ from rosbags import rosbag2
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.typesys import Stores
 
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bags import BagError, DepthFrame
 from rangeseg_ros.io.recordings import message_types
-from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.messages.outputs import OUTPUTS
 
 NAMESPACE = '/segment_planes'
 """Name of the node that publishes the topics."""

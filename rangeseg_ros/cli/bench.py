@@ -11,7 +11,8 @@ from typing import Any
 
 import click
 
-from rangeseg_ros.cli import measures, options
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera

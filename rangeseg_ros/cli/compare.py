@@ -6,7 +6,8 @@ from pathlib import Path
 
 import click
 
-from rangeseg_ros.cli import measures, options
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.figures import Compared, compared, table
 from rangeseg_ros.evaluation.label_files import (
     as_truth,

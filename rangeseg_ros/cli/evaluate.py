@@ -6,13 +6,14 @@ from pathlib import Path
 
 import click
 
-from rangeseg_ros.cli import measures, options
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluated, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.io.params import read_config
-from rangeseg_ros.parallel import run_all
 from rangeseg_ros.report.evaluation import write_evaluation
+from rangeseg_ros.tasks import run_all
 
 
 @click.command(cls=measures.ToleranceCommand)

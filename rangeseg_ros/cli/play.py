@@ -77,7 +77,7 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float) -> Non
 
 def _publishers(node: Any, connections: list[Connection]) -> dict[str, Any]:
     """Publishers of the topics whose message classes are installed."""
-    from rangeseg_ros.ros.messages import message_class
+    from rangeseg_ros.messages.make import message_class
 
     publishers = {}
     for connection in connections:

@@ -12,10 +12,11 @@ from typing import Any
 import click
 
 from rangeseg_ros.batch.replay import Outcome, Replay
-from rangeseg_ros.cli import measures, options
-from rangeseg_ros.parallel import run_all, run_on_cluster
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli import tolerances as measures
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.replay import write_overview
-from rangeseg_ros.ros.outputs import OUTPUTS
+from rangeseg_ros.tasks import run_all, run_on_cluster
 
 
 @click.command()

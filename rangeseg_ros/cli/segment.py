@@ -9,8 +9,8 @@ import click
 
 from rangeseg_ros.batch.replay import write_pictures
 from rangeseg_ros.cli import options
-from rangeseg_ros.core.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import replacing

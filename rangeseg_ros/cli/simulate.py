@@ -11,17 +11,17 @@ import click
 import numpy as np
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.evaluation.segcomp import (
+from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.segcomp.files import (
     write_angles,
     write_perceptron,
     write_raster,
     write_segmentation,
 )
-from rangeseg_ros.evaluation.segcomp_geometry import abw_calibration
-from rangeseg_ros.io.bags import DepthBagWriter
-from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.images import write_image
+from rangeseg_ros.segcomp.geometry import abw_calibration
 from rangeseg_ros.simulation.kinect import NOISES, Frame, kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scanners import (
     Scan,

@@ -8,7 +8,8 @@ from typing import Any
 import click
 import numpy as np
 
-from rangeseg_ros.cli import measures, options
+from rangeseg_ros.cli import options
+from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.tracks import track_figures, track_rooms
 from rangeseg_ros.io.params import read_config
 

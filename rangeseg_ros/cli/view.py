@@ -11,8 +11,8 @@ import numpy as np
 
 from rangeseg_ros.batch.replay import segmented
 from rangeseg_ros.cli import options
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import colours, grey
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.files import replacing

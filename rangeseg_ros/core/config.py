@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from rangeseg_ros.core.directions import DirectionsError, check_count
+from rangeseg_ros.core.by_normals.directions import DirectionsError, check_count
 
 
 class ConfigError(ValueError):

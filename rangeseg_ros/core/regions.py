@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.threads import halves
+from rangeseg_ros.core.runtime.threads import halves
 
 
 def plane_regions(

@@ -10,8 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core import coarse_to_fine, moves
-from rangeseg_ros.core.blocks import (
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.normals import observed_normals
+from rangeseg_ros.core.by_planes.blocks import (
     block_links,
     block_moments,
     block_size,
@@ -19,26 +21,25 @@ from rangeseg_ros.core.blocks import (
     slopes_and_residuals,
     weighted,
 )
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.by_planes.curvature import curved
+from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.plane_energy import Problem
+from rangeseg_ros.core.by_planes.plane_energy import energy as plane_energy
+from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.coplanar import parts, touching
-from rangeseg_ros.core.curvature import curved
-from rangeseg_ros.core.directions import directions
-from rangeseg_ros.core.energy import angle, energy
-from rangeseg_ros.core.fits import Fits
-from rangeseg_ros.core.growing import surfaces
-from rangeseg_ros.core.jump_edges import jump_edges
-from rangeseg_ros.core.memory import keep_freed_memory
-from rangeseg_ros.core.neighbourhood import weights
-from rangeseg_ros.core.normals import observed_normals
-from rangeseg_ros.core.plane_energy import Problem
-from rangeseg_ros.core.plane_energy import energy as plane_energy
-from rangeseg_ros.core.planes import Plane, described
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.refinement import refine
+from rangeseg_ros.core.description.planes import Plane, described
+from rangeseg_ros.core.fitting.coplanar import parts, touching
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.graphcut import moves
+from rangeseg_ros.core.graphcut.energy import angle, energy
 from rangeseg_ros.core.regions import by_falling_size, plane_regions, rejoined, translated, without
-from rangeseg_ros.core.sensor import SensorModel
-from rangeseg_ros.core.threads import aside
+from rangeseg_ros.core.runtime.memory import keep_freed_memory
+from rangeseg_ros.core.runtime.threads import aside
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.jump_edges import jump_edges
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.planes import Plane
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.core.roles import roles
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.roles import roles
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
-from rangeseg_ros.core.tracking import Tracker
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.tracking.tracker import Tracker
 
 
 class SequenceSegmenter:

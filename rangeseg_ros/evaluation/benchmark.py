@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.camera import Camera
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.camera import Camera, CameraError
-from rangeseg_ros.core.range_image import RangeImage, RangeImageError
+from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.evaluation.label_files import (
     EvaluationError,
     Truth,
@@ -23,22 +23,22 @@ from rangeseg_ros.evaluation.label_files import (
     read_angles_beside,
     read_label_image,
 )
-from rangeseg_ros.evaluation.segcomp import (
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.io.pcd import PcdError, read_pcd
+from rangeseg_ros.segcomp.files import (
     FIRST_REGION,
     RegionAngle,
     SegcompError,
     read_perceptron,
     read_raster,
 )
-from rangeseg_ros.evaluation.segcomp_geometry import (
+from rangeseg_ros.segcomp.geometry import (
     abw_calibration,
     abw_range_image,
     perceptron_range_image,
 )
-from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import natural_order
-from rangeseg_ros.io.images import read_depth
-from rangeseg_ros.io.pcd import PcdError, read_pcd
 
 
 class Sample(NamedTuple):

@@ -18,7 +18,7 @@ from rangeseg_ros.evaluation.datasets import Case
 from rangeseg_ros.evaluation.figures import COUNTS, TOLERANCES
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.measure import Measurement, Task
-from rangeseg_ros.parallel import run_all
+from rangeseg_ros.tasks import run_all
 
 K = TypeVar('K')
 Row = dict[str, Any]

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.evaluation.overlap import Overlap
-from rangeseg_ros.evaluation.segcomp import (
+from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.images import read_labels
+from rangeseg_ros.segcomp.files import (
     FIRST_REGION,
     RegionAngle,
     from_segcomp,
@@ -18,8 +20,6 @@ from rangeseg_ros.evaluation.segcomp import (
     read_normals,
     read_segmentation,
 )
-from rangeseg_ros.io.files import natural_order
-from rangeseg_ros.io.images import read_labels
 
 NOT_PLANAR = 65535
 _SHIFT = FIRST_REGION - 1

@@ -16,14 +16,14 @@ from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
-from rangeseg_ros.evaluation.segcomp import (
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.segcomp.files import (
     MAX_REGIONS,
     to_segcomp,
     write_normals,
     write_segmentation,
 )
-from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.images import write_image
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.range_image import RangeImage
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.tracking import Tracker
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room

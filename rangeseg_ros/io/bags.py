@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from rosbags import rosbag2
 from rosbags.typesys import Stores
 
-from rangeseg_ros.core.camera import Camera, CameraError
-from rangeseg_ros.io.depth_encodings import (
+from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
+from rangeseg_ros.messages.images import (
     PIXEL_TYPES,
     EncodingError,
     decode_compressed,
     decode_image,
 )
-from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'

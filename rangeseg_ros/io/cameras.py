@@ -6,7 +6,7 @@ from pathlib import Path
 
 import yaml
 
-from rangeseg_ros.core.camera import Camera, CameraError
+from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.planes import Plane
+from rangeseg_ros.core.description.planes import Plane
 
 
 def _axes(field: str, axes: str) -> dict[str, Callable[[Any], Any]]:

@@ -10,10 +10,10 @@ from typing import Any
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from rangeseg_ros.core.camera import Camera, CameraError
-from rangeseg_ros.core.range_image import RangeImage
-from rangeseg_ros.ros.clouds import points_from_message
-from rangeseg_ros.ros.messages import camera_from_message, depth_from_message
+from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.messages.clouds import points_from_message
+from rangeseg_ros.messages.make import camera_from_message, depth_from_message
 from rangeseg_ros.ros.qos import MatchedSubscription
 
 IMAGE_TOPIC = 'depth/image_rect'

@@ -22,12 +22,12 @@ from rclpy.time import Time
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.messages.make import make_rclpy, message_class
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.gravity import Gravity
 from rangeseg_ros.ros.latest import Latest
-from rangeseg_ros.ros.messages import make_rclpy, message_class
-from rangeseg_ros.ros.outputs import OUTPUTS
 from rangeseg_ros.ros.parameters import NodeConfig, bind
 
 

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.camera import Camera
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.scenes import Scene
 from rangeseg_ros.simulation.solids import cast, cosine_of_incidence, lit
 from rangeseg_ros.simulation.truth import TruePlane, visible_regions

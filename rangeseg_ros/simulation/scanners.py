@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.evaluation.segcomp_geometry import (
+from rangeseg_ros.segcomp.geometry import (
     AbwCalibration,
     perceptron_rays,
     perceptron_values,

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.evaluation.segcomp import FIRST_REGION, RegionAngle, to_segcomp
+from rangeseg_ros.segcomp.files import FIRST_REGION, RegionAngle, to_segcomp
 from rangeseg_ros.simulation.scanners import Scan
 from rangeseg_ros.simulation.truth import TruePlane
 

@@ -1,0 +1,1 @@
+"""Method normals: labels are directions of normals, as in the thesis."""

@@ -1,0 +1,165 @@
+"""Observed surface normals (thesis 5.7): unit vectors towards the sensor."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+
+def observed_normals(
+    image: RangeImage,
+    horizontal: NDArray[np.floating],
+    vertical: NDArray[np.floating],
+    config: Config,
+) -> NDArray[np.float32]:
+    """Normals by the method that `config` names.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    horizontal, vertical : (H, W-1), (H-1, W) float
+        Neighbourhood weights, 0 where disconnected.
+    config : Config
+        `normals`, `normal_baseline`, `normal_radius` and `jump_edges` are read.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        Unit vectors, NaN where undefined. With jump edges by plane deviation, which lie between
+        pixels, that is also where a tangent crosses one.
+    """
+    if config.normals == 'plane_fit':
+        return plane_fit(image, config.normal_radius)
+    normals = cross_product(image, config.normal_baseline)
+    if config.jump_edges == 'plane':
+        reach = config.normal_baseline
+        broken = _within(horizontal <= 0, reach) | _within(vertical.T <= 0, reach).T
+        normals[broken] = np.nan
+    return normals
+
+
+def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
+    """Cross product of the tangents between the neighbours of a pixel (thesis 5.7.1).
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    baseline : int
+        Distance from the pixel to its left, right, upper and lower neighbour, pixels; 1 in the
+        thesis. The noise of the direction falls in proportion.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        NaN where the pixel or one of its neighbours was not measured or lies outside the image.
+    """
+    normals = np.empty(image.rays.shape, np.float32)
+    strips(_cross_product, len(normals), image.inverse, image.rays, baseline, normals)
+    return normals
+
+
+@njit(cache=True, nogil=True)
+def _cross_product(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    reach: int,
+    normals: NDArray[np.float32],
+) -> None:
+    """Normals of some rows."""
+    height, width = inverse.shape
+    normals[first:after] = np.float32(np.nan)
+    u, v = np.empty(3), np.empty(3)
+    for i in range(max(first, reach), min(after, height - reach)):
+        for j in range(reach, width - reach):
+            left, right = inverse[i, j - reach], inverse[i, j + reach]
+            upper, lower = inverse[i - reach, j], inverse[i + reach, j]
+            if min(left, right, upper, lower, inverse[i, j]) <= 0:
+                continue
+            for c in range(3):
+                u[c] = rays[i, j + reach, c] / right - rays[i, j - reach, c] / left
+                v[c] = rays[i + reach, j, c] / lower - rays[i - reach, j, c] / upper
+            x = u[2] * v[1] - u[1] * v[2]
+            y = u[0] * v[2] - u[2] * v[0]
+            z = u[1] * v[0] - u[0] * v[1]
+            facing = x * rays[i, j, 0] + y * rays[i, j, 1] + z * rays[i, j, 2]
+            length = math.sqrt(x * x + y * y + z * z)
+            if length > 0 and facing != 0:
+                scale = -math.copysign(1 / length, facing)
+                normals[i, j, 0] = x * scale
+                normals[i, j, 1] = y * scale
+                normals[i, j, 2] = z * scale
+
+
+def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
+    """Least-squares plane through a window of pixels (thesis 5.7.2).
+
+    The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse, so that the sums
+    of the normal equations are box filters over the image.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    radius : int
+        The window has 2 radius + 1 rows and columns.
+
+    Returns
+    -------
+    (H, W, 3) float32
+        NaN where the window holds a pixel that was not measured or lies outside the image.
+    """
+    window = 2 * radius + 1
+
+    def mean(product: NDArray[np.float64]) -> NDArray:
+        return cv2.boxFilter(product, cv2.CV_64F, (window, window), borderType=cv2.BORDER_CONSTANT)
+
+    valid = image.valid
+    a, b, c = (np.where(valid, ray, 0) for ray in cv2.split(image.rays.astype(np.float64)))
+    w = image.inverse.astype(np.float64)
+    aa, ab, ac, bb, bc, cc = (mean(p) for p in (a * a, a * b, a * c, b * b, b * c, c * c))
+    aw, bw, cw = (mean(p) for p in (a * w, b * w, c * w))
+    # Cramer's rule, without the determinant: the result is normalised anyhow.
+    normal = np.stack(
+        [
+            (bb * cc - bc * bc) * aw + (ac * bc - ab * cc) * bw + (ab * bc - ac * bb) * cw,
+            (ac * bc - ab * cc) * aw + (aa * cc - ac * ac) * bw + (ab * ac - aa * bc) * cw,
+            (ab * bc - ac * bb) * aw + (ab * ac - aa * bc) * bw + (aa * bb - ab * ab) * cw,
+        ],
+        axis=-1,
+    )
+    kernel = np.ones((window, window), np.uint8)
+    complete = cv2.erode(
+        valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
+    )
+    normal[complete == 0] = np.nan
+    return _towards_sensor(normal, image)
+
+
+def _towards_sensor(normals: NDArray, image: RangeImage) -> NDArray[np.float32]:
+    """Unit vectors against the rays; NaN for vectors without a direction."""
+    length = np.sqrt(np.einsum('ijk,ijk->ij', normals, normals))
+    facing = np.einsum('ijk,ijk->ij', normals, image.rays)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        scale = np.where(length > 0, -np.sign(facing) / length, np.nan)
+    scale[scale == 0] = np.nan
+    return (normals * scale[..., None]).astype(np.float32)
+
+
+def _within(edges: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
+    """Pixels (H, W) with an edge of (H, W-1) among the `reach` to their left or right."""
+    framed = np.pad(edges, ((0, 0), (reach, reach)))
+    kernel = np.ones((1, 2 * reach), np.uint8)
+    near = cv2.dilate(framed.astype(np.uint8), kernel, anchor=(reach, 0))
+    return near[:, reach : reach + edges.shape[1] + 1] > 0

@@ -1,0 +1,1 @@
+"""Method planes: labels are planes."""

@@ -1,0 +1,287 @@
+"""Planes as labels (thesis 5.1.2): every pixel takes the plane that explains it.
+
+Labelling and planes are improved in turn (PEARL; Isack and Boykov, IJCV 2012): relabelling lowers
+the energy (`plane_energy`) for the planes at hand, refitting lowers the residuals of the labelling
+at hand.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_planes.plane_energy import (
+    NO_PLANE,
+    Models,
+    Problem,
+    costs,
+    data_cost,
+    energy,
+    region_moments,
+)
+from rangeseg_ros.core.graphcut.expansion import Choice, Sites, band, choice, fronts
+from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+# An improvement smaller than this is rounding.
+_STEP = 1e-6
+# Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
+_REACH, _BAND = 2, 4
+# Blocks from a surface that its label is expanded to when exact. Its plane may well explain pixels
+# anywhere in the image, but these are rarely the surface's.
+_DOMAIN = 4
+
+
+def refine(
+    problem: Problem,
+    surfaces: NDArray[np.intp],
+    moments: NDArray[np.float64],
+    sensor: SensorModel,
+    exact: bool = False,
+    refits: int = 0,
+) -> tuple[NDArray[np.int32], Models]:
+    """Label the pixels with the planes of surfaces.
+
+    Parameters
+    ----------
+    problem : Problem
+    surfaces : (rows, columns) int
+        Surface of each block, 0...K, 0 for none.
+    moments : (K + 1, 13) float64
+        Of the surfaces.
+    sensor : SensorModel
+    exact : bool
+        Expand every label to all pixels within four blocks of its surface until no expansion
+        helps; otherwise every label once, near its boundaries.
+    refits : int
+        Rounds, at most, of fitting the planes to the labels and the labels to the planes again;
+        fewer when a round does not lower the energy, as a fit may: it does not know of the cap.
+
+    Returns
+    -------
+    labels : (n,) int32
+        0 = no plane.
+    models : Models
+        The planes the labelling was found for.
+    """
+    starts, models = surfaces.astype(np.int32), Models.of(moments)
+    labels, cost = _descended(problem, starts, models)
+    domains = _domains(starts, problem, len(moments)) if exact else None
+    _minimise(labels, cost, problem, models, domains)
+    value = energy(labels, problem, models) if refits else 0.0
+    for _ in range(refits):
+        shape = -1, problem.width
+        arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
+        weight = problem.weight.reshape(shape)
+        moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
+        refitted, better = Models.of(moments)._replace(price=models.price), labels.copy()
+        _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
+        last, value = value, energy(better, problem, refitted)
+        if value >= last - _STEP:
+            break
+        labels, models = better, refitted
+    return labels, models
+
+
+def _minimise(
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+    domains: Sites | None,
+) -> None:
+    """Expand the labels near their boundaries, or in their domains until none helps; in place."""
+    if domains is None:
+        near = fronts(labels, problem.links, problem.width, len(models.theta))
+        # No plane is not expanded: every pixel has had that choice, and it gains next to nothing.
+        _expand_each(range(1, len(models.theta)), labels, cost, problem, models, near, _BAND)
+        return
+    cost = costs(labels, problem, models)
+    every = range(len(models.theta))
+    while _expand_each(every, labels, cost, problem, models, domains, 1):
+        pass
+
+
+def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites:
+    """Pixels that each label may expand to: no plane all, others those near their surface."""
+    measured = problem.weight.reshape(-1, problem.width) > 0
+    height, width = measured.shape
+    window = np.ones(2 * [2 * _DOMAIN + 1], np.uint8)
+    domains = [np.flatnonzero(measured)]
+    for label in range(1, count):
+        blocks = cv2.dilate((surfaces == label).astype(np.uint8), window) > 0
+        pixels = blocks.repeat(problem.block, axis=0).repeat(problem.block, axis=1)
+        domains.append(np.flatnonzero(pixels[:height, :width] & measured))
+    start = np.cumsum([0, *map(len, domains)])
+    return start, np.concatenate(domains).astype(np.int32)
+
+
+def _descended(
+    problem: Problem, surfaces: NDArray[np.int32], models: Models
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
+    labels = np.zeros(len(problem.inverse), np.int32)
+    cost = np.zeros(len(labels), np.float32)
+    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
+    exact = surfaces.astype(np.float32)
+    least = cv2.erode(exact, window)
+    settled = (least > 0) & (least == cv2.dilate(exact, window))
+    strips(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
+    _descend(labels, cost, problem, models)
+    return labels, cost
+
+
+@njit(cache=True, nogil=True)
+def _take_nearest(
+    first: int,
+    after: int,
+    surfaces: NDArray[np.int32],
+    settled: NDArray[np.bool_],
+    problem: Problem,
+    models: Models,
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+) -> None:
+    """Give each pixel of rows of blocks the cheapest label among those of the blocks around it.
+
+    Costs in `settled` blocks, where no label competes, stay 0.
+    """
+    rows, columns = surfaces.shape
+    width, block = problem.width, problem.block
+    height = len(labels) // width
+    side = 2 * _REACH + 1
+    candidates = np.empty(side * side, np.int32)
+    for bi in range(first, after):
+        for bj in range(columns):
+            count = 0
+            around = 0 if settled[bi, bj] else _REACH
+            for i in range(max(bi - around, 0), min(bi + around + 1, rows)):
+                for j in range(max(bj - around, 0), min(bj + around + 1, columns)):
+                    label = surfaces[i, j]
+                    known = label == 0
+                    for k in range(count):
+                        known |= candidates[k] == label
+                    if not known:
+                        candidates[count] = label
+                        count += 1
+            for i in range(bi * block, min((bi + 1) * block, height)):
+                row = i * width
+                for p in range(row + bj * block, row + min((bj + 1) * block, width)):
+                    if problem.weight[p] == 0:
+                        continue
+                    if settled[bi, bj]:
+                        labels[p] = candidates[0]
+                        continue
+                    best, least = 0, np.float32(NO_PLANE)
+                    for k in range(count):
+                        value = np.float32(data_cost(candidates[k], p, problem, models))
+                        if value < least:
+                            best, least = candidates[k], value
+                    labels[p], cost[p] = best, least
+
+
+@njit(cache=True)
+def _descend(
+    labels: NDArray[np.int32], cost: NDArray[np.float32], problem: Problem, models: Models
+) -> None:
+    """Iterated conditional modes (Besag 1986): pixels take a neighbour's label where it pays.
+
+    In place, until no pixel changes. It leaves the energy in a poor local minimum, but one from
+    which the cuts have only the boundaries left to move.
+    """
+    offsets = np.array([1, problem.width, -1, -problem.width])
+    links = problem.links
+    around = np.zeros(4, np.int32)
+    link = np.zeros(4)
+    # A ring, long enough as no pixel is in it twice.
+    queue = np.empty(len(labels), np.int32)
+    queued = np.zeros(len(labels), np.bool_)
+    waiting = 0
+    for p in range(len(labels)):
+        for k in range(2):
+            q = p + offsets[k]
+            if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
+                for end in (p, q):
+                    if not queued[end]:
+                        queue[waiting] = end
+                        queued[end] = True
+                        waiting += 1
+    first, last = 0, waiting % len(queue)
+    while waiting > 0:
+        p = queue[first]
+        first = (first + 1) % len(queue)
+        waiting -= 1
+        queued[p] = False
+        here = labels[p]
+        least = np.float64(cost[p]) - _STEP
+        for k in range(4):
+            q = p + offsets[k]
+            link[k] = links[k % 2, min(p, q)]
+            around[k] = labels[q] if link[k] > 0 else here
+            if around[k] != here:
+                least += link[k]
+        for k in range(5):
+            label = around[k] if k < 4 else np.int32(0)
+            if label == here:
+                continue
+            data = np.float32(data_cost(int(label), int(p), problem, models))
+            total = np.float64(data)
+            for m in range(4):
+                if around[m] != label:
+                    total += link[m]
+            if total < least:
+                least, labels[p], cost[p] = total, label, data
+        if labels[p] == here:
+            continue
+        for k in range(4):
+            q = p + offsets[k]
+            if link[k] > 0 and not queued[q]:
+                queued[q] = True
+                queue[last] = q
+                last = (last + 1) % len(queue)
+                waiting += 1
+
+
+def _expand_each(
+    alphas: range,
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+    near: Sites,
+    reach: int,
+) -> bool:
+    """Expand each label once, to the pixels `near` it and by `reach` - 1 beyond; in place.
+
+    Whether that helped.
+    """
+    position = np.full(len(labels), -1, np.int32)
+    start, sites = near
+    helped = False
+    for alpha in alphas:
+        front = sites[start[alpha] : start[alpha + 1]]
+        move = _move(alpha, front, reach, labels, cost, problem, models, position)
+        helped |= move.make(alpha, labels, cost, _STEP)
+    return helped
+
+
+@njit(cache=True)
+def _move(
+    alpha: int,
+    front: NDArray[np.int32],
+    reach: int,
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+    position: NDArray[np.int32],
+) -> Choice:
+    """Expansion of one label from its front."""
+    links, width = problem.links, problem.width
+    sites = band(alpha, front, reach, labels, links, width, position)
+    new = np.empty(len(sites), np.float32)
+    for s in range(len(sites)):
+        new[s] = data_cost(alpha, int(sites[s]), problem, models)
+    return choice(alpha, sites, new, labels, cost, links, width, position)

@@ -1,0 +1,235 @@
+"""Blocks grow to patches small enough for the sensor's distortion to be nearly constant."""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
+
+# Quantile 0.999 of chi-squared with the three degrees of freedom of a plane, for pixels of
+# whose noise four agree.
+_NOISE = 16.0 * 4.0
+# Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
+# are merged at once.
+_CLEAR = 24.0
+WITHIN_PATCH = 2.0
+"""Systematic variances granted between blocks of a patch."""
+# Residuals of a block, in variances, beyond which it is no part of a plane.
+_ROUGH = 10.0
+
+
+@njit(cache=True, nogil=True)
+def patches(
+    first: int,
+    after: int,
+    moments: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    largest: float,
+) -> NDArray[np.intp]:
+    """Group some rows of blocks into patches.
+
+    Parameters
+    ----------
+    first, after : int
+        The rows.
+    moments : (rows, columns, 13) float64
+        Of blocks, weighted; zeros for blocks to leave out.
+    right, below : (rows, columns-1), (rows-1, columns) bool
+        Whether a block is connected to its right, its lower neighbour.
+    largest : float
+        Pixels of the largest patch.
+
+    Returns
+    -------
+    ((after - first) * columns,) int
+        Number of the block that stands for each block's patch, its own for a block in none.
+    """
+    shape = after - first, moments.shape[1]
+    blocks = moments[first:after].copy().reshape(-1, SIZE)
+    right, below = right[first:after], below[first : max(after - 1, first)]
+    theta = np.zeros(3)
+    residual = np.zeros(len(blocks))
+    smooth = np.zeros(len(blocks), np.bool_)
+    for a in range(len(blocks)):
+        residual[a] = fit(blocks[a], theta)
+        smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
+    pairs = _pairs(smooth.reshape(shape), right, below)
+    parent = _quads(blocks, residual, smooth.reshape(shape), right, below)
+    return _grow(blocks, residual, smooth, pairs, parent, largest) + first * shape[1]
+
+
+@njit(cache=True)
+def _pairs(
+    smooth: NDArray[np.bool_], right: NDArray[np.bool_], below: NDArray[np.bool_]
+) -> NDArray[np.intp]:
+    """Numbers of smooth blocks that touch, (N, 2)."""
+    rows, columns = smooth.shape
+    pairs = np.empty((2 * rows * columns, 2), np.intp)
+    count = 0
+    for i in range(rows):
+        for j in range(columns):
+            here = i * columns + j
+            if not smooth[i, j]:
+                continue
+            if j + 1 < columns and right[i, j] and smooth[i, j + 1]:
+                pairs[count] = here, here + 1
+                count += 1
+            if i + 1 < rows and below[i, j] and smooth[i + 1, j]:
+                pairs[count] = here, here + columns
+                count += 1
+    return pairs[:count]
+
+
+@njit(cache=True)
+def misfit(
+    extra: float, first: NDArray[np.float64], second: NDArray[np.float64], granted: float
+) -> float:
+    """How far two parts leave a common plane, in what noise and distortion are granted.
+
+    Parameters
+    ----------
+    extra : float
+        Chi-squared of the common plane less those of the parts' own.
+    first, second : (13,) float64
+        Moments of the parts.
+    granted : float
+        Systematic variances.
+
+    Returns
+    -------
+    float
+        1 is too far.
+    """
+    pixels = first[COUNT] + second[COUNT]
+    ratio = (first[RATIO] + second[RATIO]) / pixels
+    return extra / (_NOISE + granted * ratio * first[COUNT] * second[COUNT] / pixels)
+
+
+@njit(cache=True)
+def _quads(
+    moments: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    smooth: NDArray[np.bool_],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+) -> NDArray[np.intp]:
+    """Merge every 2 x 2 blocks that clearly lie on one plane; in place.
+
+    Most blocks do; merging these at once saves the queue of `_grow` most of its work. Returns
+    the parent of each block.
+    """
+    rows, columns = smooth.shape
+    parent = np.arange(rows * columns)
+    theta, total = np.zeros(3), np.zeros(SIZE)
+    for i in range(0, rows - 1, 2):
+        for j in range(0, columns - 1, 2):
+            if not (
+                smooth[i, j] and smooth[i, j + 1] and smooth[i + 1, j] and smooth[i + 1, j + 1]
+            ):
+                continue
+            if not (right[i, j] and right[i + 1, j] and below[i, j] and below[i, j + 1]):
+                continue
+            a = i * columns + j
+            apart = 0.0
+            total[:] = 0
+            for b in (a, a + 1, a + columns, a + columns + 1):
+                total += moments[b]
+                apart += residual[b]
+            together = fit(total, theta)
+            if together - apart < _CLEAR:
+                parent[a + 1] = parent[a + columns] = parent[a + columns + 1] = a
+                moments[a], residual[a] = total, together
+    return parent
+
+
+@njit(cache=True)
+def _grow(
+    moments: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    nodes: NDArray[np.bool_],
+    pairs: NDArray[np.intp],
+    parent: NDArray[np.intp],
+    largest: float,
+) -> NDArray[np.intp]:
+    """Merge blocks to patches of at most `largest` pixels, the flattest first, each with the
+    neighbour it fits best; in place.
+
+    Returns the root of each block's patch, itself for a block that is no node.
+    """
+    count = len(moments)
+    # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
+    head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
+    link = np.full(2 * len(pairs), -1, np.int32)
+    target = np.empty(2 * len(pairs), np.int32)
+    for e in range(2 * len(pairs)):
+        a, b = parent[pairs[e // 2, e % 2]], parent[pairs[e // 2, 1 - e % 2]]
+        target[e], link[e] = b, head[a]
+        head[a] = e
+        if tail[a] < 0:
+            tail[a] = e
+    version = np.zeros(count, np.int64)
+    heap = [(0.0, 0, 0)]
+    heap.pop()
+    for a in range(count):
+        if nodes[a] and parent[a] == a:
+            heappush(heap, (residual[a] / moments[a, COUNT], a, 0))
+    seen = np.full(count, -1, np.int32)
+    turn = 0
+    while len(heap) > 0:
+        _, a, age = heappop(heap)
+        if parent[a] != a or version[a] != age:
+            continue
+        turn += 1
+        best, partner = 1.0, -1
+        before, e = -1, head[a]
+        while e >= 0:
+            b = target[e]
+            while parent[b] != b:
+                parent[b] = parent[parent[b]]
+                b = parent[b]
+            target[e] = b
+            following = link[e]
+            if b == a or seen[b] == turn:
+                # An inner edge, or one more to the same patch.
+                if before < 0:
+                    head[a] = following
+                else:
+                    link[before] = following
+                if following < 0:
+                    tail[a] = before
+            else:
+                seen[b] = turn
+                before = e
+                if moments[a, COUNT] + moments[b, COUNT] <= largest:
+                    extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
+                    apart = misfit(extra, moments[a], moments[b], WITHIN_PATCH)
+                    if apart < best:
+                        best, partner = apart, b
+            e = following
+        if partner >= 0:
+            residual[a] = common_residual(moments[a], moments[partner])
+            moments[a] += moments[partner]
+            parent[partner] = a
+            if head[partner] >= 0:
+                link[tail[a]] = head[partner]
+                tail[a] = tail[partner]
+            version[a] += 1
+            heappush(heap, (residual[a] / moments[a, COUNT], a, version[a]))
+    return roots(parent)
+
+
+@njit(cache=True)
+def roots(parent: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
+    root = np.empty(len(parent), np.intp)
+    for a in range(len(parent)):
+        b = a
+        while parent[b] != b:
+            b = parent[b]
+        root[a] = b
+    return root

@@ -1,0 +1,212 @@
+"""What planes cost as labels: the energy of thesis eq. 5.3 with residuals for angles.
+
+The data cost of a plane is the squared residual in variances of the sensor, capped; label 0
+stands for what no plane explains and has a fixed cost; the prior is Potts over the neighbourhood
+weights.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
+from rangeseg_ros.core.graphcut.expansion import grid_links
+from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel
+
+# For each pixel that has to agree with its neighbour to count as one measurement.
+_SMOOTHNESS = 1.2
+NO_PLANE = 6.0
+"""Data cost of label 0."""
+_CAP = 8.0
+# Systematic variances granted to the pixels of a plane.
+_GRANTED = 2.0
+
+
+class Problem(NamedTuple):
+    """What the labelling has to explain: n pixels in raster order.
+
+    Attributes
+    ----------
+    inverse, rays : (n,), (n, 3) float32
+        Range image.
+    weight : (n,) float32
+        1 / random variance of the inverse range; 0 where nothing was measured.
+    links : (2, n) float32
+        Cost of unlike labels across the edges to the right and down, see `grid_links`.
+    width : int
+        Columns of the image.
+    block : int
+        Rows and columns of the blocks that surfaces are grown from.
+    """
+
+    inverse: NDArray[np.float32]
+    rays: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    links: NDArray[np.float32]
+    width: int
+    block: int
+
+    @classmethod
+    def of(
+        cls,
+        image: RangeImage,
+        sensor: SensorModel,
+        horizontal: NDArray[np.float32],
+        vertical: NDArray[np.float32],
+        block: int,
+    ) -> Problem:
+        """Weigh the pixels of an image by the noise of its sensor."""
+        inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
+        weight = _weights(inverse, sensor.noise, sensor.range_noise)
+        prior = grid_links(horizontal, vertical, _SMOOTHNESS * sensor.patch)
+        return cls(inverse, rays, weight, prior, image.shape[1], block)
+
+
+@njit(cache=True, nogil=True)
+def _weights(
+    inverse: NDArray[np.float32], noise: float, range_noise: float
+) -> NDArray[np.float32]:
+    weight = np.zeros_like(inverse)
+    for p in range(len(inverse)):
+        y = np.float64(inverse[p])
+        if y > 0:
+            weight[p] = 1 / (FLOOR + noise**2 + (range_noise * y * y) ** 2)
+    return weight
+
+
+class Models(NamedTuple):
+    """The planes that are labels.
+
+    Attributes
+    ----------
+    theta : (K + 1, 3) float64
+        theta . ray = inverse range; entry 0 is no plane.
+    price : (K + 1,) float64
+        Data cost of a residual of one random variance: the less, the more variance is granted.
+    """
+
+    theta: NDArray[np.float64]
+    price: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, moments: NDArray[np.float64]) -> Models:
+        """Planes of moment vectors (K + 1, 13)."""
+        theta, _ = fit_all(moments)
+        count = np.maximum(moments[:, COUNT], 1)
+        ratio = moments[:, RATIO] / (count + DISTORTION_PIXELS)
+        granted = 1 + moments[:, SLOPE] / count + _GRANTED * ratio
+        return cls(theta, 0.5 / granted)
+
+
+def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
+    """Value of eq. 5.3 for labels (n,): data costs and the costs of the edges between unlike."""
+    below = problem.links[1, : -problem.width]
+    right = problem.links[0, :-1]  # 0 from the end of one row to the next
+    unlike = right[labels[1:] != labels[:-1]].sum(dtype=np.float64)
+    unlike += below[labels[problem.width :] != labels[: -problem.width]].sum(dtype=np.float64)
+    return float(costs(labels, problem, models).sum(dtype=np.float64) + unlike)
+
+
+@njit(cache=True)
+def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
+    """What a label costs a measured pixel."""
+    if label == 0:
+        return NO_PLANE
+    theta, rays = models.theta, problem.rays
+    level = (
+        theta[label, 0] * rays[p, 0] + theta[label, 1] * rays[p, 1] + theta[label, 2] * rays[p, 2]
+    )
+    residual = problem.inverse[p] - level
+    return min(models.price[label] * problem.weight[p] * residual * residual, _CAP)
+
+
+@njit(cache=True)
+def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArray[np.float32]:
+    """What each pixel's label costs it, (n,); 0 where nothing was measured."""
+    cost = np.zeros(len(labels), np.float32)
+    for p in range(len(labels)):
+        if problem.weight[p] > 0:
+            cost[p] = data_cost(labels[p], p, problem, models)
+    return cost
+
+
+def region_moments(
+    labels: NDArray[np.integer],
+    count: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    sensor: SensorModel,
+) -> NDArray[np.float64]:
+    """Moments of the pixels of each label.
+
+    Parameters
+    ----------
+    labels : (H, W) int
+    count : int
+        Number of labels, 0 included.
+    inverse, rays : (H, W), (H, W, 3) float32
+        Range image.
+    weight : (H, W) float32
+        1 / random variance of the inverse range.
+    sensor : SensorModel
+        Its distortion is read.
+
+    Returns
+    -------
+    (count, 13) float64
+        Zeros for label 0.
+    """
+    arrays = labels, count, inverse, rays, weight
+    distortion = sensor.distortion, sensor.range_distortion
+    upper, lower = halves(_sum_moments, len(labels), *arrays, *distortion)
+    return upper + lower
+
+
+@njit(cache=True, nogil=True)
+def _sum_moments(
+    first: int,
+    after: int,
+    labels: NDArray[np.integer],
+    count: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    distortion: float,
+    range_distortion: float,
+) -> NDArray[np.float64]:
+    total = np.zeros((count, SIZE))
+    width = labels.shape[1]
+    for i in range(first, after):
+        j = 0
+        while j < width:
+            label = labels[i, j]
+            if label == 0:
+                j += 1
+                continue
+            # In variables of their own: sums in an array go through memory for every pixel.
+            a = b = c = d = e = f = p = q = r = square = pixels = ratio = 0.0
+            while j < width and labels[i, j] == label:
+                y, w = np.float64(inverse[i, j]), np.float64(weight[i, j])
+                x0 = np.float64(rays[i, j, 0])
+                x1 = np.float64(rays[i, j, 1])
+                x2 = np.float64(rays[i, j, 2])
+                wx0, wx1, wx2, wy = w * x0, w * x1, w * x2, w * y
+                a, b, c = a + wx0 * x0, b + wx0 * x1, c + wx0 * x2
+                d, e, f = d + wx1 * x1, e + wx1 * x2, f + wx2 * x2
+                p, q, r = p + x0 * wy, q + x1 * wy, r + x2 * wy
+                square += wy * y
+                pixels += 1
+                ratio += w * (distortion**2 + (range_distortion * y * y) ** 2)
+                j += 1
+            sums = (a, b, c, d, e, f, p, q, r, square, pixels, ratio)
+            for entry, value in enumerate(sums):
+                total[label, entry] += value
+    return total

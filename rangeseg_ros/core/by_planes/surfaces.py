@@ -1,0 +1,188 @@
+"""First planes: blocks grow to patches, patches join to surfaces.
+
+Agglomerative clustering on the adjacency of blocks, as in Feng, Taguchi and Kamat (ICRA 2014),
+with tests that count the sensor's variances. Real sensors bend planes smoothly, so how far two
+parts may leave their common plane cannot be one number: the plane a patch of a wall suggests is
+off by the distortion where the wall ends, yet the patch beside it agrees. Hence two steps. Blocks
+merge to patches small enough for the distortion to be nearly constant; patches join where they
+agree with their neighbours, averaged along the common border, and the surface as a whole stays
+within the distortion.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_planes.blocks import Links
+from rangeseg_ros.core.by_planes.patches import WITHIN_PATCH, misfit, patches, roots
+from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE, common_residual, fit
+
+DISTORTION_PIXELS = 2000.0
+"""Regions of this size meet half the variance of the distortion, large ones all of it."""
+# Systematic variances granted between neighbouring patches, and within a surface (4 standard
+# deviations).
+_BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
+# Blocks of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
+_PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
+# Blocks that may lie between the parts of a face.
+_GAP = 4
+
+
+def surfaces(
+    moments: NDArray[np.float64], links: Links, block: int, least: int = 1
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Group blocks into planar surfaces.
+
+    Parameters
+    ----------
+    moments : (rows, columns, 13) float64
+        Of blocks, weighted; zeros for blocks to leave out.
+    links : Links
+        Which neighbouring blocks are connected.
+    block : int
+        Rows and columns of a block.
+    least : int
+        Pixels of the smallest surface.
+
+    Returns
+    -------
+    labels : (rows, columns) int
+        0 where no surface is, otherwise 1...K.
+    moments : (K + 1, 13) float64
+        Of the surfaces; zeros for 0.
+    """
+    shape = moments.shape[:2]
+    blocks = moments.reshape(-1, SIZE)
+    # No patch reaches over the middle, but neither does any reach across a large surface.
+    roots = halves(patches, shape[0], moments, *links, _PATCH_LARGEST * block**2)
+    patch, moments = _renumbered(np.concatenate(roots), blocks, _PATCH_MINIMUM * block**2)
+    border = _borders(patch.reshape(shape), *links, len(moments))
+    surface, moments = _renumbered(_join(moments, border, _BETWEEN_PATCHES), moments, least)
+    labels = surface[patch].reshape(shape)
+    # A neck narrower than a block, or a row of holes, may keep parts of a face from touching.
+    root = _join(moments, _nearby(labels, len(moments)), WITHIN_PATCH)
+    surface, moments = _renumbered(root, moments, 1)
+    return surface[labels], moments
+
+
+@njit(cache=True)
+def _renumbered(
+    root: NDArray[np.intp], moments: NDArray[np.float64], least: float
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
+    count = np.zeros(len(root))
+    for a in range(len(root)):
+        count[root[a]] += moments[a, COUNT]
+    number = np.zeros(len(root), np.intp)
+    clusters = 0
+    for a in range(len(root)):
+        if count[a] >= least:
+            clusters += 1
+            number[a] = clusters
+    labels = np.zeros(len(root), np.intp)
+    total = np.zeros((clusters + 1, SIZE))
+    for a in range(len(root)):
+        labels[a] = number[root[a]]
+        if labels[a] > 0:
+            for entry in range(SIZE):
+                total[labels[a], entry] += moments[a, entry]
+    return labels, total
+
+
+@njit(cache=True)
+def _borders(
+    patch: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
+) -> NDArray[np.float64]:
+    """Length of the border between every two patches, in blocks: (count, count), symmetric."""
+    rows, columns = patch.shape
+    border = np.zeros((count, count))
+    for i in range(rows):
+        for j in range(columns):
+            a = patch[i, j]
+            for k in range(2):
+                if k == 0 and (j + 1 == columns or not right[i, j]):
+                    continue
+                if k == 1 and (i + 1 == rows or not below[i, j]):
+                    continue
+                b = patch[i, j + 1] if k == 0 else patch[i + 1, j]
+                if a != b and a > 0 and b > 0:
+                    border[a, b] += 1
+                    border[b, a] += 1
+    return border
+
+
+@njit(cache=True)
+def _nearby(labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
+    """Pairs of blocks within `_GAP` of each other, of every two surfaces: as `_borders`."""
+    rows, columns = labels.shape
+    near = np.zeros((count, count))
+    for i in range(rows):
+        for j in range(columns):
+            a = labels[i, j]
+            inner = 0 < j < columns - 1 and labels[i, j - 1] == a and labels[i, j + 1] == a
+            if a == 0 or (inner and i + 1 < rows and labels[i + 1, j] == a):
+                continue
+            for ni in range(i, min(i + _GAP + 1, rows)):
+                for nj in range(max(j - _GAP, 0), min(j + _GAP + 1, columns)):
+                    b = labels[ni, nj]
+                    if b > 0 and b != a:
+                        near[a, b] += 1
+                        near[b, a] += 1
+    return near
+
+
+@njit(cache=True)
+def _join(
+    moments: NDArray[np.float64], border: NDArray[np.float64], granted: float
+) -> NDArray[np.intp]:
+    """Join patches 1...P to surfaces, those that agree best first; returns the roots.
+
+    The strain between two surfaces is the mean misfit of the patches on either side of their
+    border, where so many systematic variances are granted.
+    """
+    count = len(moments)
+    moments, border = moments.copy(), border.copy()
+    theta = np.zeros(3)
+    residual = np.zeros(count)
+    for a in range(count):
+        residual[a] = fit(moments[a], theta)
+    strain = np.zeros((count, count))
+    heap = [(0.0, 0, 0)]
+    heap.pop()
+    for a in range(count):
+        for b in range(a + 1, count):
+            if border[a, b] > 0:
+                extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
+                apart = misfit(extra, moments[a], moments[b], granted)
+                strain[a, b] = strain[b, a] = apart * border[a, b]
+                heappush(heap, (strain[a, b] / border[a, b], a, b))
+    parent = np.arange(count)
+    while len(heap) > 0:
+        mean, a, b = heappop(heap)
+        if mean >= 1:
+            break
+        if parent[a] != a or parent[b] != b or strain[a, b] / border[a, b] != mean:
+            continue
+        chi2 = common_residual(moments[a], moments[b])
+        extra = chi2 - residual[a] - residual[b]
+        pixels = moments[a, COUNT] + moments[b, COUNT]
+        within = _WITHIN_SURFACE * pixels / (pixels + DISTORTION_PIXELS)
+        if misfit(extra, moments[a], moments[b], within) >= 1:
+            continue
+        parent[b] = a
+        moments[a] += moments[b]
+        residual[a] = chi2
+        for c in range(count):
+            if border[b, c] > 0 and c != a:
+                border[a, c] += border[b, c]
+                strain[a, c] += strain[b, c]
+                border[c, a], strain[c, a] = border[a, c], strain[a, c]
+            border[b, c] = border[c, b] = 0
+            if border[a, c] > 0:
+                heappush(heap, (strain[a, c] / border[a, c], min(a, c), max(a, c)))
+    return roots(parent)

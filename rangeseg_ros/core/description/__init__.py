@@ -1,0 +1,1 @@
+"""What a plane is to its users: equation, size, outline."""

@@ -1,0 +1,199 @@
+"""Area, principal axes and extents of regions on their planes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# A pixel's place on its plane is taken seriously up to this many times its measured range.
+_FAR = 2.0
+
+
+def areas_and_axes(
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    theta: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Area of regions and the axis along which they are longest.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+        0...M.
+    image : RangeImage
+        (H, W).
+    theta : (M + 1, 3) float64
+        Planes, theta . ray = inverse range.
+    tangents : (M + 1, 2, 3) float64
+        Two orthonormal vectors in each plane.
+
+    Returns
+    -------
+    area : (M + 1,) float64
+        Of the pixels' footprints on the plane, square metres.
+    major : (M + 1, 3) float64
+        Unit vector in the plane of the largest second moment of the area; x >= 0.
+    """
+    arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents
+    upper, lower = halves(_area_moments, len(labels), *arrays)
+    sums = upper + lower
+    # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
+    area = sums[:, 0] * np.linalg.norm(theta, axis=1)
+    mean = sums[:, 1:3] / np.maximum(sums[:, :1], 1e-300)
+    uu, uv, vv = (
+        sums[:, 3 + k] - sums[:, 0] * mean[:, a] * mean[:, b]
+        for k, (a, b) in enumerate(((0, 0), (0, 1), (1, 1)))
+    )
+    turn = 0.5 * np.arctan2(2 * uv, uu - vv)[:, None]
+    major = np.cos(turn) * tangents[:, 0] + np.sin(turn) * tangents[:, 1]
+    return area, major * np.where(major[:, :1] < 0, -1.0, 1.0)
+
+
+def rectangles(
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    theta: NDArray[np.float64],
+    axes: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Rectangles around regions on their planes.
+
+    Parameters
+    ----------
+    labels, image, theta
+        As for `areas_and_axes`.
+    axes : (M + 1, 2, 3) float64
+        Directions of the rectangles' sides.
+
+    Returns
+    -------
+    (M + 1, 2, 2) float64
+        Smallest and largest coordinate along each axis, metres; of the corners of the pixels for
+        a camera, of their centres otherwise. Not finite without pixels.
+    """
+    camera = image.camera
+    half = (0.5 / camera.fx, 0.5 / camera.fy) if camera else (0.0, 0.0)
+    arrays = labels, image.inverse, image.rays, theta, axes
+    upper, lower = halves(_limits, len(labels), *arrays, *half)
+    # Smallest and largest.
+    return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
+
+
+def _footprints(image: RangeImage) -> NDArray[np.float32]:
+    """|du x dv . r|, (H, W), of the rays r and their differences from pixel to pixel."""
+    if image.camera is None:
+        return _ray_footprints(image.rays, image.inverse)
+    return np.full(image.shape, 1 / (image.camera.fx * image.camera.fy), np.float32)
+
+
+@njit(cache=True)
+def _ray_footprints(
+    rays: NDArray[np.float32], inverse: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Footprints of rays that are known where something was measured."""
+    height, width = inverse.shape
+    result = np.zeros((height, width), np.float32)
+    for i in range(height):
+        for j in range(width):
+            if inverse[i, j] == 0:
+                continue
+            left = j - 1 if j > 0 and inverse[i, j - 1] > 0 else j
+            right = j + 1 if j + 1 < width and inverse[i, j + 1] > 0 else j
+            top = i - 1 if i > 0 and inverse[i - 1, j] > 0 else i
+            bottom = i + 1 if i + 1 < height and inverse[i + 1, j] > 0 else i
+            steps = (right - left) * (bottom - top)
+            if steps > 0:
+                du, dv = rays[i, right] - rays[i, left], rays[bottom, j] - rays[top, j]
+                volume = (
+                    rays[i, j, 0] * (du[1] * dv[2] - du[2] * dv[1])
+                    + rays[i, j, 1] * (du[2] * dv[0] - du[0] * dv[2])
+                    + rays[i, j, 2] * (du[0] * dv[1] - du[1] * dv[0])
+                )
+                result[i, j] = abs(volume) / steps
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _area_moments(
+    first: int,
+    after: int,
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    footprints: NDArray[np.float32],
+    theta: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2: a is area over |theta|."""
+    sums = np.zeros((len(theta), 6))
+    width = labels.shape[1]
+    for i in range(first, after):
+        j = 0
+        while j < width:
+            label = int(labels[i, j])
+            if label == 0:
+                j += 1
+                continue
+            plane, across, along = theta[label], tangents[label, 0], tangents[label, 1]
+            # In variables of their own: sums in an array go through memory for every pixel.
+            one = su = sv = suu = suv = svv = 0.0
+            while j < width and labels[i, j] == label:
+                y = inverse[i, j]
+                x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+                level = plane[0] * x0 + plane[1] * x1 + plane[2] * x2
+                if y > 0 and level * _FAR >= y:
+                    z = 1 / level
+                    u = z * (across[0] * x0 + across[1] * x1 + across[2] * x2)
+                    v = z * (along[0] * x0 + along[1] * x1 + along[2] * x2)
+                    area = footprints[i, j] * z * z * z
+                    au, av = area * u, area * v
+                    one, su, sv = one + area, su + au, sv + av
+                    suu, suv, svv = suu + au * u, suv + au * v, svv + av * v
+                j += 1
+            for entry, value in enumerate((one, su, sv, suu, suv, svv)):
+                sums[label, entry] += value
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _limits(
+    first: int,
+    after: int,
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    theta: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    half_x: float,
+    half_y: float,
+) -> NDArray[np.float64]:
+    """Smallest and largest coordinates (M + 1, 2, 2) along the axes."""
+    limits = np.empty((len(theta), 2, 2))
+    limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
+    corners = 1 if half_x == 0 else 4
+    width = labels.shape[1]
+    for i in range(first, after):
+        for j in range(width):
+            label = labels[i, j]
+            # Rows of pixels are straight on the plane: the extremes lie at their ends.
+            inner = 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]
+            if label == 0 or inner or inverse[i, j] == 0:
+                continue
+            plane = theta[label]
+            for corner in range(corners):
+                x = rays[i, j, 0] + half_x * (1 - 2 * (corner & 1))
+                y = rays[i, j, 1] + half_y * (1 - (corner & 2))
+                z = float(rays[i, j, 2])
+                level = plane[0] * x + plane[1] * y + plane[2] * z
+                if level * _FAR < inverse[i, j]:
+                    continue
+                for a in range(2):
+                    axis = axes[label, a]
+                    value = (axis[0] * x + axis[1] * y + axis[2] * z) / level
+                    limits[label, a, 0] = min(limits[label, a, 0], value)
+                    limits[label, a, 1] = max(limits[label, a, 1], value)
+    return limits

@@ -1,0 +1,94 @@
+"""Outlines of regions on their planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.camera import Camera
+
+TOLERANCE = 1.5
+"""Distance of the polygon from the outline at most, pixels: what segmentation leaves open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Border of a region, put on its plane when first asked for.
+
+    Attributes
+    ----------
+    mask : (h, w) bool
+        The region in its bounding box.
+    row, column : int
+        Of the box's first pixel in the image.
+    theta : (3,) float64
+        Plane, theta . ray = inverse range.
+    rays : Camera or (h, w, 3) float32
+        What gives the rays: of the corners of the pixels (camera), or of their centres (cloud).
+    """
+
+    mask: NDArray[np.bool_]
+    row: int
+    column: int
+    theta: NDArray[np.float64]
+    rays: Camera | NDArray[np.float32]
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """(N, 3) outer border of the largest part, counter-clockwise seen from the sensor."""
+        return self._rings[0]
+
+    @property
+    def holes(self) -> list[NDArray[np.float64]]:
+        """Borders (N, 3) of the holes in the largest part, clockwise seen from the sensor."""
+        return self._rings[1]
+
+    @cached_property
+    def _rings(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
+        # A pixel covers its four corners. On this lattice, contours run along the sides of the
+        # pixels, those of holes too, and holes of single pixels close.
+        lattice = np.zeros((self.mask.shape[0] + 1, self.mask.shape[1] + 1), np.uint8)
+        for i in (0, 1):
+            for j in (0, 1):
+                lattice[i : i + self.mask.shape[0], j : j + self.mask.shape[1]] |= self.mask
+        contours, tree = cv2.findContours(lattice, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        # Each with the number of the border around it, -1 for outer ones.
+        rings = list(zip(contours, tree[0, :, 3].tolist(), strict=True))
+        outer = max(
+            (k for k, (_, parent) in enumerate(rings) if parent < 0),
+            key=lambda k: cv2.contourArea(rings[k][0]),
+        )
+        holes = [self._on_plane(ring) for ring, parent in rings if parent == outer]
+        return self._on_plane(rings[outer][0]), [hole for hole in holes if len(hole) > 2]
+
+    def _on_plane(self, contour: NDArray[Any]) -> NDArray[np.float64]:
+        # Contours run counter-clockwise on the screen, x right and y down, and so does the
+        # sensor see them.
+        corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0]
+        rays = self._rays(corners)
+        level = rays @ self.theta
+        # Grazing planes end in the distance.
+        ahead = level > 1e-3 * np.abs(self.theta).max()
+        points: NDArray[np.float64] = rays[ahead] / level[ahead, None]
+        return points
+
+    def _rays(self, corners: NDArray[Any]) -> NDArray[np.float64]:
+        """Rays (N, 3) of corners (x, y) of pixels in the box."""
+        if isinstance(self.rays, Camera):
+            camera = self.rays
+            x = (corners[:, 0] + self.column - 0.5 - camera.cx) / camera.fx
+            y = (corners[:, 1] + self.row - 0.5 - camera.cy) / camera.fy
+            return np.stack([x, y, np.ones(len(corners))], axis=1)
+        total = np.zeros((len(corners), 3))
+        height, width = self.mask.shape
+        for i in (0, -1):
+            for j in (0, -1):
+                row = np.clip(corners[:, 1] + i, 0, height - 1)
+                column = np.clip(corners[:, 0] + j, 0, width - 1)
+                total += self.rays[row, column] * self.mask[row, column, None]
+        return total / np.linalg.norm(total, axis=1, keepdims=True)

@@ -1,0 +1,207 @@
+"""Planes of regions: uncertainty, place and shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.description.extents import areas_and_axes, rectangles
+from rangeseg_ros.core.description.outlines import Outline
+from rangeseg_ros.core.fitting.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
+from rangeseg_ros.core.fitting.coplanar import common_surfaces
+from rangeseg_ros.core.fitting.fits import Fits, symmetric
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
+from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A planar region: normal . p + distance = 0 in metres, in the frame of the image.
+
+    Attributes
+    ----------
+    label : int
+        Value in the label image, 1...
+    id : int
+        Identity over time, see `tracking.Tracker`; the label when nothing is tracked.
+    surface : int
+        The same for regions of one image that lie on one plane, seen apart: the label of the
+        largest of them. See `coplanar.common_surfaces`. When tracked, the identity of the
+        surface over time.
+    normal : (3,) float64
+        Unit normal towards the sensor.
+    distance : float
+        Distance of the origin from the plane, metres, positive for a sensor at the origin.
+    covariance : (4, 4) float64
+        Covariance of (normal, distance), of rank 3, from the errors of the sensor model.
+    centroid : (3,) float64
+        Mean of the points that the plane explains, projected to the plane, metres.
+    count : int
+        Number of measured pixels.
+    rms : float
+        Root mean square distance from the plane, metres, of the points that it explains.
+    confidence : float
+        0...1: the share of the pixels that the plane explains, times the mean square residual that
+        the sensor model expects of them over the observed one where that is larger. About 1 for
+        planes, less for what is bent, rough or spills over its border.
+    area : float
+        Area of the pixels on the plane, square metres.
+    extents : (2,) float64
+        Length and width of the rectangle around the region, its sides along the principal
+        axes of the region's area, metres.
+    centre : (3,) float64
+        Centre of that rectangle, metres.
+    orientation : (4,) float64
+        Quaternion x, y, z, w of the frame whose x axis runs along the length, pointing to the
+        image's right, and whose z axis is the normal.
+    outline : Outline
+        What `hull` and `holes` are made of when first asked for.
+    role : str
+        Of `roles.ROLES`; empty when none is asked for.
+    """
+
+    label: int
+    id: int
+    surface: int
+    normal: NDArray[np.float64]
+    distance: float
+    covariance: NDArray[np.float64]
+    centroid: NDArray[np.float64]
+    count: int
+    rms: float
+    confidence: float
+    area: float
+    extents: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+    outline: Outline = field(repr=False)
+    role: str = ''
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """(N, 3) outline on the plane, metres, counter-clockwise seen from the sensor.
+
+        Follows the region's largest part within `outlines.TOLERANCE` pixels; concave as it is.
+        """
+        return self.outline.hull
+
+    @property
+    def holes(self) -> list[NDArray[np.float64]]:
+        """Outlines (N, 3) of the holes in the hull, clockwise seen from the sensor."""
+        return self.outline.holes
+
+
+def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> list[Plane]:
+    """Plane of every region, as `described`, fitted as by `Fits.of`."""
+    return described(labels, image, Fits.of(labels, image, sensor))
+
+
+def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:
+    """Uncertainty, place and shape of every region's plane.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
+    image : RangeImage
+        (H, W).
+    fits : Fits
+        Of these labels.
+
+    Returns
+    -------
+    list of Plane
+        In the order of the labels.
+    """
+    theta, sums = fits.theta, fits.explained
+    found = np.flatnonzero(theta.any(axis=1))
+    if not len(found):
+        return []
+    distance = np.zeros(len(theta))
+    distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
+    normal = -theta * distance[:, None]
+    surface = common_surfaces(fits)
+    jacobian = plane_jacobians(normal, distance)
+    covariance = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
+
+    inliers = np.maximum(sums[:, COUNT], 1)
+    centroid = sums[:, POINT:SCATTER] / inliers[:, None]
+    scatter = symmetric(sums[:, SCATTER:]) / inliers[:, None, None]
+    offset = (normal * centroid).sum(axis=1)
+    square = np.einsum('ki,kij,kj->k', normal, scatter, normal)
+    square += distance * (2 * offset + distance)
+    rms = np.sqrt(np.maximum(square, 0))
+    centroid = centroid - (offset + distance)[:, None] * normal
+    expected = distance**2 * _expected_square(fits)
+    share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
+    confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
+
+    area, major = areas_and_axes(labels, image, theta, _tangents(normal))
+    axes = np.stack([major, np.cross(normal, major)], axis=1)
+    limits = rectangles(labels, image, theta, axes)[found]
+    extents = limits[..., 1] - limits[..., 0]
+    centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes[found])
+    centre -= distance[found, None] * normal[found]
+    frames = np.stack([axes[found, 0], axes[found, 1], normal[found]], axis=2)
+    orientation = Rotation.from_matrix(frames).as_quat()
+    orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
+    boxes = fits.boxes()
+    return [
+        Plane(
+            label=int(k),
+            id=int(k),
+            surface=int(surface[k]),
+            normal=normal[k],
+            distance=float(distance[k]),
+            covariance=covariance[k],
+            centroid=centroid[k],
+            count=int(fits.pixels[k]),
+            rms=float(rms[k]),
+            confidence=float(confidence[k]),
+            area=float(area[k]),
+            extents=extents[index],
+            centre=centre[index],
+            orientation=orientation[index],
+            outline=_outline(int(k), labels, image, boxes[k], theta[k]),
+        )
+        for index, k in enumerate(found)
+    ]
+
+
+def _expected_square(fits: Fits) -> NDArray[np.float64]:
+    """Mean square distance from the planes, over distance^2, that the sensor's errors make."""
+    cells, theta, errors = fits.cells, fits.theta, fits.variances
+    region = np.repeat(fits.regions_of_parts(), np.diff(cells.start))
+    count, weight = cells.sums[:, COUNT], cells.sums[:, WEIGHT]
+    ray = cells.sums[:, WEIGHTED_RAY:WEIGHT]
+    level = (ray * theta[region]).sum(axis=1) / np.where(count > 0, weight, 1)
+    # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
+    squared = np.where(level > 0, level, 1) ** 2
+    constant, quartic = errors[0] + errors[2], errors[1] + errors[3]
+    total = np.bincount(region, count * (constant / squared + quartic * squared), len(theta))
+    return total / np.maximum(np.bincount(region, count, len(theta)), 1)
+
+
+def _tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two unit vectors across each normal, (N, 2, 3)."""
+    across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, across)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+    return np.stack([first, np.cross(normal, first)], axis=1)
+
+
+def _outline(
+    label: int,
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    box: NDArray[np.intp],
+    theta: NDArray[np.float64],
+) -> Outline:
+    top, left, bottom, right = (int(edge) for edge in box)
+    crop = slice(top, bottom), slice(left, right)
+    return Outline(labels[crop] == label, top, left, theta, image.camera or image.rays[crop])

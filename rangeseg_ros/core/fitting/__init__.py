@@ -1,0 +1,1 @@
+"""Planes through regions, with their uncertainty."""

@@ -1,0 +1,235 @@
+r"""How far fitted planes may be off: covariances from the sensor's errors.
+
+A weighted fit of theta . r = y turns errors e of the inverse range into
+A^-1 sum_i w_i r_i e_i, with A = sum_i w_i r_i r_i^T, whence the sandwich
+
+    cov(theta) = A^-1 (sum_ij w_i w_j r_i r_j^T cov(e_i, e_j)) A^-1.
+
+The sensor's errors are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)),
+sigma the width of the kernel they look smoothed with. Their sum over pairs of pixels is taken over
+pairs of cells, one axis after the other; where cells are wider than the field, as a sum
+over the pixels of which each counts for the number that agree with it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells
+from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+# Widths of a field that a cell may span and still be treated as a unit.
+_FINE = 2.0
+
+
+class Field(NamedTuple):
+    """Gaussian random field of variance constant + quartic y^4 at the inverse range y.
+
+    `width` is that of the kernel it looks smoothed with, pixels.
+    """
+
+    width: float
+    constant: float
+    quartic: float
+
+
+def theta_covariances(
+    cells: Cells,
+    theta: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    sensor: SensorModel,
+    variances: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Covariance of each plane in the form theta . ray = inverse range.
+
+    Parameters
+    ----------
+    cells : Cells
+        Of M + 1 regions.
+    theta : (M + 1, 3) float64
+        Their planes; zeros where there is none.
+    inverse : (M + 1, 3, 3) float64
+        A^-1.
+    sensor : SensorModel
+    variances : (4,) float64
+        Of `sensor`.
+
+    Returns
+    -------
+    (M + 1, 3, 3) float64
+        Zeros where there is no plane.
+    """
+    middle = _middles(
+        cells,
+        theta,
+        variances,
+        sensor.white if sensor.correlation > 0 else 1.0,
+        sensor.correlation,
+        sensor.distortion_length,
+    )
+    return inverse @ ((middle + middle.transpose(0, 2, 1)) / 2) @ inverse
+
+
+def plane_jacobians(
+    normal: NDArray[np.float64], distance: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Derivative (N, 4, 3) of (normal, distance) by theta = -normal / distance."""
+    tangent = np.eye(3) - normal[:, :, None] * normal[:, None, :]
+    jacobian = np.empty((len(normal), 4, 3))
+    jacobian[:, :3] = -distance[:, None, None] * tangent
+    jacobian[:, 3] = distance[:, None] ** 2 * normal
+    return jacobian
+
+
+@njit(cache=True)
+def _middles(
+    cells: Cells,
+    theta: NDArray[np.float64],
+    variances: NDArray[np.float64],
+    white: float,
+    correlation: float,
+    distortion_length: float,
+) -> NDArray[np.float64]:
+    """Sums over pairs of pixels of w_i w_j r_i r_j^T cov(e_i, e_j), (M + 1, 3, 3)."""
+    result = np.zeros((len(theta), 3, 3))
+    part = np.empty((3, 3))
+    for k in range(1, len(theta)):
+        if not theta[k].any():
+            continue
+        own = cells.sums[cells.start[k] : cells.start[k + 1]]
+        random_square = np.zeros((3, 3))
+        systematic_square = np.zeros((3, 3))
+        count = 0.0
+        for c in range(len(own)):
+            if own[c, COUNT] == 0:
+                continue
+            count += own[c, COUNT]
+            # Squares of the same scale as the rays: variance times weight.
+            level = _level(own[c], theta[k])
+            mean = own[c, WEIGHT] / own[c, COUNT]
+            entry = 0
+            for a in range(3):
+                for b in range(a, 3):
+                    part[a, b] = part[b, a] = own[c, entry]
+                    entry += 1
+            random_square += mean * (variances[0] + variances[1] * level**4) * part
+            systematic_square += mean * (variances[2] + variances[3] * level**4) * part
+        result[k] = white * random_square
+        # Sides of pixels overstate the length of a border by 4 / pi on average.
+        share = np.pi / 4 * cells.border[k] / count
+        if white < 1:
+            random = Field(correlation, variances[0], variances[1])
+            result[k] += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
+        if variances[2] + variances[3] > 0:
+            systematic = Field(distortion_length, variances[2], variances[3])
+            result[k] += _field(cells, k, theta[k], systematic, systematic_square, share)
+    return result
+
+
+@njit(cache=True)
+def _level(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """Inverse range of a plane at the middle of a cell."""
+    total = 0.0
+    for a in range(3):
+        total += theta[a] * cell[WEIGHTED_RAY + a]
+    return total / cell[WEIGHT]
+
+
+@njit(cache=True)
+def _field(
+    cells: Cells,
+    k: int,
+    theta: NDArray[np.float64],
+    field: Field,
+    square: NDArray[np.float64],
+    border: float,
+) -> NDArray[np.float64]:
+    """Sum over pairs of pixels of region `k`.
+
+    `square` is the sum over the single pixels, `border` the length of border per pixel.
+    """
+    if cells.size[k] <= _FINE * field.width:
+        return pairs(cells, k, theta, k, theta, field)
+    # Along each row and column, as many pixels agree as the correlation sums to.
+    line = 1.0
+    for lag in range(1, int(8 * field.width) + 2):
+        if field.width > 0:
+            line += 2 * np.exp(-((lag / field.width) ** 2) / 4)
+    # Those within width / sqrt(pi) of the border miss half of them on average.
+    inside = max(1 - border * field.width / np.sqrt(np.pi), 0.5)
+    return max(line * line * inside, 1.0) * square
+
+
+@njit(cache=True)
+def pairs(
+    cells: Cells,
+    a: int,
+    theta_a: NDArray[np.float64],
+    b: int,
+    theta_b: NDArray[np.float64],
+    field: Field,
+) -> NDArray[np.float64]:
+    """Sum over pairs of pixels, the first of region a, the second of b, (3, 3)."""
+    rays_a, rays_b = _scaled_rays(cells, a, theta_a, field), _scaled_rays(cells, b, theta_b, field)
+    along = _correlation(cells, a, b, rays_a.shape[1], rays_b.shape[1], 1, field.width)
+    down = _correlation(cells, a, b, rays_a.shape[0], rays_b.shape[0], 0, field.width)
+    # First the columns, then the rows: cubes instead of fourth powers of the grid's side.
+    half = np.zeros((rays_b.shape[0], rays_a.shape[1], 3))
+    for i in range(rays_b.shape[0]):
+        for j in range(rays_b.shape[1]):
+            for m in range(rays_a.shape[1]):
+                for p in range(3):
+                    half[i, m, p] += along[m, j] * rays_b[i, j, p]
+    result = np.zeros((3, 3))
+    seen = np.zeros(3)
+    for i in range(rays_a.shape[0]):
+        for j in range(rays_a.shape[1]):
+            seen[:] = 0
+            for m in range(rays_b.shape[0]):
+                for p in range(3):
+                    seen[p] += down[i, m] * half[m, j, p]
+            for p in range(3):
+                for q in range(3):
+                    result[p, q] += rays_a[i, j, p] * seen[q]
+    return result
+
+
+@njit(cache=True)
+def _scaled_rays(
+    cells: Cells, k: int, theta: NDArray[np.float64], field: Field
+) -> NDArray[np.float64]:
+    """Sums of weighted rays times the field's standard deviation, (rows, columns, 3)."""
+    own = cells.sums[cells.start[k] : cells.start[k + 1]]
+    columns = cells.columns[k]
+    rays = np.zeros((len(own) // columns, columns, 3))
+    for c in range(len(own)):
+        if own[c, COUNT] > 0:
+            level = _level(own[c], theta)
+            deviation = np.sqrt(field.constant + field.quartic * level**4)
+            for p in range(3):
+                rays[c // columns, c % columns, p] = deviation * own[c, WEIGHTED_RAY + p]
+    return rays
+
+
+@njit(cache=True)
+def _correlation(
+    cells: Cells, a: int, b: int, count_a: int, count_b: int, axis: int, width: float
+) -> NDArray[np.float64]:
+    """Mean correlation between the pixels of two rows of cells, (count_a, count_b)."""
+    size_a, size_b = cells.size[a], cells.size[b]
+    # The offsets within both cells widen the correlation by their variances.
+    variance = 2 * width**2
+    wide = variance + (size_a**2 + size_b**2 - 2) / 12
+    gain = np.sqrt(variance / wide)
+    result = np.empty((count_a, count_b))
+    for i in range(count_a):
+        for j in range(count_b):
+            lag = cells.box[a, axis] + (i + 0.5) * size_a
+            lag -= cells.box[b, axis] + (j + 0.5) * size_b
+            result[i, j] = gain * np.exp(-(lag**2) / (2 * wide))
+    return result

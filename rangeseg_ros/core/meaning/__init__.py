@@ -1,0 +1,1 @@
+"""What planes mean to a robot."""

@@ -1,0 +1,1 @@
+"""Threads and memory: how kernels run, apart from what they compute."""

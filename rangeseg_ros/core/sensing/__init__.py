@@ -1,0 +1,1 @@
+"""What is measured: cameras, range images, the sensor model, jump edges and the pixel grid."""

@@ -1,0 +1,261 @@
+"""Jump edges between neighbouring pixels (thesis 2.2-2.4, 5.5.2), aware of shadows (6.7)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.runtime.threads import aside, strips
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
+GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+_WINDOW = 3
+# The farthest window that a boundary looks at.
+_MARGIN = 2 * _WINDOW - 1
+# A step between two pixels that needs no look at their surroundings, in units of `step`: steeper
+# than all but planes seen edge-on from centimetres away.
+_CLEAR = 5
+
+
+def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
+    """Jump edges by the method that `config` names."""
+    if config.jump_edges == 'plane':
+        return plane_deviation(image, config.edge_step)
+    if config.jump_edges == 'sobel':
+        return beside(sobel(image))
+    return None
+
+
+def sobel(image: RangeImage) -> NDArray[np.bool_]:
+    """Pixels on thresholded ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
+
+    Median filter, Sobel operators, the threshold of eq. 2.6, ridge thinning, morphological
+    bridging. Windows that hold a pixel without measurement respond with nothing (section 6.7).
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+
+    Returns
+    -------
+    (H, W) bool
+    """
+    valid = image.valid
+    with np.errstate(divide='ignore'):
+        depth = np.where(valid, 1 / image.inverse, 0).astype(np.float32)
+    depth = np.where(_complete(valid), cv2.medianBlur(depth, _WINDOW), depth)
+    complete = _complete(valid)
+    gx = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 1, 0), 0)
+    gy = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 0, 1), 0)
+    strength = gx * gx + gy * gy
+    strong = strength > 4 * strength[complete].mean() if complete.any() else complete
+    # A ridge is no lower than the pixel before and higher than the one after, across it.
+    framed = np.pad(strength, 1)
+    left, right = framed[1:-1, :-2], framed[1:-1, 2:]
+    upper, lower = framed[:-2, 1:-1], framed[2:, 1:-1]
+    steep = np.abs(gx) >= np.abs(gy)
+    ridge = np.where(
+        steep,
+        (strength >= left) & (strength > right),
+        (strength >= upper) & (strength > lower),
+    )
+    return bridged(strong & ridge)
+
+
+def beside(pixels: NDArray[np.bool_]) -> GridEdges:
+    """All edges of the given pixels (H, W): edge pixels are disconnected from everything."""
+    return pixels[:, 1:] | pixels[:, :-1], pixels[1:] | pixels[:-1]
+
+
+def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels whose 3 x 3 window, as far as it lies in the image, was measured throughout."""
+    return cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+
+
+# The eight neighbours in a circle, as bits, and the offsets of each: (row, column).
+_RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
+
+
+def bridged(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
+    kernel = np.zeros((3, 3), np.float32)
+    for bit, position in enumerate(_RING):
+        kernel[position] = 1 << bit
+    pattern = cv2.filter2D(
+        edges.astype(np.uint8), cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT
+    )
+    return edges | _JOINS[pattern]
+
+
+def _joins(pattern: int) -> bool:
+    """Whether the neighbours set in a pattern of eight bits fall apart without the centre."""
+    ring = np.zeros((3, 3), np.uint8)
+    for bit, position in enumerate(_RING):
+        ring[position] = pattern >> bit & 1
+    return cv2.connectedComponents(ring, connectivity=8)[0] > 2
+
+
+_JOINS = np.array([_joins(pattern) for pattern in range(256)])
+
+
+def plane_deviation(image: RangeImage, step: float) -> GridEdges:
+    """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
+
+    In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
+    adjoining 3 x 3 windows is compared to the steps on either side of it: on a plane all three
+    are equal, over a crease the middle one lies between the others, and only a jump exceeds both.
+    Where the deviation exceeds `step`, the boundary runs where the inverse range changes from
+    above its local mean to below: the zero crossing, which closes contours by itself.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    step : float
+        Deviation that makes a jump, 1/m.
+
+    Returns
+    -------
+    horizontal, vertical : (H, W-1), (H-1, W) bool
+        Never true beside a pixel that was not measured.
+    """
+    inverse = image.inverse
+    mask = (inverse > 0).astype(np.float32)
+    wide = aside(_window_sums, inverse, mask, 2 * _WINDOW + 1)
+    mean = _means(*_window_sums(inverse, mask, _WINDOW))
+    height, width = image.shape
+    strong = np.zeros((height, width), np.bool_)
+    strips(_find_strong, height, mean, step, strong)
+    horizontal = np.zeros((height, width - 1), np.bool_)
+    vertical = np.zeros((height - 1, width), np.bool_)
+    strips(
+        _find_crossings,
+        height,
+        inverse,
+        strong,
+        *wide.result(),
+        _CLEAR * step,
+        horizontal,
+        vertical,
+    )
+    return horizontal, vertical
+
+
+def _window_sums(
+    inverse: NDArray[np.float32], mask: NDArray[np.float32], size: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sum and number of the measurements in the window around each pixel."""
+    window, border = (size, size), cv2.BORDER_CONSTANT
+    total = cv2.boxFilter(inverse, -1, window, normalize=False, borderType=border)
+    count = cv2.boxFilter(mask, -1, window, normalize=False, borderType=border)
+    return np.asarray(total), np.asarray(count)
+
+
+@njit(cache=True)
+def _means(total: NDArray[np.float32], count: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Means of windows, NaN where nothing was measured and in a margin around the image."""
+    height, width = total.shape
+    mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
+    for i in range(height):
+        for j in range(width):
+            if count[i, j] > 0.5:
+                mean[i + _MARGIN, j + _MARGIN] = total[i, j] / count[i, j]
+    return mean
+
+
+@njit(cache=True, nogil=True)
+def _find_strong(
+    first: int, after: int, mean: NDArray[np.float32], step: float, strong: NDArray[np.bool_]
+) -> None:
+    """Pixels at which the step to some neighbour leaves the steps beside it by more than `step`.
+
+    A boundary that runs along the rows shows in the columns alone, the risers of its staircase
+    too: what counts is a pixel's deviation in either direction.
+    """
+    height, width = strong.shape
+    leaving = np.zeros(width, np.bool_)
+    below = np.zeros(width, np.bool_)
+    for i in range(first - 1, after):
+        # Boundaries with the next pixel: the windows around the last but one and so on.
+        k = i + _MARGIN
+        above, below = below, np.zeros(width, np.bool_)
+        if 0 <= i < height - 1:
+            columns = mean[:, _MARGIN : _MARGIN + width]
+            _leave(columns[k - 4], columns[k - 1], columns[k + 2], columns[k + 5], step, below)
+        if i < first:
+            continue
+        row = mean[k, _MARGIN - 4 :]
+        _leave(row, row[3:], row[6:], row[9:], step, leaving[: width - 1])
+        for j in range(width):
+            strong[i, j] = above[j] | below[j] | leaving[j]
+        for j in range(1, width):
+            strong[i, j] |= leaving[j - 1]
+
+
+@njit(cache=True, nogil=True)
+def _leave(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    c: NDArray[np.float32],
+    d: NDArray[np.float32],
+    step: float,
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the steps from b to c lie outside those from a to b and from c to d so far.
+
+    A side that was not measured (NaN) is left out.
+    """
+    # Without branches, so that the compiler takes many at a time.
+    limit = np.float32(step)
+    for j in range(len(result)):
+        here = c[j] - b[j]
+        before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
+        first, last = before != before, after != after
+        above = ((before > limit) | first) & ((after > limit) | last)
+        below = ((before < -limit) | first) & ((after < -limit) | last)
+        result[j] = (above | below) & ~(first & last)
+
+
+@njit(cache=True, nogil=True)
+def _find_crossings(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    strong: NDArray[np.bool_],
+    total: NDArray[np.float32],
+    count: NDArray[np.float32],
+    clear: float,
+    horizontal: NDArray[np.bool_],
+    vertical: NDArray[np.bool_],
+) -> None:
+    """Edges between strong pixels on unlike sides of the local mean, and all of a clear step.
+
+    The latter because where three surfaces meet, two may lie on the same side of the mean.
+    """
+    height, width = inverse.shape
+    for i in range(first, after):
+        for j in range(width):
+            here = inverse[i, j]
+            if here == 0:
+                continue
+            above = here * count[i, j] > total[i, j]
+            if j + 1 < width and inverse[i, j + 1] > 0:
+                there = inverse[i, j + 1]
+                horizontal[i, j] = abs(here - there) > clear or (
+                    strong[i, j]
+                    and strong[i, j + 1]
+                    and above != (there * count[i, j + 1] > total[i, j + 1])
+                )
+            if i + 1 < height and inverse[i + 1, j] > 0:
+                there = inverse[i + 1, j]
+                vertical[i, j] = abs(here - there) > clear or (
+                    strong[i, j]
+                    and strong[i + 1, j]
+                    and above != (there * count[i + 1, j] > total[i + 1, j])
+                )

@@ -1,0 +1,156 @@
+"""The range image every later step reads: rays, inverse range, validity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rangeseg_ros.core.sensing.camera import Camera
+
+
+class RangeImageError(ValueError):
+    """An array that is no depth image or organised cloud, or does not fit its camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class RangeImage:
+    """Measurements along pixel rays: point = ray / inverse.
+
+    A plane n . p + d = 0 is linear in this form: (-n/d) . ray = inverse, which holds for the
+    pinhole camera (rays scaled to z = 1, inverse = 1/z) as for any cloud (unit rays,
+    inverse = 1/range).
+
+    Attributes
+    ----------
+    rays : (H, W, 3) float32
+        Ray of each pixel; undefined where invalid when the image comes from points.
+    inverse : (H, W) float32
+        Inverse depth (pinhole) or inverse range (cloud), 1/m; 0 where nothing was measured.
+    camera : Camera or None
+        None for organised clouds.
+    """
+
+    rays: NDArray[np.float32]
+    inverse: NDArray[np.float32]
+    camera: Camera | None = None
+
+    @classmethod
+    def from_depth(
+        cls, depth: ArrayLike, camera: Camera, scale: float | None = None
+    ) -> RangeImage:
+        """Range image of a depth image (REP 118).
+
+        Parameters
+        ----------
+        depth : (H, W) uint16 or float32
+            Depth along the optical axis; 0 (integers), non-finite or <= 0 (floats) is invalid.
+        camera : Camera
+            Intrinsics; its size must be the image's.
+        scale : float, optional
+            Metres per unit; 0.001 for integers and 1 for floats when not given.
+
+        Raises
+        ------
+        RangeImageError
+            Not a 2-D uint16 or float image, a size other than the camera's, a scale that is
+            not positive.
+        """
+        array = np.asarray(depth)
+        if array.ndim != 2:
+            raise RangeImageError(f'depth image must have one channel, not shape {array.shape}')
+        if array.dtype != np.uint16 and array.dtype.kind != 'f':
+            raise RangeImageError(f'depth image must be uint16 or float, not {array.dtype}')
+        if array.shape != camera.shape:
+            raise RangeImageError(
+                f'depth image is {array.shape[1]}x{array.shape[0]}, '
+                f'its camera {camera.width}x{camera.height}'
+            )
+        if scale is None:
+            scale = 0.001 if array.dtype == np.uint16 else 1.0
+        if not (np.isfinite(scale) and scale > 0):
+            raise RangeImageError(f'depth scale must be positive, not {scale}')
+        return cls(camera.rays, _reciprocal(array, scale), camera)
+
+    @classmethod
+    def from_points(cls, points: ArrayLike) -> RangeImage:
+        """Range image of an organised cloud of any sensor.
+
+        Parameters
+        ----------
+        points : (H, W, 3) float
+            Points in metres, the sensor at the origin; any non-finite coordinate, or a point at
+            the origin, is invalid.
+
+        Raises
+        ------
+        RangeImageError
+            An array of another shape or type.
+        """
+        array = np.asarray(points)
+        if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != 'f':
+            raise RangeImageError(
+                f'organised cloud must be (H, W, 3) float, not {array.shape} {array.dtype}'
+            )
+        finite = np.isfinite(array).all(axis=2)
+        cloud = np.where(finite[..., None], array, 0).astype(np.float64)
+        distance = np.linalg.norm(cloud, axis=2)
+        inverse = _reciprocal(distance, 1.0)
+        rays = (cloud * inverse[..., None]).astype(np.float32)
+        return cls(rays, inverse)
+
+    def dithered(self, sigma: float, seed: int) -> RangeImage:
+        """Copy with Gaussian noise on the ranges (thesis 6.7.1).
+
+        Parameters
+        ----------
+        sigma : float
+            Standard deviation, metres.
+        seed : int
+            Of the noise.
+        """
+        noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
+        with np.errstate(divide='ignore'):
+            return RangeImage(self.rays, _reciprocal(1 / self.inverse + noise, 1.0), self.camera)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width)."""
+        height, width = self.inverse.shape
+        return height, width
+
+    @cached_property
+    def valid(self) -> NDArray[np.bool_]:
+        """(H, W) True where there is a measurement; the rest is shadow (thesis 6.7)."""
+        return self.inverse > 0
+
+    @cached_property
+    def points(self) -> NDArray[np.float32]:
+        """(H, W, 3) points in metres, NaN where nothing was measured."""
+        with np.errstate(divide='ignore', invalid='ignore'):
+            points = self.rays / self.inverse[..., None]
+        points[~self.valid] = np.nan
+        return points
+
+
+# Metres; what lies outside was not measured by any sensor, and its squares leave float32.
+_NEAREST, _FARTHEST = 1e-6, 1e6
+
+
+def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
+    """1 / (scale * distance) in 1/m, 0 where that is no distance from 1 um to 1000 km."""
+    if distance.dtype == np.uint16:
+        return _reciprocals(scale)[distance]
+    with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
+        metres = distance.astype(np.float64) * scale
+        inverse = (1.0 / metres).astype(np.float32)
+    inverse[~((metres >= _NEAREST) & (metres <= _FARTHEST))] = 0
+    return inverse
+
+
+@lru_cache(maxsize=4)
+def _reciprocals(scale: float) -> NDArray[np.float32]:
+    """Of the 65536 depths there can be."""
+    return _reciprocal(np.arange(65536, dtype=np.float64), scale)

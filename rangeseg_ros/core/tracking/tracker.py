@@ -1,0 +1,260 @@
+"""Ids that persist: the planes of one frame matched to those of the frames before.
+
+Planes seen in successive frames give away how the camera moved: a rigid motion, estimated in a
+least-squares sense, takes the known planes into the new frame. There they are matched by their
+parameters, in standard deviations, and by the overlap of their pixels. A plane out of sight
+moves along with the camera and is found again where it should be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.tracking.tracks import (
+    Tracks,
+    are_near,
+    distances,
+    offsets,
+    overlaps,
+    samples_of,
+    shared_samples,
+    variances,
+)
+
+# Largest squared distance in standard deviations, of two degrees of freedom, that may match.
+_GATE = 20.0
+# Overlap that planes in reach of each other count with, beside what they have.
+_UNSEEN_OVERLAP = 0.1
+# Frames in which a plane must have been seen to be as good as older ones, and what it counts with
+# until then: what looks like a new plane at first may be a part of one that is about to go.
+_TRIAL, _ON_TRIAL = 10, 0.05
+# Standard deviations of the camera's motion between two frames: radians, metres.
+_TURN, _SHIFT = np.radians(2.0), 0.03
+# Least intersection over union, and largest changes, of planes the motion is estimated from.
+_SURE_OVERLAP, _SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
+_MOTION_ROUNDS = 3
+
+
+class Tracker:
+    """Gives planes, and the surfaces they are parts of, ids that persist from frame to frame.
+
+    A plane keeps its id while the camera moves and while it is out of sight for up to
+    `track_memory` frames. When an occluder splits a plane, the part that overlaps most with the
+    plane as it was, so in general the largest, keeps the id and the others get ids of their own.
+    When parts merge, the oldest id stays, unless it belonged to a part of less than a quarter of
+    the other, and the other part's id waits in the memory for the next split. Of a face seen in
+    scraps that come and go, one has the oldest id for as long as any is in sight.
+
+    What parts have in common is `Plane.surface`: from a frame's groups of coplanar planes it
+    becomes the id of the surface, the lowest that any part has had, which persists when that
+    part goes out of sight and others stay.
+
+    No id is ever given twice in the life of a tracker, and the same input gives the same ids.
+
+    Parameters
+    ----------
+    config : Config, optional
+        `track_memory`.
+
+    Examples
+    --------
+    >>> tracker = Tracker()
+    >>> planes = tracker.track(result.labels, result.planes, stamp)
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self._next = 1
+        self._stamp = 0
+        self._shape: tuple[int, ...] = ()
+        self._tracks = Tracks.of([], np.zeros(0, np.intp))
+
+    def track(
+        self, labels: NDArray[np.uint16], planes: Sequence[Plane], stamp: int
+    ) -> list[Plane]:
+        """The planes of the next frame with their ids.
+
+        Parameters
+        ----------
+        labels : (H, W) uint16
+            0 = no plane.
+        planes : sequence of Plane
+            As `Segmenter` returns them with `labels`.
+        stamp : int
+            Time of the frame, nanoseconds. A frame before the last one, as of a looped
+            recording, and one of another size start anew: nothing known is matched to it.
+
+        Returns
+        -------
+        list of Plane
+            In the order given, `id` and `surface` set.
+        """
+        if stamp < self._stamp or labels.shape != self._shape:
+            self._tracks = Tracks.of([], np.zeros(0, np.intp))
+        self._stamp, self._shape = stamp, labels.shape
+        samples = samples_of(labels, planes)
+        seen, known = Tracks.of(planes, samples), self._tracks
+        shared = shared_samples(known, samples, len(planes))
+        known = known.moved(*_camera_motion(known, seen, shared))
+        distance = distances(known, seen)
+        match = _assign(known, seen, shared, distance)
+        seen.id[:] = _oldest(known, match, shared, distance)
+        _inherit(planes, seen, known, shared, distance)
+        s, t = np.nonzero(seen.id[:, None] == known.id)
+        seen.age[s] += known.age[t]
+        new = seen.id == 0
+        seen.id[new] = self._next + np.arange(new.sum())
+        self._next += int(new.sum())
+        seen.surface[:] = self._surfaces(planes, seen, known)
+        lost = ~np.isin(known.id, seen.id) & (known.unseen < self.config.track_memory)
+        self._tracks = seen.joined(known.where(lost).aged())
+        return [
+            replace(plane, id=int(i), surface=int(surface))
+            for plane, i, surface in zip(planes, seen.id, seen.surface, strict=True)
+        ]
+
+    def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
+        """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
+        before = dict(zip(known.id.tolist(), known.surface.tolist(), strict=True))
+        claims = []
+        for members in _groups(planes):
+            own = seen.id[members].tolist()
+            claim = min(before.get(i, i) for i in own)
+            largest = max(members, key=lambda n: planes[n].count)
+            size = sum(planes[n].count for n in members)
+            # Of surfaces that come apart, the one with the plane that gave the id keeps it.
+            claims.append((claim not in own, -size, min(own), claim, largest, members))
+        distance = distances(seen, seen)
+        holders: dict[int, int] = {}
+        surfaces = [0] * len(planes)
+        for _, _, own, claim, largest, members in sorted(claims):
+            # Parts once found on one surface stay together for as long as they may be on one.
+            for surface in (claim, own, self._next):
+                if distance[holders.setdefault(surface, largest), largest] <= _GATE:
+                    break
+            self._next += surface == self._next
+            for n in members:
+                surfaces[n] = surface
+        return surfaces
+
+
+def _groups(planes: Sequence[Plane]) -> list[list[int]]:
+    """Numbers of the planes that lie on one surface, for each surface of a frame."""
+    parts: dict[int, list[int]] = {}
+    for n, plane in enumerate(planes):
+        parts.setdefault(plane.surface, []).append(n)
+    return list(parts.values())
+
+
+def _camera_motion(
+    known: Tracks, seen: Tracks, shared: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation and shift that take points of the last frame to this one.
+
+    With a small rotation w and a shift v, a plane's normal n changes by w x n and the centroid c
+    of the plane that is seen comes to lie n.c + d + w.(n x c) - n.v off it: linear least squares
+    over the planes that overlap most with each other, weighted by their variances, and those
+    that fit badly (things that move by themselves) less. Directions in which the planes leave
+    the motion open are held by a prior of zero.
+    """
+    overlap = overlaps(known, seen, shared) * (known.unseen == 0)[:, None]
+    best = overlap == np.maximum(
+        overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
+    )
+    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < _SURE_SHIFT)
+    sure &= known.normal @ seen.normal.T > np.cos(_SURE_TURN)
+    t, s = np.nonzero(sure)
+    angle, offset = (variance[t, s] for variance in variances(known, seen))
+    start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
+    rotation, shift = np.eye(3), np.zeros(3)
+    prior = np.diag(np.repeat([_TURN**-2, _SHIFT**-2], 3))
+    for _ in range(_MOTION_ROUNDS):
+        n = start @ rotation.T
+        turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
+        gap = np.einsum('ni,ni->n', n, c - shift) + distance
+        weight = 1 / (1 + (np.einsum('ni,ni->n', turn, turn) / angle + gap**2 / offset) / 4)
+        # For w x n = n' - n the normal equations are (I - n n^T) w = n x n'.
+        across = np.eye(3) * (weight / angle).sum() - (n.T * (weight / angle)) @ n
+        slope = np.hstack([lever, -n])
+        left = prior + (slope.T * (weight / offset)) @ slope
+        left[:3, :3] += across
+        right = -(weight / offset * gap) @ slope
+        right[:3] += (weight / angle) @ turn
+        step = np.linalg.solve(left, right)
+        twist = cv2.Rodrigues(step[:3])[0]
+        rotation, shift = twist @ rotation, twist @ shift + step[3:]
+    return rotation, shift
+
+
+def _assign(
+    known: Tracks,
+    seen: Tracks,
+    shared: NDArray[np.intp],
+    distance: NDArray[np.float64],
+) -> NDArray[np.intp]:
+    """(N,) number of the known plane that each plane is, -1 for none."""
+    # Little without overlap, or two bad pairs would be worth more than one that is sure.
+    affinity = (overlaps(known, seen, shared) + _UNSEEN_OVERLAP) * np.exp(-distance / 8)
+    affinity[known.age < _TRIAL] *= _ON_TRIAL
+    affinity[~are_near(known, seen, shared, 'reach') | (distance > _GATE)] = 0
+    rows, columns = linear_sum_assignment(affinity, maximize=True)
+    match = np.full(len(seen.id), -1)
+    match[columns] = np.where(affinity[rows, columns] > 0, rows, -1)
+    return match
+
+
+def _oldest(
+    known: Tracks,
+    match: NDArray[np.intp],
+    shared: NDArray[np.intp],
+    distance: NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """(N,) ids of the matched planes, 0 for the others; of merged parts the lowest id."""
+    matched = np.flatnonzero(match >= 0)
+    kept = match[matched]
+    free = known.unseen == 0
+    free[kept] = False
+    merged = free[:, None] & (2 * shared > known.size[:, None])[:, matched]
+    merged &= (distance <= _GATE)[:, matched] & (4 * known.size[:, None] >= known.size[kept])
+    parts = np.where(merged, known.id[:, None], known.id[kept])
+    ids = np.zeros(len(match), np.int64)
+    if len(kept):
+        ids[matched] = parts.min(axis=0)
+    return ids
+
+
+def _inherit(
+    planes: Sequence[Plane],
+    seen: Tracks,
+    known: Tracks,
+    shared: NDArray[np.intp],
+    distance: NDArray[np.float64],
+) -> None:
+    """Let a part in sight have the id of its surface when the part that had it is lost.
+
+    The two parts exchange their ids, so that the lost one is found again by the other's. They
+    are to be close, as scraps of a grazing face are: things far apart on one plane are things of
+    their own. And no large part is renamed after a sliver.
+    """
+    near = are_near(known, seen, shared, 'radius') & (distance <= _GATE)
+    near &= 4 * known.size[:, None] >= seen.size
+    surface = dict(zip(known.id.tolist(), known.surface.tolist(), strict=True))
+    for members in _groups(planes):
+        claim = min((surface[i] for i in seen.id[members].tolist() if i), default=0)
+        lost = np.flatnonzero(known.id == claim)
+        if claim in seen.id or not len(lost):
+            continue
+        heirs = [n for n in members if near[lost[0], n]]
+        if not heirs:
+            continue
+        heir = max(heirs, key=lambda n: (shared[lost[0], n], planes[n].count))
+        own = known.id == seen.id[heir]
+        known.id[lost], known.id[own], seen.id[heir] = seen.id[heir], claim, claim

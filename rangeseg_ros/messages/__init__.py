@@ -1,0 +1,1 @@
+"""ROS messages without ROS: for the node, for recordings, for readers of either."""

@@ -1,0 +1,197 @@
+"""Point clouds of messages: organised clouds in, points out, `~/planes` out and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.messages.make import Make
+
+# One row of `~/planes`: the fields of a Plane.
+PLANE_TYPE = np.dtype(
+    [
+        ('x', '<f4'),
+        ('y', '<f4'),
+        ('z', '<f4'),
+        ('normal_x', '<f4'),
+        ('normal_y', '<f4'),
+        ('normal_z', '<f4'),
+        ('distance', '<f4'),
+        ('label', '<u4'),
+        ('id', '<u4'),
+        ('surface', '<u4'),
+        ('role', '<u4'),
+        ('count', '<u4'),
+        ('rms', '<f4'),
+        ('confidence', '<f4'),
+        ('area', '<f4'),
+        ('length', '<f4'),
+        ('width', '<f4'),
+        ('centre_x', '<f4'),
+        ('centre_y', '<f4'),
+        ('centre_z', '<f4'),
+        ('orientation_x', '<f4'),
+        ('orientation_y', '<f4'),
+        ('orientation_z', '<f4'),
+        ('orientation_w', '<f4'),
+        *((f'covariance_{i}{j}', '<f4') for i, j in combinations_with_replacement('xyzd', 2)),
+    ]
+)
+
+_POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
+
+# sensor_msgs/PointField: datatype -> numpy.
+_POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+
+class CloudError(ValueError):
+    """A PointCloud2 that is damaged, or not what is asked for."""
+
+
+def points_from_message(cloud: Any) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2.
+
+    Raises
+    ------
+    CloudError
+        No fields x, y, z of one floating-point type, one row only, or damaged.
+    """
+    records = _records(cloud)
+    columns: Any = records.dtype.fields or {}
+    kinds = {str(columns[name][0]) if name in columns else 'missing' for name in 'xyz'}
+    if kinds not in ({'float32'}, {'float64'}):
+        raise CloudError('cloud must have the fields x, y, z of one floating-point type')
+    if cloud.height < 2 and cloud.width > 1:
+        raise CloudError(f'cloud is not organised ({cloud.width}x{cloud.height})')
+    return np.stack([records[name] for name in 'xyz'], axis=-1)
+
+
+def planes_from_message(cloud: Any) -> NDArray[np.void]:
+    """Planes of a message of `~/planes`.
+
+    Parameters
+    ----------
+    cloud : sensor_msgs/PointCloud2
+        Of rclpy or rosbags.
+
+    Returns
+    -------
+    (N,) structured array, one row per plane, with the columns of `PLANE_TYPE`: `x`, `y`, `z`
+    (centroid, metres), `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance`
+    (metres: normal . p + distance = 0), `label`, `id`, `surface` (the same for parts of one plane
+    seen apart), `role` (index in `roles.ROLES`, 1 is floor), `count` (pixels), `rms` (metres),
+    `confidence` (0...1), `area` (square metres), `length`, `width`, `centre_x`, `centre_y`,
+    `centre_z` (of the rectangle around the region, metres), `orientation_x`, `orientation_y`,
+    `orientation_z`, `orientation_w` (quaternion of the frame with x along the length and z along
+    the normal), `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of the 4x4
+    covariance of normal x, y, z and distance d).
+
+    Raises
+    ------
+    CloudError
+        The message is damaged.
+    """
+    return _records(cloud).ravel()
+
+
+def _records(cloud: Any) -> NDArray[np.void]:
+    """Structured array (H, W) of the fields of a PointCloud2, native byte order."""
+    order = '>' if cloud.is_bigendian else '<'
+    try:
+        dtype = np.dtype(
+            {
+                'names': [field.name for field in cloud.fields],
+                'formats': [
+                    (order + _POINT_FIELD_TYPES[field.datatype], field.count)
+                    if field.count > 1
+                    else order + _POINT_FIELD_TYPES[field.datatype]
+                    for field in cloud.fields
+                ],
+                'offsets': [field.offset for field in cloud.fields],
+                'itemsize': cloud.point_step,
+            }
+        )
+    except (ValueError, KeyError) as error:
+        raise CloudError(f'cloud has contradictory fields: {error}') from None
+    data = np.frombuffer(cloud.data, np.uint8)
+    if cloud.height * cloud.width == 0:
+        return np.empty((cloud.height, cloud.width), dtype).astype(dtype.newbyteorder('='))
+    row = cloud.width * cloud.point_step
+    needed = cloud.row_step * (cloud.height - 1) + row
+    if cloud.row_step < row or data.size < needed:
+        raise CloudError(
+            f'{data.size} bytes of data are too few for {cloud.width}x{cloud.height} points of '
+            f'{cloud.point_step} bytes in rows of {cloud.row_step} bytes'
+        )
+    strides = (cloud.row_step, cloud.point_step)
+    records: NDArray[np.void] = np.ndarray((cloud.height, cloud.width), dtype, data, 0, strides)
+    return records.astype(dtype.newbyteorder('='))
+
+
+def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
+    """sensor_msgs/PointCloud2 with one point per plane; see `planes_from_message`."""
+    rows = np.array(
+        [
+            (
+                *plane.centroid,
+                *plane.normal,
+                plane.distance,
+                plane.label,
+                plane.id,
+                plane.surface,
+                ROLES.index(plane.role or 'other'),
+                plane.count,
+                plane.rms,
+                plane.confidence,
+                plane.area,
+                *plane.extents,
+                *plane.centre,
+                *plane.orientation,
+                *plane.covariance[np.triu_indices(4)],
+            )
+            for plane in planes
+        ],
+        PLANE_TYPE,
+    )
+    return _cloud(make, header, rows)
+
+
+def points_message(make: Make, header: Any, points: NDArray[np.floating]) -> Any:
+    """sensor_msgs/PointCloud2 of points (N, 3), metres."""
+    rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
+    return _cloud(make, header, rows)
+
+
+def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:
+    """sensor_msgs/PointCloud2 of one row, a point for each of the records (N,)."""
+    datatypes = {kind: number for number, kind in _POINT_FIELD_TYPES.items()}
+    fields = []
+    for name in rows.dtype.names or ():
+        column, offset = rows.dtype.fields[name][:2]  # type: ignore[index]
+        fields.append(
+            make(
+                'sensor_msgs/msg/PointField',
+                name=name,
+                offset=offset,
+                datatype=datatypes[column.str[1:]],
+                count=1,
+            )
+        )
+    return make(
+        'sensor_msgs/msg/PointCloud2',
+        header=header,
+        height=1,
+        width=rows.size,
+        fields=fields,
+        is_bigendian=False,
+        point_step=rows.dtype.itemsize,
+        row_step=rows.nbytes,
+        data=rows.view(np.uint8),
+        is_dense=True,
+    )

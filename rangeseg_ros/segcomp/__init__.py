@@ -1,0 +1,1 @@
+"""File formats and scanners of the segmentation comparison of Hoover et al."""

@@ -1,0 +1,200 @@
+"""The two scanners of the segmentation comparison of Hoover et al.: range values to points.
+
+Everything is in metres in the optical frame: x right, y down, z forward.
+
+References
+----------
+A. Hoover et al., "An experimental comparison of range image segmentation algorithms", IEEE TPAMI
+18(7), 1996; geometry as in its published conversion program, range-to-coords.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.segcomp.files import SIZE, SegcompError
+
+
+@dataclass(frozen=True)
+class AbwCalibration:
+    """Geometry of the ABW structured-light scanner, a pinhole camera.
+
+    The published formulas x = (c - 255) (v / scale + offset) / |f|,
+    y = (255 - r) / aspect (v / scale + offset) / |f|, z = (255 - v) / scale describe rays through
+    one centre at the depth v / scale + offset; here they are given in the optical frame of that
+    centre (x right, y down, z forward, metres; the published unit is taken as the millimetre).
+
+    Attributes
+    ----------
+    offset : float
+        Depth of range value 0, mm.
+    scale : float
+        Range values per mm.
+    focal : float
+        Focal length in columns.
+    """
+
+    offset: float
+    scale: float
+    focal: float
+
+    _ASPECT = 1.4508
+
+    @property
+    def camera(self) -> Camera:
+        """The scanner as a camera: 512 x 512, pixels lower than wide."""
+        return Camera(SIZE, SIZE, self.focal, self.focal * self._ASPECT, 255.0, 255.0)
+
+    def depth(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Depth in metres of range values; NaN for 0, which is shadow."""
+        array = np.asarray(values, dtype=float)
+        return np.where(array == 0, np.nan, (array / self.scale + self.offset) * 1e-3)
+
+    def values(self, depth: ArrayLike) -> NDArray[np.float64]:
+        """Range values, not yet rounded, of depths in metres; the inverse of `depth`."""
+        return (np.asarray(depth, dtype=float) * 1e3 - self.offset) * self.scale
+
+
+ABW_FIRST = AbwCalibration(785.410786, 0.773545, 1610.981722)
+ABW_SECOND = AbwCalibration(771.016866, 0.791686, 1586.072821)
+_FIRST_TEST_IMAGES = frozenset((0, 19, 21, 25, 27, 28, 29))
+
+
+def abw_calibration(number: int, split: str = 'test') -> AbwCalibration:
+    """Calibration of an ABW image, by its number in the `test` or `train` set."""
+    return ABW_FIRST if split == 'test' and number in _FIRST_TEST_IMAGES else ABW_SECOND
+
+
+def abw_points(values: ArrayLike, calibration: AbwCalibration) -> NDArray[np.float64]:
+    """Points of an ABW range image.
+
+    Parameters
+    ----------
+    values : (512, 512) integer or float
+        Range values; 0 is shadow.
+    calibration : AbwCalibration
+        From `abw_calibration`.
+
+    Returns
+    -------
+    (512, 512, 3) float64
+        Metres in the optical frame, NaN where shadow.
+    """
+    return calibration.camera.rays.astype(float) * calibration.depth(values)[..., None]
+
+
+def abw_range_image(values: ArrayLike, calibration: AbwCalibration) -> RangeImage:
+    """Range image of (512, 512) ABW range values.
+
+    Raises
+    ------
+    SegcompError
+        An image of another size.
+    """
+    _check_size(values, 'ABW')
+    return RangeImage.from_depth(calibration.depth(values).astype(np.float32), calibration.camera)
+
+
+class PerceptronRays(NamedTuple):
+    """Rays of the Perceptron's pixels in the optical frame, metres.
+
+    Attributes
+    ----------
+    origins : (512, 512, 3) float64
+        Where the beam leaves the second mirror; no single centre.
+    directions : (512, 512, 3) float64
+        Unit vectors.
+    lead : (512, 512) float64
+        Length of the beam inside the scanner, up to `origins`.
+    """
+
+    origins: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    lead: NDArray[np.float64]
+
+
+# The published program names no unit. With 4096 steps of 0.20236 the range covers 829 units:
+# 8.3 m in centimetres, the ambiguity interval of an 18 MHz modulation, and mirrors 3 and 5.5 cm
+# apart; millimetres would put the mirrors 3 mm from each other.
+_PERCEPTRON_UNIT = 0.01
+_STEP = 0.20236 * _PERCEPTRON_UNIT
+_STANDOFF = 830.3
+
+
+@cache
+def perceptron_rays() -> PerceptronRays:
+    """Rays of the Perceptron laser scanner with its rotating and its nodding mirror."""
+    h1, h2 = 3.0, 5.5
+    gamma = theta = np.pi / 4
+    pixel = np.arange(SIZE)
+    alpha = np.radians(51.65 * (255.5 - pixel) / SIZE)[None, :]
+    beta = np.radians(36.73 * (255.5 - pixel) / SIZE)[:, None]
+    dz = -h1 * (1 - np.cos(alpha)) / np.tan(gamma) + np.zeros_like(beta)
+    dy = dz * np.tan(theta + beta / 2)
+    dx = (h2 + dy) * np.tan(alpha)
+    lead = (dz - h2) + np.hypot(dx, h2 + dy)
+    # Published: x left, y up, z forward.
+    origins = np.stack([-dx, -dy, dz], axis=-1) * _PERCEPTRON_UNIT
+    directions = np.stack(
+        [
+            -np.sin(alpha) + np.zeros_like(beta),
+            -np.cos(alpha) * np.sin(beta),
+            np.cos(alpha) * np.cos(beta),
+        ],
+        axis=-1,
+    )
+    rays = PerceptronRays(origins, directions, lead * _PERCEPTRON_UNIT)
+    for array in rays:
+        array.setflags(write=False)
+    return rays
+
+
+def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
+    """Points of a Perceptron range image.
+
+    Parameters
+    ----------
+    values : (512, 512) integer or float
+        Range values.
+
+    Returns
+    -------
+    (512, 512, 3) float64
+        Metres in the optical frame: x right, y down, z forward, the origin at the second mirror.
+    """
+    rays = perceptron_rays()
+    length = (np.asarray(values, dtype=float) + _STANDOFF) * _STEP - rays.lead
+    return rays.origins + length[..., None] * rays.directions
+
+
+def perceptron_values(distance: ArrayLike) -> NDArray[np.float64]:
+    """Range values, not yet rounded, of distances along `perceptron_rays`, metres.
+
+    The inverse of `perceptron_points`: point = origin + distance * direction.
+    """
+    return (np.asarray(distance, dtype=float) + perceptron_rays().lead) / _STEP - _STANDOFF
+
+
+def perceptron_range_image(values: ArrayLike) -> RangeImage:
+    """Range image of (512, 512) Perceptron range values.
+
+    Raises
+    ------
+    SegcompError
+        An image of another size.
+    """
+    _check_size(values, 'Perceptron')
+    return RangeImage.from_points(perceptron_points(values))
+
+
+def _check_size(values: ArrayLike, sensor: str) -> None:
+    shape = np.shape(values)
+    if shape != (SIZE, SIZE):
+        raise SegcompError(f'{sensor} range images are {SIZE}x{SIZE}, not {shape}')
