@@ -31,6 +31,7 @@ lint: $(VENV)/linters
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/lint-imports
 
 # Editable, so that the sources in this folder are what runs.
 $(VENV)/installed: setup.py setup.cfg pyproject.toml

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_normals.directions import DirectionsError, directions, platonic, regular
+from rangeseg_ros import ConfigError
+from rangeseg_ros.core.by_normals.directions import directions, platonic, regular
 
 
 @pytest.mark.parametrize(('subdivisions', 'count'), list(enumerate([4, 17, 73, 305, 1249])))
@@ -77,5 +78,5 @@ def test_rejection_repeats_with_its_seed():
     ],
 )
 def test_impossible_counts_are_refused(distribution, count, message):
-    with pytest.raises(DirectionsError, match=message):
+    with pytest.raises(ConfigError, match=message):
         directions(distribution, count)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from rangeseg_ros.core.by_normals.directions import DirectionsError, check_count
+# Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
+PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
 
 
 class ConfigError(ValueError):
@@ -98,11 +100,15 @@ class Config:
     )
     moves: str = option(
         'expansion',
-        'method normals: alpha-expansion or alpha-beta-swap; the latter only with exact',
+        'method normals with exact: alpha-expansion or alpha-beta-swap; swap is refused elsewhere',
         choices=('expansion', 'swap'),
     )
     cycles: int = option(
-        5, 'method normals: rounds of moves at most; fewer when none helps', low=1, high=1000
+        5,
+        'method normals with exact: rounds of moves at most, fewer when none helps; nothing else '
+        'reads it',
+        low=1,
+        high=1000,
     )
     exact: bool = option(
         False,
@@ -222,10 +228,9 @@ class Config:
         for option_field in fields(self):
             value = _checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
-        try:
-            check_count(self.directions, self.direction_count)
-        except DirectionsError as error:
-            raise ConfigError(f'parameter direction_count: {error}') from None
+        check_directions(self.directions, self.direction_count)
+        if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
+            raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.warm_start and (self.method != 'normals' or self.exact):
             raise ConfigError('parameter warm_start is for method normals, without exact')
         if self.up_x == self.up_y == self.up_z == 0:
@@ -245,6 +250,26 @@ class Config:
             if name not in known:
                 raise ConfigError(f'unknown parameter {name!r}; known: {", ".join(sorted(known))}')
         return cls(**mapping)
+
+
+def check_directions(distribution: str, count: int) -> None:
+    """Raise ConfigError if `distribution` cannot give `count` directions."""
+    if distribution not in ('platonic', 'regular', 'spiral', 'random'):
+        raise ConfigError(f'unknown distribution of directions {distribution!r}')
+    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
+        counts = ', '.join(map(str, PLATONIC_COUNTS))
+        raise ConfigError(
+            f'parameter direction_count: platonic subdivision gives {counts} directions, '
+            f'not {count}'
+        )
+    if count < 1:
+        raise ConfigError(f'parameter direction_count must be positive, not {count}')
+    root = math.isqrt(count)
+    if distribution == 'regular' and (root * root != count or root % 2 == 0):
+        raise ConfigError(
+            'parameter direction_count: regular angles give an odd square (1, 9, 25 ... 1225) of '
+            f'directions, not {count}'
+        )
 
 
 def _checked(option_field: Any, value: Any) -> Any:

@@ -12,12 +12,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
+from rangeseg_ros.core.config import PLATONIC_COUNTS, check_directions
+
 _EQUATOR = 1e-9
-
-
-class DirectionsError(ValueError):
-    """A number of directions that the distribution cannot give."""
 
 
 def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float64]:
@@ -41,10 +38,10 @@ def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float
 
     Raises
     ------
-    DirectionsError
+    ConfigError
         Unknown distribution, or a count that it cannot give.
     """
-    check_count(distribution, count)
+    check_directions(distribution, count)
     if distribution == 'platonic':
         return platonic(PLATONIC_COUNTS.index(count))
     if distribution == 'regular':
@@ -52,22 +49,6 @@ def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float
     if distribution == 'spiral':
         return spiral(count)
     return hypercube_rejection(count, seed)
-
-
-def check_count(distribution: str, count: int) -> None:
-    """Raise DirectionsError if `distribution` cannot give `count` directions."""
-    if distribution not in ('platonic', 'regular', 'spiral', 'random'):
-        raise DirectionsError(f'unknown distribution of directions {distribution!r}')
-    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
-        counts = ', '.join(map(str, PLATONIC_COUNTS))
-        raise DirectionsError(f'platonic subdivision gives {counts} directions, not {count}')
-    if count < 1:
-        raise DirectionsError(f'the number of directions must be positive, not {count}')
-    root = math.isqrt(count)
-    if distribution == 'regular' and (root * root != count or root % 2 == 0):
-        raise DirectionsError(
-            f'regular angles give an odd square (1, 9, 25 ... 1225) of directions, not {count}'
-        )
 
 
 def platonic(subdivisions: int) -> NDArray[np.float64]:
