@@ -5,10 +5,14 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
 
-.PHONY: test demo demo-ros lint clean
+.PHONY: test quick demo demo-ros lint release-check clean
 
 test: $(VENV)/installed
 	$(BIN)/python -m pytest
+
+# Without the tests that take long or need ROS 2.
+quick: $(VENV)/installed
+	$(BIN)/python -m pytest -m 'not slow and not ros'
 
 demo: $(VENV)/installed
 	rm -rf demo
@@ -33,10 +37,16 @@ lint: $(VENV)/linters
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+release-check: $(VENV)/installed
+	.ci/release-check $(BIN)/python
+
+# The messages of ROS 2 Jazzy are compiled for NumPy 1.
+SYSTEM_NUMPY := $(if $(SYSTEM_ROS),'numpy<2')
+
 # Editable, so that the sources in this folder are what runs.
 $(VENV)/installed: setup.py setup.cfg pyproject.toml
 	$(PYTHON) -m venv $(SYSTEM_ROS) $(VENV)
-	$(BIN)/pip install --quiet --editable '.[test]'
+	$(BIN)/pip install --quiet --editable '.[test]' $(SYSTEM_NUMPY)
 ifeq ($(SYSTEM_ROS),)
 	$(BIN)/pip install --quiet --editable '.[jazzy]' || \
 	  echo 'No ROS 2 wheels for this platform: the tests of the node will be skipped.'

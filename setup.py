@@ -1,3 +1,4 @@
+import re
 from glob import glob
 from pathlib import Path
 
@@ -5,10 +6,15 @@ from setuptools import find_packages, setup
 
 package_name = 'rangeseg_ros'
 share = f'share/{package_name}'
+# No address, as the project has none yet: `url` and `project_urls` belong beside the version here,
+# and <url> in package.xml, once it is published.
+(version,) = re.findall(
+    r"^__version__ = '(.+)'$", Path(package_name, '__init__.py').read_text('utf-8'), re.MULTILINE
+)
 
 setup(
     name=package_name,
-    version='0.1.0',
+    version=version,
     description='Planar segmentation of range images by multi-label graph cuts, for ROS 2',
     long_description=Path('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
@@ -17,6 +23,22 @@ setup(
     maintainer='rangeseg_ros maintainers',
     maintainer_email='rangeseg-ros@example.org',
     license='GPL-3.0-or-later',
+    keywords=['ROS', 'depth image', 'range image', 'plane segmentation', 'graph cuts'],
+    classifiers=[
+        'Development Status :: 4 - Beta',
+        'Environment :: Console',
+        'Intended Audience :: Developers',
+        'Intended Audience :: Science/Research',
+        'License :: OSI Approved :: GNU General Public License v3 or later (GPLv3+)',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Programming Language :: Python :: 3.10',
+        'Programming Language :: Python :: 3.11',
+        'Programming Language :: Python :: 3.12',
+        'Programming Language :: Python :: 3.13',
+        'Topic :: Scientific/Engineering :: Image Recognition',
+        'Typing :: Typed',
+    ],
     packages=find_packages(include=[package_name, f'{package_name}.*']),
     package_data={package_name: ['py.typed', 'report/templates/*.html']},
     data_files=[
@@ -24,7 +46,8 @@ setup(
         (share, ['package.xml']),
         (f'{share}/launch', glob('launch/*.py')),
         (f'{share}/params', glob('params/*')),
-        # `ros2 run` looks here. colcon puts the console scripts here by setup.cfg, pip does not.
+        # `ros2 run` looks here. colcon puts the console scripts here as well, by setup.cfg; pip
+        # does not.
         (f'lib/{package_name}', glob('scripts/*')),
     ],
     python_requires='>=3.10',
@@ -32,10 +55,10 @@ setup(
         'click>=8.0',
         'jinja2>=3.0',
         'lz4',
-        'mapbox-earcut>=2.0,<3',
+        'mapbox-earcut>=1.0,<3',
         'matplotlib>=3.6',
         'mcap>=1.2.1',
-        'numba>=0.59',
+        'numba>=0.58.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'PyMaxflow>=1.3',
@@ -53,6 +76,7 @@ setup(
         # all of these, so do not install this extra beside one.
         'jazzy': [
             'ros-jazzy-rclpy',
+            'ros-jazzy-builtin-interfaces',
             'ros-jazzy-rmw-fastrtps-cpp',
             'ros-jazzy-sensor-msgs',
             'ros-jazzy-geometry-msgs',

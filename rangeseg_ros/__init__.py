@@ -8,6 +8,8 @@ from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.messages.clouds import planes_from_message
 
+__version__ = '0.1.0'
+
 __all__ = [
     'ROLES',
     'Camera',
@@ -19,5 +21,6 @@ __all__ = [
     'RangeImageError',
     'Segmentation',
     'Segmenter',
+    '__version__',
     'planes_from_message',
 ]

@@ -20,6 +20,8 @@ from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import kinect_camera
 
+pytestmark = pytest.mark.ros
+
 REPOSITORY = Path(__file__).parents[1]
 
 

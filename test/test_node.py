@@ -21,6 +21,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, Poi
 from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
 from rangeseg_ros.drawing import overlay
 
+pytestmark = pytest.mark.ros
+
 REPOSITORY = Path(__file__).parents[1]
 
 

@@ -20,6 +20,8 @@ from rangeseg_ros.messages.clouds import points_from_message
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
 
+pytestmark = pytest.mark.ros
+
 HEIGHT, WALL = 0.8, 3.0
 GRAVITY = 9.81
 

@@ -14,6 +14,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from rangeseg_ros.simulation.kinect import kinect_camera
 
+pytestmark = pytest.mark.ros
+
 
 @pytest.fixture(scope='module')
 def node():

@@ -10,6 +10,9 @@ from unittest import mock
 from xml.etree import ElementTree
 
 import pytest
+import yaml
+
+from rangeseg_ros import __version__
 
 ROOT = Path(__file__).parents[1]
 
@@ -24,15 +27,19 @@ def setup_arguments(monkeypatch):
     return setup.call_args.kwargs
 
 
-def test_setup_and_package_xml_agree(setup_arguments):
+def test_setup_package_xml_and_citation_agree(setup_arguments):
     package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
+    assert setup_arguments['version'] == citation['version'] == __version__
+    assert setup_arguments['license'] == citation['license']
     assert package.get('format') == '3'
     for tag in ('name', 'version', 'license'):
         assert package.findtext(tag) == setup_arguments[tag]
     assert package.findtext('export/build_type') == 'ament_python'
     (wheel_only,) = re.findall(r'pip install ([\w -]+?) -->', (ROOT / 'package.xml').read_text())
     keys = {
-        element.text.removeprefix('python3-').lower() for element in package.iter('exec_depend')
+        element.text.removeprefix('python3-').removesuffix('-pip').lower()
+        for element in package.iter('exec_depend')
     }
     aliases = {'pyyaml': 'yaml', 'opencv-python-headless': 'opencv'}
     for requirement in setup_arguments['install_requires']:
@@ -75,7 +82,7 @@ def test_launchers_match_the_console_scripts(setup_arguments):
         assert 'from {} import {}\n'.format(*target.split(':')) in launcher.read_text()
 
 
-def test_launcher_takes_the_python_of_its_prefix(tmp_path):
+def test_launchers_run_with_the_python_of_the_environment(tmp_path):
     launcher = tmp_path / 'lib/rangeseg_ros/rangeseg'
     launcher.parent.mkdir(parents=True)
     shutil.copy(ROOT / 'scripts/rangeseg', launcher)
@@ -88,7 +95,7 @@ def test_launcher_takes_the_python_of_its_prefix(tmp_path):
         capture_output=True,
         text=True,
         cwd=tmp_path,
-        env={'PATH': '/bin:/usr/bin'},
+        env={'PATH': f'{python.parent}:/bin:/usr/bin'},
     )
     assert done.stdout.startswith('Usage: rangeseg'), done.stderr
 

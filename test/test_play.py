@@ -16,6 +16,8 @@ from ros_bench import DEPTH, INFO, Bench, corner_depth
 from rangeseg_ros.io.bags import DepthBagWriter
 from rangeseg_ros.simulation.kinect import kinect_camera
 
+pytestmark = pytest.mark.ros
+
 PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
 RANGESEG = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 
