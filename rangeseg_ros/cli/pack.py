@@ -12,6 +12,7 @@ from rangeseg_ros.io.bags import BagError, DepthBagWriter
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.io.poses import PoseFileError, match_poses, read_pose
 
 SUFFIXES = ('.png', '.tif', '.tiff')
 
@@ -33,14 +34,30 @@ SUFFIXES = ('.png', '.tif', '.tiff')
     help='Images per second.',
 )
 @options.depth_scale
+@click.option(
+    '--poses',
+    'poses_dir',
+    type=options.FOLDER,
+    help='Folder of 4x4 matrices, the pose of the camera in the world for each image.',
+)
 def command(
-    frames_dir: Path, camera_file: Path, output: Path, rate: float, depth_scale: float | None
+    frames_dir: Path,
+    camera_file: Path,
+    output: Path,
+    rate: float,
+    depth_scale: float | None,
+    poses_dir: Path | None,
 ) -> None:
     """Pack the depth images (PNG, TIFF) of FRAMES_DIR into a rosbag2.
 
     Images are taken in the order of their names, 2 before 10. The topics are /depth/image_rect
     and /depth/camera_info. Images of 16 bits and 0.001 m stay as they are (16UC1), others become
     metres (32FC1).
+
+    A pose is a text file of 16 numbers, row by row: p_world = T p_camera, metres. That of an image
+    is <stem>.txt or <stem>.pose.txt, or else the one with the same number in its name. Poses
+    become /tf, from the frame world to camera_depth_optical_frame, at the stamps of the images;
+    an image whose pose is missing, not finite or not rigid has none.
     """
     paths = sorted(
         (path for path in frames_dir.iterdir() if path.suffix.lower() in SUFFIXES),
@@ -49,6 +66,8 @@ def command(
     if not paths:
         raise click.ClickException(f'{frames_dir}: no {", ".join(SUFFIXES)} images')
     camera = read_camera(camera_file)
+    poses = match_poses(paths, poses_dir) if poses_dir else {}
+    without: list[str] = []
     with DepthBagWriter(output, camera) as bag:
         for index, path in enumerate(options.progress(paths, len(paths), 'image')):
             depth = read_depth(path)
@@ -56,9 +75,21 @@ def command(
                 depth = np.float32(depth_scale or 1) * depth.astype(np.float32)
             elif depth_scale not in (None, 0.001):
                 depth = np.float32(depth_scale) * depth.astype(np.float32)
+            # Time 0 means 'not set' in ROS, so the first image is at one second.
+            stamp = 10**9 + round(index * 1e9 / rate)
             try:
-                # Time 0 means 'not set' in ROS, so the first image is at one second.
-                bag.write(depth, 10**9 + round(index * 1e9 / rate))
+                bag.write(depth, stamp)
             except BagError as error:
                 raise click.ClickException(f'{path}: {error}') from None
+            if poses_dir:
+                try:
+                    if path not in poses:
+                        raise PoseFileError(f'no pose for {path.name}')
+                    bag.write_pose(read_pose(poses[path]), stamp)
+                except PoseFileError as error:
+                    without.append(str(error))
     click.echo(f'{output}: {len(paths)} images')
+    if poses_dir:
+        more = f', and {len(without) - 1} more' if len(without) > 1 else ''
+        why = f', {len(without)} without: {without[0]}{more}' if without else ''
+        click.echo(f'{len(paths) - len(without)} poses{why}')

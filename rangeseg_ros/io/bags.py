@@ -13,8 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag2
+from rosbags.interfaces import Connection
 from rosbags.typesys import Stores
+from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
@@ -28,6 +31,7 @@ from rangeseg_ros.messages.images import (
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 
 class BagError(ValueError):
@@ -273,6 +277,7 @@ class DepthBagWriter:
 
     depth_topic = '/depth/image_rect'
     camera_topic = '/depth/camera_info'
+    transform_topic = '/tf'
 
     def __init__(
         self, path: Path, camera: Camera, frame_id: str = 'camera_depth_optical_frame'
@@ -295,6 +300,7 @@ class DepthBagWriter:
         self._info = self._writer.add_connection(
             self.camera_topic, CAMERA_INFO, typestore=self._store
         )
+        self._transforms: Connection | None = None
         return self
 
     def __exit__(
@@ -314,8 +320,7 @@ class DepthBagWriter:
                 f'not {depth.shape} {depth.dtype}'
             )
         types = self._store.types
-        time = types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
-        header = types['std_msgs/msg/Header'](time, self.frame_id)
+        header = self._header(stamp, self.frame_id)
         height, width = depth.shape
         little_endian = np.ascontiguousarray(depth, depth.dtype.newbyteorder('<'))
         image = types[IMAGE](
@@ -343,5 +348,31 @@ class DepthBagWriter:
             roi=types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
         )
         for connection, message in ((self._info, info), (self._image, image)):
-            data = self._store.serialize_cdr(message, connection.msgtype)
-            self._writer.write(connection, stamp, data)
+            self._append(connection, stamp, message)
+
+    def write_pose(self, pose: Transform, stamp: int, parent: str = 'world') -> None:
+        """Append to /tf where the camera is in `parent` at `stamp` nanoseconds."""
+        if self._transforms is None:
+            self._transforms = self._writer.add_connection(
+                self.transform_topic, TRANSFORMS, typestore=self._store
+            )
+        types = self._store.types
+        transform = types['geometry_msgs/msg/TransformStamped'](
+            header=self._header(stamp, parent),
+            child_frame_id=self.frame_id,
+            transform=types['geometry_msgs/msg/Transform'](
+                translation=types['geometry_msgs/msg/Vector3'](*pose.shift.tolist()),
+                rotation=types['geometry_msgs/msg/Quaternion'](
+                    *Rotation.from_matrix(pose.rotation).as_quat().tolist()
+                ),
+            ),
+        )
+        self._append(self._transforms, stamp, types[TRANSFORMS]([transform]))
+
+    def _header(self, stamp: int, frame_id: str) -> Any:
+        time = self._store.types['builtin_interfaces/msg/Time'](*divmod(stamp, 10**9))
+        return self._store.types['std_msgs/msg/Header'](time, frame_id)
+
+    def _append(self, connection: Connection, stamp: int, message: Any) -> None:
+        data = self._store.serialize_cdr(message, connection.msgtype)
+        self._writer.write(connection, stamp, data)

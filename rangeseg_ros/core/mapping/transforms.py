@@ -1,0 +1,297 @@
+"""Transforms between frames over time, with the semantics of tf2.
+
+References
+----------
+T. Foote, "tf: the transform library", IEEE TePRA 2013. K. Shoemake, "Animating rotation with
+quaternion curves", SIGGRAPH 1985 (slerp). REP 105 for the frames of mobile robots.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from operator import itemgetter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CACHE_TIME = 10 * 10**9
+"""Nanoseconds that the past of a frame is kept, as by default in tf2."""
+
+# What a quaternion's length, or a rotation matrix's product with its transpose, may be off one.
+_RIGID = 0.01
+
+
+class TransformError(ValueError):
+    """A transform that is not known, in words.
+
+    Attributes
+    ----------
+    may_come : bool
+        Whether it may be known later: a frame not heard of yet, or a time ahead of the last one.
+    """
+
+    def __init__(self, message: str, may_come: bool = False) -> None:
+        super().__init__(message)
+        self.may_come = may_come
+
+
+class Transform(NamedTuple):
+    """Rigid motion p -> rotation p + shift, from the coordinates of one frame to another's.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+    shift : (3,) float64
+        Metres.
+    """
+
+    rotation: NDArray[np.float64]
+    shift: NDArray[np.float64]
+
+    @classmethod
+    def identity(cls) -> Transform:
+        """The motion that leaves everything where it is."""
+        return cls(np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike) -> Transform:
+        """Motion of a 4x4 matrix, its rotation the nearest one.
+
+        Raises
+        ------
+        TransformError
+            Values that are not finite, or no rigid motion.
+        """
+        values = np.asarray(matrix, np.float64)
+        if values.shape != (4, 4):
+            raise TransformError(f'not a 4x4 matrix: shape {values.shape}')
+        if not np.isfinite(values).all():
+            raise TransformError('values are not finite')
+        turn = values[:3, :3]
+        off = np.abs(turn.T @ turn - np.eye(3)).max()
+        if off > _RIGID or np.linalg.det(turn) < 0 or (values[3] != (0, 0, 0, 1)).any():
+            raise TransformError('not a rigid motion')
+        left, _, right = np.linalg.svd(turn)
+        return cls(left @ right, values[:3, 3])
+
+    def inverse(self) -> Transform:
+        """The motion back."""
+        return Transform(self.rotation.T, -self.rotation.T @ self.shift)
+
+    def after(self, first: Transform) -> Transform:
+        """This motion after `first`."""
+        return Transform(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
+
+
+class _Sample(NamedTuple):
+    stamp: int
+    parent: str
+    rotation: NDArray[np.float64]
+    """Unit quaternion x, y, z, w."""
+    shift: NDArray[np.float64]
+
+    def transform(self) -> Transform:
+        return Transform(rotation_matrix(self.rotation), self.shift)
+
+
+_stamp = itemgetter(0)
+
+
+class TransformBuffer:
+    """The tree of frames as it was in the last seconds.
+
+    Every frame has one parent at a time. Between two samples of a transform, its shift is
+    interpolated linearly and its rotation along the shorter arc (slerp); before the first and
+    after the last one it is not known. Static transforms hold at any time. As in tf2 a second
+    sample of the same stamp is ignored. A sample that is `CACHE_TIME` older than the last one is
+    of a time that began anew, as of a looped recording: the past of its frame is forgotten.
+
+    Examples
+    --------
+    >>> buffer.insert('odom', 'base_link', stamp, rotation, shift)
+    >>> buffer.lookup('odom', 'camera', stamp)
+    """
+
+    def __init__(self) -> None:
+        self._moving: dict[str, list[_Sample]] = {}
+        self._static: dict[str, _Sample] = {}
+        self._frames: set[str] = set()
+
+    def insert(
+        self,
+        parent: str,
+        child: str,
+        stamp: int,
+        rotation: ArrayLike,
+        shift: ArrayLike,
+        static: bool = False,
+    ) -> None:
+        """Take in where a frame is in its parent.
+
+        Parameters
+        ----------
+        parent, child : str
+            Names of the frames; a leading slash does not count.
+        stamp : int
+            Nanoseconds.
+        rotation : (4,) float
+            Quaternion x, y, z, w that turns the child's coordinates to the parent's.
+        shift : (3,) float
+            The child's origin in the parent, metres.
+        static : bool
+            Holds at any time, and replaces what was known of the child.
+
+        Raises
+        ------
+        TransformError
+            No name, a frame in itself, values that are not finite, or a quaternion far from
+            unit length.
+        """
+        parent, child = parent.removeprefix('/'), child.removeprefix('/')
+        name = f'transform from {parent!r} to {child!r}'
+        if not parent or not child or parent == child:
+            raise TransformError(f'{name}: two different frames are needed')
+        turn, place = np.array(rotation, np.float64), np.array(shift, np.float64)
+        if not (np.isfinite(turn).all() and np.isfinite(place).all()):
+            raise TransformError(f'{name}: values are not finite')
+        length = float(np.linalg.norm(turn))
+        if abs(length - 1) > _RIGID:
+            raise TransformError(f'{name}: quaternion of length {length:g}')
+        self._frames |= {parent, child}
+        sample = _Sample(stamp, parent, turn / length, place)
+        if static:
+            self._static[child] = sample
+            self._moving.pop(child, None)
+            return
+        self._static.pop(child, None)
+        samples = self._moving.setdefault(child, [])
+        if samples and stamp < samples[-1].stamp - CACHE_TIME:
+            samples.clear()
+        at = bisect_left(samples, stamp, key=_stamp)
+        if at == len(samples) or samples[at].stamp != stamp:
+            insort(samples, sample, key=_stamp)
+            del samples[: bisect_left(samples, samples[-1].stamp - CACHE_TIME, key=_stamp)]
+
+    def clear(self) -> None:
+        """Forget all that moves; what is static holds."""
+        self._moving.clear()
+
+    def lookup(self, target: str, source: str, stamp: int) -> Transform:
+        """The motion that takes coordinates in `source` to those in `target`.
+
+        Parameters
+        ----------
+        target, source : str
+            Names of frames.
+        stamp : int
+            Nanoseconds; 0 for the last time at which all of the chain is known, as in tf2.
+
+        Raises
+        ------
+        TransformError
+            A frame that is not known, frames that are not connected, a loop, or a time outside
+            what is known.
+        """
+        target, source = target.removeprefix('/'), source.removeprefix('/')
+        for frame in (target, source):
+            if frame not in self._frames:
+                raise TransformError(f'frame {frame!r} is not known', may_come=True)
+        stamp = stamp or self._latest_common_time(target, source)
+        up, up_ends = self._ancestors(source, stamp)
+        down, down_ends = self._ancestors(target, stamp)
+        for frame, motion in down.items():
+            if frame in up:
+                return motion.inverse().after(up[frame])
+        failed = up_ends or down_ends
+        if failed:
+            raise failed
+        raise TransformError(f'frames {target!r} and {source!r} are not connected', may_come=True)
+
+    def _ancestors(
+        self, frame: str, stamp: int
+    ) -> tuple[dict[str, Transform], TransformError | None]:
+        """Motions from a frame to itself and all above it, and why it goes no higher."""
+        found = {frame: Transform.identity()}
+        while frame in self._static or frame in self._moving:
+            try:
+                sample = self._at(frame, stamp)
+            except TransformError as error:
+                return found, error
+            if sample.parent in found:
+                raise TransformError(f'frames form a loop: {" -> ".join([*found, sample.parent])}')
+            found[sample.parent] = sample.transform().after(found[frame])
+            frame = sample.parent
+        return found, None
+
+    def _at(self, frame: str, stamp: int) -> _Sample:
+        """Where a frame is in its parent at a time."""
+        if frame in self._static:
+            return self._static[frame]
+        samples = self._moving[frame]
+        after = bisect_left(samples, stamp, key=_stamp)
+        if after < len(samples) and samples[after].stamp == stamp:
+            return samples[after]
+        if after == 0:
+            behind = (samples[0].stamp - stamp) * 1e-9
+            raise TransformError(f'{frame!r} is not known until {behind:.3f} s after this time')
+        if after == len(samples):
+            ahead = (stamp - samples[-1].stamp) * 1e-9
+            raise TransformError(f'{frame!r} is known until {ahead:.3f} s before this time', True)
+        first, second = samples[after - 1 : after + 1]
+        if first.parent != second.parent:
+            return first
+        share = (stamp - first.stamp) / (second.stamp - first.stamp)
+        return _Sample(
+            stamp,
+            first.parent,
+            slerp(first.rotation, second.rotation, share),
+            first.shift + share * (second.shift - first.shift),
+        )
+
+    def _latest_common_time(self, target: str, source: str) -> int:
+        """Last time at which all moving transforms between two frames are known; 0 for none."""
+        chains = []
+        for frame in (target, source):
+            chain: dict[str, int | None] = {}
+            while frame not in chain:
+                samples = self._moving.get(frame)
+                sample = self._static.get(frame) or (samples[-1] if samples else None)
+                chain[frame] = sample.stamp if samples and sample else None
+                frame = sample.parent if sample else frame
+            chains.append(chain)
+        common = set(chains[0]) & set(chains[1])
+        times = []
+        for chain in chains:
+            for frame, time in chain.items():
+                if frame in common:
+                    break
+                times.append(time)
+        return min((time for time in times if time is not None), default=0)
+
+
+def slerp(
+    first: NDArray[np.float64], second: NDArray[np.float64], share: float
+) -> NDArray[np.float64]:
+    """Unit quaternion (4,) on the shorter arc between two, `share` of the way (Shoemake 1985)."""
+    cosine = float(first @ second)
+    second = -second if cosine < 0 else second
+    # By the chord, which unlike the cosine tells small angles apart.
+    angle = 2 * np.arcsin(min(float(np.linalg.norm(second - first)) / 2, 1.0))
+    if angle < 1e-9:
+        return first
+    mixed = np.sin((1 - share) * angle) * first + np.sin(share * angle) * second
+    unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
+    return unit
+
+
+def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation (3, 3) of a unit quaternion x, y, z, w."""
+    x, y, z, w = quaternion
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

@@ -1,0 +1,68 @@
+"""Transforms in recordings, for their images in turn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
+from rangeseg_ros.io.recordings import open_recording
+from rangeseg_ros.messages.transforms import insert_transforms
+
+MOVING, STATIC = '/tf', '/tf_static'
+# The latter in recordings of early ROS 1.
+TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
+
+
+class RecordedTransforms:
+    """What the node would know of frames when an image has waited for them.
+
+    All static transforms count from the beginning. Of the others, what was recorded up to
+    `timeout` after an image is known to it, as the node waits that long.
+
+    Parameters
+    ----------
+    path : Path
+        Of the recording.
+    timeout : float
+        Seconds; the parameter `tf_timeout`.
+    """
+
+    def __init__(self, path: Path, timeout: float) -> None:
+        self._recording = open_recording(path)
+        self._timeout = round(timeout * 1e9)
+        self._buffer = TransformBuffer()
+        self._messages = self._read()
+        self._next = next(self._messages, None)
+
+    def __enter__(self) -> RecordedTransforms:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._recording.close()
+
+    def lookup(self, target: str, source: str, stamp: int, time: int) -> Transform:
+        """As `TransformBuffer.lookup`, for an image recorded at `time`, nanoseconds."""
+        self._advance(time + self._timeout)
+        return self._buffer.lookup(target, source, stamp)
+
+    def _advance(self, time: int) -> None:
+        """Take in what was recorded up to a time."""
+        while self._next and self._next[0] <= time:
+            insert_transforms(self._buffer, self._next[1], static=False)
+            self._next = next(self._messages, None)
+
+    def _read(self) -> Iterator[tuple[int, Any]]:
+        try:
+            for _, _, message in self._messages_on(STATIC):
+                insert_transforms(self._buffer, message, static=True)
+            for _, time, message in self._messages_on(MOVING):
+                yield time, message
+        # The damage is told by whoever reads the images. Up to it all is used.
+        except Exception:
+            return
+
+    def _messages_on(self, topic: str) -> Iterator[tuple[str, int, Any]]:
+        there = self._recording.types.get(topic) in TYPES
+        return self._recording.messages([topic]) if there else iter(())

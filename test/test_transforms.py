@@ -1,0 +1,183 @@
+"""The buffer of transforms against motions in closed form and random trees."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.mapping.transforms import (
+    CACHE_TIME,
+    Transform,
+    TransformBuffer,
+    TransformError,
+)
+
+SECOND = 10**9
+
+
+class Motion:
+    """Constant velocity and turning, the motion that linear interpolation and slerp follow."""
+
+    def __init__(self, seed):
+        random = np.random.default_rng(seed)
+        self.start = Rotation.from_quat(random.standard_normal(4))
+        self.turning = random.uniform(-3, 3, 3)
+        self.place, self.velocity = random.uniform(-5, 5, (2, 3))
+
+    def at(self, seconds):
+        turn = Rotation.from_rotvec(self.turning * seconds) * self.start
+        return turn, self.place + self.velocity * seconds
+
+    def matrix(self, seconds):
+        turn, place = self.at(seconds)
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = turn.as_matrix(), place
+        return matrix
+
+
+def matrix_of(transform):
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = transform
+    return matrix
+
+
+def fill(buffer, parent, child, motion, stamps, flip=None):
+    for k, stamp in enumerate(stamps):
+        turn, place = motion.at(stamp / SECOND)
+        # q and -q are one rotation.
+        sign = -1 if flip is not None and flip[k % len(flip)] else 1
+        buffer.insert(parent, child, stamp, sign * turn.as_quat(), place)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_lookups_in_random_trees_equal_the_closed_form(data):
+    count = data.draw(st.integers(2, 8))
+    parents = [data.draw(st.integers(0, k - 1)) for k in range(1, count)]
+    flips = data.draw(st.lists(st.booleans(), min_size=1, max_size=5))
+    seed = data.draw(st.integers(0, 10**6))
+    times = data.draw(st.lists(st.integers(1, 5 * SECOND), min_size=1, max_size=12, unique=True))
+    # A fifth of a second apart, so that no turn is near half a revolution; in any order.
+    stamps = sorted({*range(1, 5 * SECOND, SECOND // 5), *times, 5 * SECOND})
+    order = np.random.default_rng(seed).permutation(stamps).tolist()
+    buffer, motions = TransformBuffer(), {}
+    for k, parent in enumerate(parents, start=1):
+        motion = motions[k] = Motion([seed, k])
+        if data.draw(st.booleans()):
+            motion.turning[:], motion.velocity[:] = 0, 0
+            turn, place = motion.at(0)
+            buffer.insert(f'f{parent}', f'f{k}', 0, turn.as_quat(), place, static=True)
+        else:
+            fill(buffer, f'f{parent}', f'f{k}', motion, order, flips)
+
+    def to_root(k, seconds):
+        matrix = np.eye(4)
+        while k:
+            matrix = motions[k].matrix(seconds) @ matrix
+            k = parents[k - 1]
+        return matrix
+
+    stamp = data.draw(st.integers(1, 5 * SECOND))
+    a, b = data.draw(st.integers(0, count - 1)), data.draw(st.integers(0, count - 1))
+    expected = np.linalg.solve(to_root(a, stamp / SECOND), to_root(b, stamp / SECOND))
+    found = buffer.lookup(f'f{a}', f'f{b}', stamp)
+    np.testing.assert_allclose(matrix_of(found), expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(
+        matrix_of(found.after(buffer.lookup(f'f{b}', f'f{a}', stamp))), np.eye(4), atol=1e-9
+    )
+
+
+def test_time_0_is_the_last_that_all_of_the_chain_knows():
+    buffer = TransformBuffer()
+    slow, fast = Motion(1), Motion(2)
+    fill(buffer, 'map', 'odom', slow, range(SECOND, 3 * SECOND, SECOND // 10))
+    fill(buffer, 'odom', 'base', fast, range(SECOND, 4 * SECOND, SECOND // 50))
+    buffer.insert('base', 'camera', 0, (0, 0, 0, 1), (0, 0, 1), static=True)
+    last = 2.9
+    expected = slow.matrix(last) @ fast.matrix(last)
+    expected[:3, 3] += expected[:3, 2]
+    np.testing.assert_allclose(matrix_of(buffer.lookup('map', 'camera', 0)), expected, atol=1e-9)
+    # What is above both does not count.
+    found = buffer.lookup('odom', 'camera', 0)
+    at = (4 * SECOND - SECOND // 50) / SECOND
+    np.testing.assert_allclose(found.rotation, fast.matrix(at)[:3, :3], atol=1e-9)
+
+
+def test_ancestors_that_are_not_needed_need_not_be_known():
+    buffer = TransformBuffer()
+    fill(buffer, 'map', 'odom', Motion(1), [SECOND])
+    fill(buffer, 'odom', 'base', Motion(2), [SECOND, 2 * SECOND])
+    buffer.lookup('odom', 'base', 3 * SECOND // 2)
+    with pytest.raises(TransformError, match="'odom' is known until") as failed:
+        buffer.lookup('map', 'base', 3 * SECOND // 2)
+    assert failed.value.may_come
+
+
+def test_errors_in_words():
+    buffer = TransformBuffer()
+    fill(buffer, 'odom', 'base', Motion(0), [SECOND, 2 * SECOND])
+    fill(buffer, 'elsewhere', 'other', Motion(0), [SECOND, 2 * SECOND])
+    for wrong, frames, stamp, may_come in (
+        ("'nowhere' is not known", ('odom', 'nowhere'), SECOND, True),
+        ('not connected', ('odom', 'other'), SECOND, True),
+        ('until 0.500 s before this time', ('odom', 'base'), 5 * SECOND // 2, True),
+        ('not known until 0.500 s after this time', ('odom', 'base'), SECOND // 2, False),
+    ):
+        with pytest.raises(TransformError, match=wrong) as failed:
+            buffer.lookup(*frames, stamp)
+        assert failed.value.may_come == may_come
+    fill(buffer, 'base', 'odom', Motion(0), [SECOND, 2 * SECOND])
+    with pytest.raises(TransformError, match='loop: base -> odom -> base'):
+        buffer.lookup('base', 'elsewhere', SECOND)
+    identity, nothing = (0, 0, 0, 1), (0, 0, 0)
+    for wrong, insert in (
+        ('two different frames', ('base', 'base', 1, identity, nothing)),
+        ('two different frames', ('', 'base', 1, identity, nothing)),
+        ('length 0', ('odom', 'base', 1, (0, 0, 0, 0), nothing)),
+        ('length 2', ('odom', 'base', 1, (0, 0, 0, 2), nothing)),
+        ('finite', ('odom', 'base', 1, (0, 0, 0, np.nan), nothing)),
+        ('finite', ('odom', 'base', 1, identity, (np.inf, 0, 0))),
+    ):
+        with pytest.raises(TransformError, match=wrong):
+            buffer.insert(*insert)
+
+
+def test_late_and_repeated_samples_a_new_parent_and_a_time_that_begins_anew():
+    buffer = TransformBuffer()
+    motion = Motion(3)
+    fill(buffer, 'odom', 'base', motion, [3 * SECOND // 2, SECOND])
+    buffer.insert('odom', 'base', SECOND, (0, 0, 0, 1), (9, 9, 9))  # ignored
+    found = buffer.lookup('odom', 'base', 5 * SECOND // 4)
+    np.testing.assert_allclose(matrix_of(found), motion.matrix(1.25), atol=1e-9)
+    # Between samples in two parents, the first one holds.
+    buffer.insert('dock', 'base', 2 * SECOND, (0, 0, 0, 1), (0, 0, 0))
+    held = buffer.lookup('odom', 'base', 7 * SECOND // 4)
+    np.testing.assert_allclose(matrix_of(held), motion.matrix(1.5), atol=1e-9)
+    buffer.lookup('dock', 'base', 2 * SECOND)
+    # The past is bounded, and ends where time begins anew.
+    fill(buffer, 'odom', 'base', motion, range(SECOND, 60 * SECOND, SECOND // 10))
+    with pytest.raises(TransformError, match='not known until'):
+        buffer.lookup('odom', 'base', 60 * SECOND - CACHE_TIME - SECOND)
+    fill(buffer, 'odom', 'base', motion, [SECOND, 6 * SECOND // 5])
+    found = buffer.lookup('odom', 'base', 11 * SECOND // 10)
+    np.testing.assert_allclose(matrix_of(found), motion.matrix(1.1), atol=1e-9)
+    with pytest.raises(TransformError, match='before this time'):
+        buffer.lookup('odom', 'base', 55 * SECOND)
+
+
+def test_matrices_that_are_no_motion_are_refused():
+    good = Motion(4).matrix(0)
+    np.testing.assert_allclose(matrix_of(Transform.from_matrix(good)), good, atol=1e-12)
+    for wrong, change in (
+        ('finite', lambda m: m.__setitem__((0, 3), np.nan)),
+        ('rigid', lambda m: m.__setitem__(slice(0, 3), 1.2 * m[:3])),
+        ('rigid', lambda m: m.__setitem__((slice(None), 0), -m[:, 0])),
+        ('rigid', lambda m: m.__setitem__((3, 0), 0.5)),
+    ):
+        bad = good.copy()
+        change(bad)
+        with pytest.raises(TransformError, match=wrong):
+            Transform.from_matrix(bad)
+    with pytest.raises(TransformError, match='4x4'):
+        Transform.from_matrix(np.eye(3))
