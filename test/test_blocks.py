@@ -11,6 +11,7 @@ from rangeseg_ros.core.by_planes.blocks import (
     weighted,
 )
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -22,14 +23,15 @@ def grid(height, width, seed=0):
     rays[..., 0] = (np.arange(width) - width / 2) / 50
     rays[..., 1] = ((np.arange(height) - height / 2) / 50)[:, None]
     inverse = rays @ np.array([0.1, -0.05, 0.5]) + random.normal(0, 0.002, (height, width))
-    horizontal = np.ones((height, width - 1), np.float32)
-    vertical = np.ones((height - 1, width), np.float32)
-    return inverse.astype(np.float32), rays, horizontal, vertical
+    edges = Grid(
+        np.ones((height, width - 1), np.float32), np.ones((height - 1, width), np.float32)
+    )
+    return inverse.astype(np.float32), rays, edges
 
 
 def test_blocks_are_sums_over_their_pixels():
-    inverse, rays, *edges = grid(12, 14)
-    blocks = block_moments(inverse, rays, *edges, 4)
+    inverse, rays, edges = grid(12, 14)
+    blocks = block_moments(inverse, rays, edges, 4)
     assert blocks.shape == (3, 4, SIZE)
     part = slice(4, 8), slice(8, 12)
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
@@ -41,7 +43,8 @@ def test_blocks_are_sums_over_their_pixels():
 
 def test_blocks_that_jumps_cross_are_left_out():
     """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
-    inverse, rays, horizontal, vertical = grid(12, 20)
+    inverse, rays, edges = grid(12, 20)
+    horizontal, vertical = edges
     horizontal[1, 1] = 0  # inside block (0, 0)
     vertical[6, 9] = 0  # inside block (1, 2)
     horizontal[9, 7] = 0  # between blocks (2, 1) and (2, 2)
@@ -49,7 +52,7 @@ def test_blocks_that_jumps_cross_are_left_out():
     inverse[1, 17] = 0
     horizontal[1, 16:18] = 0
     vertical[0:2, 17] = 0
-    count = block_moments(inverse, rays, horizontal, vertical, 4)[..., COUNT]
+    count = block_moments(inverse, rays, edges, 4)[..., COUNT]
     expected = np.full((3, 5), 16)
     expected[0, 0] = expected[1, 2] = 0
     expected[0, 4] = 15
@@ -59,9 +62,9 @@ def test_blocks_that_jumps_cross_are_left_out():
 @pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
 def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
     """30 % of 16 pixels are 4.8."""
-    inverse, rays, horizontal, vertical = grid(4, 4)
+    inverse, rays, edges = grid(4, 4)
     inverse.ravel()[:missing] = 0
-    block = block_moments(inverse, rays, horizontal, vertical, 4)[0, 0]
+    block = block_moments(inverse, rays, edges, 4)[0, 0]
     assert block[COUNT] == (16 - missing if kept else 0)
     assert block.any() == kept
 
@@ -72,7 +75,7 @@ def test_blocks_touch_along_half_of_their_border(shape):
     random = np.random.default_rng(sum(shape))
     horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
     vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
-    right, below = block_links(horizontal, vertical, 4)
+    right, below = block_links(Grid(horizontal, vertical), 4)
     rows, columns = -(-height // 4), -(-width // 4)
     assert right.shape == (rows, columns - 1) and below.shape == (rows - 1, columns)
     for i, j in np.ndindex(right.shape):
@@ -88,8 +91,8 @@ def noise_of(blocks, rays):
 
 def test_slopes_and_residuals_are_those_of_the_planes():
     random = np.random.default_rng(5)
-    inverse, rays, *edges = grid(40, 60)
-    blocks = block_moments(inverse, rays, *edges, 4)
+    inverse, rays, edges = grid(40, 60)
+    blocks = block_moments(inverse, rays, edges, 4)
     slope, residual = slopes_and_residuals(blocks, rays, 4)
     i, j = random.integers(0, (10, 15))
     part = slice(4 * i, 4 * i + 4), slice(4 * j, 4 * j + 4)
@@ -101,9 +104,9 @@ def test_slopes_and_residuals_are_those_of_the_planes():
 
 
 def test_residual_noise_is_unbiased():
-    inverse, rays, *edges = grid(200, 240, seed=3)
+    inverse, rays, edges = grid(200, 240, seed=3)
     inverse[0, 0] = 0  # an incomplete block does not count
-    at, variance = noise_of(block_moments(inverse, rays, *edges, 4), rays)
+    at, variance = noise_of(block_moments(inverse, rays, edges, 4), rays)
     assert len(at) == len(variance) == 50 * 60 - 1
     # 3000 blocks of 13 degrees of freedom: 0.7 % of standard error.
     assert variance.mean() == pytest.approx(0.002**2, rel=0.03)
@@ -111,9 +114,9 @@ def test_residual_noise_is_unbiased():
 
 
 def test_weights_count_in_variances_of_the_sensor():
-    inverse, rays, *edges = grid(80, 80, seed=4)
+    inverse, rays, edges = grid(80, 80, seed=4)
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
-    plain = block_moments(inverse, rays, *edges, 4)
+    plain = block_moments(inverse, rays, edges, 4)
     blocks = weighted(plain, sensor, np.zeros(plain.shape[:2]))
     theta, residual = fit_all(blocks.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.reshape(-1, SIZE))

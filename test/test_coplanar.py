@@ -7,6 +7,7 @@ import numpy as np
 from rangeseg_ros.core.fitting.coplanar import parts, touching
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.kinect import QUANTUM
@@ -21,12 +22,12 @@ def inverse_range(theta):
 
 
 def linked():
-    return np.ones((120, 159), np.float32), np.ones((119, 160), np.float32)
+    return Grid(np.ones((120, 159), np.float32), np.ones((119, 160), np.float32))
 
 
-def groups(regions, inverse, horizontal, vertical):
+def groups(regions, inverse, grid):
     fits = Fits.of(regions, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
-    edges = touching(regions, horizontal, vertical, int(regions.max()) + 1)
+    edges = touching(regions, grid, int(regions.max()) + 1)
     return parts(fits, edges).tolist()
 
 
@@ -40,26 +41,26 @@ def stripes(*borders):
 
 def test_parts_of_a_plane_that_touch_are_one():
     regions = stripes(0, 70, 120, 160)
-    assert groups(regions, inverse_range(WALL), *linked()) == [0, 1, 1, 1]
-    assert groups(stripes(0, 40, 160), inverse_range(WALL), *linked()) == [0, 2, 2]
+    assert groups(regions, inverse_range(WALL), linked()) == [0, 1, 1, 1]
+    assert groups(stripes(0, 40, 160), inverse_range(WALL), linked()) == [0, 2, 2]
 
 
 def test_what_a_jump_or_a_gap_parts_stays_apart():
-    regions, (horizontal, vertical) = stripes(0, 70, 160), linked()
-    horizontal[:, 69] = 0
-    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 1, 2]
-    horizontal[:40, 69] = 1  # a gap in the jump
-    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 1, 2]
-    horizontal[:60, 69] = 1
-    assert groups(regions, inverse_range(WALL), horizontal, vertical) == [0, 2, 2]
+    regions, grid = stripes(0, 70, 160), linked()
+    grid.right[:, 69] = 0
+    assert groups(regions, inverse_range(WALL), grid) == [0, 1, 2]
+    grid.right[:40, 69] = 1  # a gap in the jump
+    assert groups(regions, inverse_range(WALL), grid) == [0, 1, 2]
+    grid.right[:60, 69] = 1
+    assert groups(regions, inverse_range(WALL), grid) == [0, 2, 2]
     regions[:, 69] = 0
-    assert groups(regions, inverse_range(WALL), *linked()) == [0, 1, 2]
+    assert groups(regions, inverse_range(WALL), linked()) == [0, 1, 2]
 
 
 def test_faces_that_meet_in_a_crease_stay_apart():
     regions = stripes(0, 80, 160)
     inverse = np.where(regions == 1, inverse_range(WALL), inverse_range(SIDE))
-    assert groups(regions, inverse, *linked()) == [0, 1, 2]
+    assert groups(regions, inverse, linked()) == [0, 1, 2]
 
 
 def test_a_row_of_parts_does_not_bend_a_plane_round():
@@ -71,8 +72,8 @@ def test_a_row_of_parts_does_not_bend_a_plane_round():
     for first in range(1, 4):
         pair = np.isin(regions, (first, first + 1))
         two = np.where(pair, regions - first + 1, 0).astype(np.uint16)
-        assert groups(two, np.where(pair, bent, 0), *linked()) == [0, 1, 1]
-    assert len(set(groups(regions, bent, *linked()))) > 2
+        assert groups(two, np.where(pair, bent, 0), linked()) == [0, 1, 1]
+    assert len(set(groups(regions, bent, linked()))) > 2
 
 
 def test_the_plane_of_united_parts_is_that_of_the_whole():

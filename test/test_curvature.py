@@ -36,7 +36,7 @@ def verdict(inverse, regions, distortion=0.0, seed=0):
     bent = smooth_field(CAMERA.shape, (13.0, 22.0), random)
     inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    problem = Problem.of(image, SENSOR, *weights(image), 4)
+    problem = Problem.of(image, SENSOR, weights(image), 4)
     return curved(problem, regions.astype(np.uint16), SENSOR)
 
 

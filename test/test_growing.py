@@ -31,9 +31,9 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = weights(image, plane_deviation(image, Config().edge_step))
     model = SensorModel.from_config(Config(**sensor))
-    blocks = block_moments(image.inverse, image.rays, *edges, 4)
+    blocks = block_moments(image.inverse, image.rays, edges, 4)
     blocks = weighted(blocks, model, np.zeros(blocks.shape[:2]))
-    return surfaces(blocks, block_links(*edges, 4), 4, least)
+    return surfaces(blocks, block_links(edges, 4), 4, least)
 
 
 def covered(labels, label):
@@ -98,19 +98,6 @@ def test_parts_that_do_not_touch_are_surfaces_of_their_own():
     labels, moments = grown(np.where(pillar, plane([0, 0, 1.0]), plane(WALL)))
     left, front, right = labels[15, [0, 20, 39]]
     assert len({left, front, right, 0}) == 4 and len(moments) == 4
-
-
-@pytest.mark.parametrize('step', [0.0, 4 * QUANTUM])
-def test_a_neck_narrower_than_a_block_joins_what_lies_on_one_plane(step):
-    """The edge of a box reaches down to the last two rows; the wall goes on, or a nearer one."""
-    box = (COLUMNS >= 76) & (COLUMNS < 84) & (ROWS < 118)
-    wall = plane(WALL) + step * (COLUMNS >= 80)
-    labels, moments = grown(np.where(box, plane([0, 0, 1.0]), wall))
-    left, front, right = labels[:, :18].max(), labels[15, 19], labels[:, 22:].max()
-    assert 0 < left != front and 0 < right != front
-    assert covered(labels[:, :18], left) > 0.9 and covered(labels[:, 22:], right) > 0.9
-    assert (left == right) == (step == 0)
-    assert moments[left, COUNT] == 16 * (labels == left).sum()
 
 
 def test_surfaces_below_the_least_are_left_out():

@@ -1,6 +1,5 @@
 """Planes as labels: energy, descent and expansions against literal sums and exhaustive search."""
 
-from dataclasses import replace
 from itertools import product
 
 import cv2
@@ -44,7 +43,7 @@ def random_case(seed, height, width, count=3):
     # Half of chi-squared, one to four variances granted.
     models = Models(theta, 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)]))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
-    return Problem.of(image, SENSOR, *edges, BLOCK), models, labels.astype(np.int32)
+    return Problem.of(image, SENSOR, edges, BLOCK), models, labels.astype(np.int32)
 
 
 def unary(problem, models):
@@ -134,9 +133,9 @@ def test_weights_are_inverse_variances():
 
 def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
-    white = replace(SENSOR, correlation=0.0)
+    white = SENSOR._replace(correlation=0.0)
     links, of_white = (
-        Problem.of(image, sensor, *weights(image), BLOCK).links for sensor in (SENSOR, white)
+        Problem.of(image, sensor, weights(image), BLOCK).links for sensor in (SENSOR, white)
     )
     assert SENSOR.patch > 2 and white.patch == 1
     np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
@@ -222,10 +221,10 @@ def small_room(seed=900):
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config())
     edges = weights(image)
-    blocks = block_moments(image.inverse, image.rays, *edges, BLOCK)
+    blocks = block_moments(image.inverse, image.rays, edges, BLOCK)
     blocks = weighted(blocks, sensor, np.zeros(blocks.shape[:2]))
-    found = surfaces(blocks, block_links(*edges, BLOCK), BLOCK)
-    return Problem.of(image, sensor, *edges, BLOCK), found, sensor
+    found = surfaces(blocks, block_links(edges, BLOCK), BLOCK)
+    return Problem.of(image, sensor, edges, BLOCK), found, sensor
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):

@@ -11,13 +11,13 @@ from rangeseg_ros.core.regions import (
     is_noise,
     merge,
     plane_regions,
-    rejoined,
     without,
 )
+from rangeseg_ros.core.sensing.grid import Grid
 
 
 def uncut(shape):
-    return np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1]))
+    return Grid(np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1])))
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -33,7 +33,7 @@ def test_components_of_random_images(seed):
     i = np.concatenate([index[:, :-1][right], index[:-1][below]])
     j = np.concatenate([index[:, 1:][right], index[1:][below]])
     count, expected = graph_components(coo_array((np.ones(len(i)), (i, j)), (h * w, h * w)))
-    found = connected_components(labels, horizontal, vertical)
+    found = connected_components(labels, Grid(horizontal, vertical))
     pairs = np.unique(np.stack([found.ravel(), expected]), axis=1)
     assert pairs.shape[1] == count == len(np.unique(found))
 
@@ -82,7 +82,7 @@ def test_noise_regions_are_left_marked_or_merged(noise_regions, line, speck):
     labels[:, 20] = 5
     labels[10, 10] = 5
     config = Config(noise_regions=noise_regions, min_pixels=30)
-    found = plane_regions(labels, np.ones((40, 40), bool), *uncut((40, 40)), config)
+    found = plane_regions(labels, np.ones((40, 40), bool), uncut((40, 40)), config)
     assert found[20, 5] == 1
     assert found[20, 35] in (1, 2)
     assert (found[20, 20] > 0) == (line > 0)
@@ -95,38 +95,6 @@ def test_small_regions_and_shadow_are_no_plane():
     valid = np.ones((20, 20), bool)
     valid[:, 15:] = False
     config = Config(min_pixels=26, noise_regions='leave')
-    found = plane_regions(labels, valid, *uncut((20, 20)), config)
+    found = plane_regions(labels, valid, uncut((20, 20)), config)
     assert not found[:5, :5].any() and not found[:, 15:].any()
     assert (found[5:, :15] == 1).all()
-
-
-def test_what_an_edge_cut_off_rejoins_the_region_of_its_label():
-    labels = np.array([[1, 1, 1, 2, 2], [1, 1, 1, 2, 2], [0, 0, 0, 2, 1], [3, 3, 3, 2, 1]])
-    regions = np.array(
-        [[1, 0, 0, 0, 2], [1, 0, 1, 0, 0], [0, 0, 0, 2, 0], [0, 0, 0, 0, 0]], np.uint16
-    )
-    kept = regions.copy()
-    # Label 3 has no region, and that of label 1 does not reach round the corner.
-    assert rejoined(regions, labels).tolist() == [
-        [1, 1, 1, 2, 2],
-        [1, 1, 1, 2, 2],
-        [0, 0, 0, 2, 0],
-        [0, 0, 0, 2, 0],
-    ]
-    np.testing.assert_array_equal(regions, kept)
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_rejoined_pixels_are_linked_to_a_region_of_their_label(seed):
-    """Against the components of like labels: those with one region become all of it."""
-    random = np.random.default_rng(seed)
-    labels = random.integers(0, 3, (12, 15))
-    components = connected_components(labels, *uncut(labels.shape))
-    chosen = random.random(components.max() + 1) < 0.5
-    regions = np.zeros(labels.shape, np.uint16)
-    for component in np.flatnonzero(chosen):
-        pixels = np.flatnonzero((components == component) & (labels > 0))
-        if len(pixels):
-            regions.ravel()[random.choice(pixels, 1 + len(pixels) // 3)] = component
-    expected = np.where(chosen[components] & (labels > 0), components, 0)
-    np.testing.assert_array_equal(rejoined(regions, labels), expected)

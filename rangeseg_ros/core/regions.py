@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.grid import Grid
 
 
 def plane_regions(
     labels: NDArray[np.integer],
     valid: NDArray[np.bool_],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     config: Config,
 ) -> NDArray[np.uint16]:
     """Segmentation of a labelling: its connected components that are large enough for planes.
@@ -24,8 +24,7 @@ def plane_regions(
     labels : (H, W) int
     valid : (H, W) bool
         Pixels without measurement become no plane.
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
+    grid : Grid
     config : Config
         `noise_regions` and `min_pixels` are read.
 
@@ -34,7 +33,7 @@ def plane_regions(
     (H, W) uint16
         0 = no plane, 1...M by falling size.
     """
-    regions = connected_components(labels, horizontal, vertical, valid)
+    regions = connected_components(labels, grid, valid)
     area, perimeter = _measures(regions)
     if config.noise_regions != 'leave':
         noise = _thin(area, perimeter)
@@ -46,45 +45,9 @@ def plane_regions(
     return translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
 
 
-@njit(cache=True)
-def rejoined(regions: NDArray[np.uint16], labels: NDArray[np.integer]) -> NDArray[np.uint16]:
-    """Give pixels of no region to the region of their label that they touch.
-
-    For labels that are planes: what a jump edge cuts off from a region of the same plane, too
-    little to be a region itself, is no jump away from it.
-
-    Parameters
-    ----------
-    regions : (H, W) uint16
-        0...M, 0 for no region.
-    labels : (H, W) int
-        0 = no plane.
-    """
-    height, width = regions.shape
-    regions = regions.copy()
-    queue = [(0, 0)]
-    queue.clear()
-    for i in range(height):
-        for j in range(width):
-            if regions[i, j] > 0 or labels[i, j] == 0:
-                continue
-            for ni, nj in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
-                if 0 <= ni < height and 0 <= nj < width and regions[ni, nj] > 0:
-                    queue.append((ni, nj))
-    for i, j in queue:
-        for ni, nj in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
-            if not (0 <= ni < height and 0 <= nj < width):
-                continue
-            if regions[ni, nj] == 0 and labels[ni, nj] == labels[i, j]:
-                regions[ni, nj] = regions[i, j]
-                queue.append((ni, nj))
-    return regions
-
-
 def connected_components(
     labels: NDArray[np.integer],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     valid: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.int32]:
     """4-connected components of like labels that cross no disconnected edge.
@@ -92,8 +55,7 @@ def connected_components(
     Parameters
     ----------
     labels : (H, W) int
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights, 0 where disconnected.
+    grid : Grid
     valid : (H, W) bool, optional
         Pixels to look at, all by default.
 
@@ -104,14 +66,13 @@ def connected_components(
     """
     if valid is None:
         valid = np.ones(labels.shape, np.bool_)
-    return _components(labels, horizontal, vertical, valid)
+    return _components(labels, grid, valid)
 
 
 @njit(cache=True)
 def _components(
     labels: NDArray[np.integer],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     valid: NDArray[np.bool_],
 ) -> NDArray[np.int32]:
     """Two passes over the image with a table of equivalent labels (thesis 3.1.1)."""
@@ -127,8 +88,8 @@ def _components(
                 found[i, j] = 0
                 continue
             here = labels[i, j]
-            left = j > 0 and horizontal[i, j - 1] > 0 and labels[i, j - 1] == here
-            up = i > 0 and vertical[i - 1, j] > 0 and labels[i - 1, j] == here
+            left = j > 0 and grid.right[i, j - 1] > 0 and labels[i, j - 1] == here
+            up = i > 0 and grid.below[i - 1, j] > 0 and labels[i - 1, j] == here
             left &= found[i, j - 1] > 0
             up &= found[i - 1, j] > 0
             if left:

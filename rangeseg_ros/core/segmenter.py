@@ -13,30 +13,16 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_normals import coarse_to_fine
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.normals import observed_normals
-from rangeseg_ros.core.by_planes.blocks import (
-    block_links,
-    block_moments,
-    block_size,
-    residual_noise,
-    slopes_and_residuals,
-    weighted,
-)
-from rangeseg_ros.core.by_planes.curvature import curved
-from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.plane_energy import Problem
-from rangeseg_ros.core.by_planes.plane_energy import energy as plane_energy
-from rangeseg_ros.core.by_planes.surfaces import surfaces
+from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, described
-from rangeseg_ros.core.fitting.coplanar import parts, touching
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.graphcut import moves
 from rangeseg_ros.core.graphcut.energy import angle, energy
-from rangeseg_ros.core.regions import by_falling_size, plane_regions, rejoined, translated, without
+from rangeseg_ros.core.regions import plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
-from rangeseg_ros.core.runtime.threads import aside
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -97,59 +83,33 @@ class Segmenter:
         config, watch = self.config, Stopwatch()
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        horizontal, vertical = weights(image, jump_edges(image, config), config.weighting)
+        grid = weights(image, jump_edges(image, config), config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, fits, value = method(image, horizontal, vertical, watch)
+        regions, fits, value = method(image, grid, watch)
         planes = described(regions, image, fits)
         watch.lap('planes')
         return Segmentation(regions, planes, watch.laps, _reason(image, planes), value)
 
     def _by_planes(
-        self,
-        image: RangeImage,
-        horizontal: NDArray[np.float32],
-        vertical: NDArray[np.float32],
-        watch: Stopwatch,
+        self, image: RangeImage, grid: Grid, watch: Stopwatch
     ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
         """Regions, their planes and the energy, by planes as labels."""
-        size = block_size(image.shape)
-        blocks = block_moments(image.inverse, image.rays, horizontal, vertical, size)
-        slope, residual = slopes_and_residuals(blocks, image.rays, size)
-        noise = residual_noise(blocks, residual, size)
-        sensor = SensorModel.from_config(self.config).measured(*noise)
-        watch.lap('blocks')
-        pending = aside(Problem.of, image, sensor, horizontal, vertical, size)
-        links = block_links(horizontal, vertical, size)
-        # A region may gain as much again from pixels that no block could take.
-        least = self.config.min_pixels // 2 or 1
-        surface, moments = surfaces(weighted(blocks, sensor, slope), links, size, least)
-        problem = pending.result()
-        watch.lap('surfaces')
-        labels, models = refine(
-            problem, surface, moments, sensor, self.config.exact, self.config.refits
-        )
-        watch.lap('labels')
-        image_labels = labels.reshape(image.shape)
-        regions = plane_regions(image_labels, image_labels > 0, horizontal, vertical, self.config)
-        regions = rejoined(regions, image_labels)
-        regions = without(regions, curved(problem, regions, sensor))
+        labelling = by_planes.segment(image, grid, self.config, watch.lap)
+        labels = labelling.labels
+        regions = labelling.flat(plane_regions(labels, labels > 0, grid, self.config))
         watch.lap('regions')
-        regions, fits = _united(regions, image, sensor, horizontal, vertical)
-        return regions, fits, lambda: plane_energy(labels, problem, models)
+        regions, fits = by_planes.united(regions, image, labelling.sensor, grid)
+        return regions, fits, labelling.energy
 
     def _by_normals(
-        self,
-        image: RangeImage,
-        horizontal: NDArray[np.float32],
-        vertical: NDArray[np.float32],
-        watch: Stopwatch,
+        self, image: RangeImage, grid: Grid, watch: Stopwatch
     ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
         """The same by discretised normals as labels (thesis 5.11)."""
         config = self.config
-        normals = observed_normals(image, horizontal, vertical, config)
+        normals = observed_normals(image, *grid, config)
         watch.lap('normals')
-        problem = normals, self._directions, horizontal, vertical, config.smoothness
+        problem = normals, self._directions, *grid, config.smoothness
         if config.exact:
             labels = moves.minimise(*problem, config.cycles, config.moves)
         else:
@@ -157,13 +117,13 @@ class Segmenter:
             if config.warm_start:
                 self._before = image.camera, labels
         watch.lap('labels')
-        regions = plane_regions(labels, image.valid, horizontal, vertical, config)
+        regions = plane_regions(labels, image.valid, grid, config)
         watch.lap('regions')
 
         def value() -> float:
             chosen = self._directions.T.astype(np.float32)[:, labels]
             data = angle(np.moveaxis(normals, 2, 0), chosen)
-            return energy(data, labels, horizontal, vertical, config.smoothness)
+            return energy(data, labels, *grid, config.smoothness)
 
         return regions, Fits.of(regions, image, SensorModel.from_config(config)), value
 
@@ -173,27 +133,6 @@ class Segmenter:
             return None
         camera, labels = self._before
         return labels if camera == image.camera and labels.shape == image.shape else None
-
-
-def _united(
-    regions: NDArray[np.uint16],
-    image: RangeImage,
-    sensor: SensorModel,
-    horizontal: NDArray[np.float32],
-    vertical: NDArray[np.float32],
-) -> tuple[NDArray[np.uint16], Fits]:
-    """Unite regions that touch and whose planes agree; the regions and their planes."""
-    count = int(regions.max()) + 1
-    edges = aside(touching, regions, horizontal, vertical, count)
-    fits = Fits.of(regions, image, sensor)
-    group = parts(fits, edges.result())
-    if (group == np.arange(count)).all():
-        return regions, fits
-    pixels = np.zeros(count, np.intp)
-    np.add.at(pixels, group, fits.pixels)
-    pixels[0] = 0
-    table = by_falling_size(pixels)[group]
-    return translated(regions, table), fits.united(table, image.camera is not None)
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -7,8 +7,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, SLOPE, fit
-from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
 
 # Share of a block that must have been measured.
 _MEASURED = 0.7
@@ -28,8 +33,7 @@ def block_size(shape: tuple[int, int]) -> int:
 def block_moments(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    horizontal: NDArray[np.float32],
-    vertical: NDArray[np.float32],
+    grid: Grid,
     size: int,
 ) -> NDArray[np.float64]:
     """Moments, with unit weights, of the blocks that nothing disturbs.
@@ -38,8 +42,8 @@ def block_moments(
     ----------
     inverse, rays : (H, W), (H, W, 3) float32
         Range image; inverse is 0 where nothing was measured.
-    horizontal, vertical : (H, W-1), (H-1, W) float32
-        Neighbourhood weights, 0 across jumps.
+    grid : Grid
+        0 across jumps.
     size : int
         Rows and columns of a block.
 
@@ -50,7 +54,7 @@ def block_moments(
     """
     height, width = inverse.shape
     moments = np.zeros((-(-height // size), -(-width // size), SIZE))
-    strips(_block_moments, len(moments), inverse, rays, horizontal, vertical, size, moments)
+    strips(_block_moments, len(moments), inverse, rays, grid, size, moments)
     return moments
 
 
@@ -60,8 +64,7 @@ def _block_moments(
     after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    horizontal: NDArray[np.float32],
-    vertical: NDArray[np.float32],
+    grid: Grid,
     size: int,
     moments: NDArray[np.float64],
 ) -> None:
@@ -88,24 +91,21 @@ def _block_moments(
                     square += y * y
                     count += 1
                     if j + 1 < right and inverse[i, j + 1] > 0:
-                        whole &= horizontal[i, j] > 0
+                        whole &= grid.right[i, j] > 0
                     if i + 1 < bottom and inverse[i + 1, j] > 0:
-                        whole &= vertical[i, j] > 0
+                        whole &= grid.below[i, j] > 0
             if whole and count >= _MEASURED * size * size:
                 for entry, value in enumerate((a, b, c, d, e, f, p, q, r, square, count)):
                     moments[bi, bj, entry] = value
 
 
 @njit(cache=True)
-def block_links(
-    horizontal: NDArray[np.float32], vertical: NDArray[np.float32], size: int
-) -> Links:
+def block_links(grid: Grid, size: int) -> Links:
     """Whether a block touches its right, its lower neighbour: along half of their border at least.
 
     Parameters
     ----------
-    horizontal, vertical : (H, W-1), (H-1, W) float32
-        Neighbourhood weights.
+    grid : Grid
     size : int
         Rows and columns of a block.
 
@@ -113,7 +113,7 @@ def block_links(
     -------
     right, below : (rows, columns-1), (rows-1, columns) bool
     """
-    height, width = len(horizontal), vertical.shape[1]
+    height, width = len(grid.right), grid.below.shape[1]
     rows, columns = -(-height // size), -(-width // size)
     right = np.zeros((rows, columns - 1), np.bool_)
     below = np.zeros((rows - 1, columns), np.bool_)
@@ -121,13 +121,13 @@ def block_links(
         for bj in range(columns - 1):
             touching = 0
             for i in range(bi * size, min((bi + 1) * size, height)):
-                touching += horizontal[i, (bj + 1) * size - 1] > 0
+                touching += grid.right[i, (bj + 1) * size - 1] > 0
             right[bi, bj] = 2 * touching >= size
     for bi in range(rows - 1):
         for bj in range(columns):
             touching = 0
             for j in range(bj * size, min((bj + 1) * size, width)):
-                touching += vertical[(bi + 1) * size - 1, j] > 0
+                touching += grid.below[(bi + 1) * size - 1, j] > 0
             below[bi, bj] = 2 * touching >= size
     return right, below
 
@@ -191,6 +191,7 @@ def residual_noise(
     return np.sqrt(blocks[complete, CHI2]) / size, residual[complete] / (size * size - 3)
 
 
+@njit(cache=True)
 def weighted(
     blocks: NDArray[np.float64], sensor: SensorModel, slope: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -204,27 +205,6 @@ def weighted(
     slope : (rows, columns) float64
         See `slopes_and_residuals`.
     """
-    return _weighted(
-        blocks,
-        slope,
-        sensor.pixel_noise,
-        sensor.noise,
-        sensor.range_noise,
-        sensor.distortion,
-        sensor.range_distortion,
-    )
-
-
-@njit(cache=True)
-def _weighted(
-    blocks: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    pixel_noise: float,
-    noise: float,
-    range_noise: float,
-    distortion: float,
-    range_distortion: float,
-) -> NDArray[np.float64]:
     result = np.zeros_like(blocks)
     for i in range(blocks.shape[0]):
         for j in range(blocks.shape[1]):
@@ -232,13 +212,12 @@ def _weighted(
             if count == 0:
                 continue
             squared = blocks[i, j, CHI2] / count
-            level = FLOOR + noise**2 + (range_noise * squared) ** 2
-            tilt = (pixel_noise * slope[i, j]) ** 2 / level
+            level = random_variance(sensor, squared)
+            tilt = (sensor.pixel_noise * slope[i, j]) ** 2 / level
             weight = 1 / (level * (1 + tilt))
             for entry in range(COUNT):
                 result[i, j, entry] = weight * blocks[i, j, entry]
-            systematic = distortion**2 + (range_distortion * squared) ** 2
             result[i, j, COUNT] = count
-            result[i, j, RATIO] = count * weight * systematic
+            result[i, j, RATIO] = count * weight * systematic_variance(sensor, squared)
             result[i, j, SLOPE] = count * tilt
     return result

@@ -16,9 +16,14 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
 from rangeseg_ros.core.graphcut.expansion import grid_links
 from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
 
 # For each pixel that has to agree with its neighbour to count as one measurement.
 _SMOOTHNESS = 1.2
@@ -58,26 +63,23 @@ class Problem(NamedTuple):
         cls,
         image: RangeImage,
         sensor: SensorModel,
-        horizontal: NDArray[np.float32],
-        vertical: NDArray[np.float32],
+        grid: Grid,
         block: int,
     ) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor."""
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
-        weight = _weights(inverse, sensor.noise, sensor.range_noise)
-        prior = grid_links(horizontal, vertical, _SMOOTHNESS * sensor.patch)
+        weight = _weights(inverse, sensor)
+        prior = grid_links(*grid, _SMOOTHNESS * sensor.patch)
         return cls(inverse, rays, weight, prior, image.shape[1], block)
 
 
 @njit(cache=True, nogil=True)
-def _weights(
-    inverse: NDArray[np.float32], noise: float, range_noise: float
-) -> NDArray[np.float32]:
+def _weights(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float32]:
     weight = np.zeros_like(inverse)
     for p in range(len(inverse)):
         y = np.float64(inverse[p])
         if y > 0:
-            weight[p] = 1 / (FLOOR + noise**2 + (range_noise * y * y) ** 2)
+            weight[p] = 1 / random_variance(sensor, y * y)
     return weight
 
 
@@ -164,9 +166,7 @@ def region_moments(
     (count, 13) float64
         Zeros for label 0.
     """
-    arrays = labels, count, inverse, rays, weight
-    distortion = sensor.distortion, sensor.range_distortion
-    upper, lower = halves(_sum_moments, len(labels), *arrays, *distortion)
+    upper, lower = halves(_sum_moments, len(labels), labels, count, inverse, rays, weight, sensor)
     return upper + lower
 
 
@@ -179,8 +179,7 @@ def _sum_moments(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     weight: NDArray[np.float32],
-    distortion: float,
-    range_distortion: float,
+    sensor: SensorModel,
 ) -> NDArray[np.float64]:
     total = np.zeros((count, SIZE))
     width = labels.shape[1]
@@ -204,7 +203,7 @@ def _sum_moments(
                 p, q, r = p + x0 * wy, q + x1 * wy, r + x2 * wy
                 square += wy * y
                 pixels += 1
-                ratio += w * (distortion**2 + (range_distortion * y * y) ** 2)
+                ratio += w * systematic_variance(sensor, y * y)
                 j += 1
             sums = (a, b, c, d, e, f, p, q, r, square, pixels, ratio)
             for entry, value in enumerate(sums):

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Links
-from rangeseg_ros.core.by_planes.patches import WITHIN_PATCH, misfit, patches, roots
+from rangeseg_ros.core.by_planes.patches import misfit, patches, roots
 from rangeseg_ros.core.runtime.threads import halves
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, common_residual, fit
 
@@ -29,8 +29,6 @@ DISTORTION_PIXELS = 2000.0
 _BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
 # Blocks of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
 _PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
-# Blocks that may lie between the parts of a face.
-_GAP = 4
 
 
 def surfaces(
@@ -63,11 +61,7 @@ def surfaces(
     patch, moments = _renumbered(np.concatenate(roots), blocks, _PATCH_MINIMUM * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumbered(_join(moments, border, _BETWEEN_PATCHES), moments, least)
-    labels = surface[patch].reshape(shape)
-    # A neck narrower than a block, or a row of holes, may keep parts of a face from touching.
-    root = _join(moments, _nearby(labels, len(moments)), WITHIN_PATCH)
-    surface, moments = _renumbered(root, moments, 1)
-    return surface[labels], moments
+    return surface[patch].reshape(shape), moments
 
 
 @njit(cache=True)
@@ -114,26 +108,6 @@ def _borders(
                     border[a, b] += 1
                     border[b, a] += 1
     return border
-
-
-@njit(cache=True)
-def _nearby(labels: NDArray[np.intp], count: int) -> NDArray[np.float64]:
-    """Pairs of blocks within `_GAP` of each other, of every two surfaces: as `_borders`."""
-    rows, columns = labels.shape
-    near = np.zeros((count, count))
-    for i in range(rows):
-        for j in range(columns):
-            a = labels[i, j]
-            inner = 0 < j < columns - 1 and labels[i, j - 1] == a and labels[i, j + 1] == a
-            if a == 0 or (inner and i + 1 < rows and labels[i + 1, j] == a):
-                continue
-            for ni in range(i, min(i + _GAP + 1, rows)):
-                for nj in range(max(j - _GAP, 0), min(j + _GAP + 1, columns)):
-                    b = labels[ni, nj]
-                    if b > 0 and b != a:
-                        near[a, b] += 1
-                        near[b, a] += 1
-    return near
 
 
 @njit(cache=True)

@@ -16,7 +16,11 @@ from rangeseg_ros.core.fitting.fits import Fits, symmetric
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,15 +179,15 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
 
 def _expected_square(fits: Fits) -> NDArray[np.float64]:
     """Mean square distance from the planes, over distance^2, that the sensor's errors make."""
-    cells, theta, errors = fits.cells, fits.theta, fits.variances
+    cells, theta, sensor = fits.cells, fits.theta, fits.sensor
     region = np.repeat(fits.regions_of_parts(), np.diff(cells.start))
     count, weight = cells.sums[:, COUNT], cells.sums[:, WEIGHT]
     ray = cells.sums[:, WEIGHTED_RAY:WEIGHT]
     level = (ray * theta[region]).sum(axis=1) / np.where(count > 0, weight, 1)
     # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
     squared = np.where(level > 0, level, 1) ** 2
-    constant, quartic = errors[0] + errors[2], errors[1] + errors[3]
-    total = np.bincount(region, count * (constant / squared + quartic * squared), len(theta))
+    variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+    total = np.bincount(region, count * variance / squared, len(theta))
     return total / np.maximum(np.bincount(region, count, len(theta)), 1)
 
 

@@ -15,7 +15,11 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import halves
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
 
 MOST = 100
 """Cells of a region at most."""
@@ -55,9 +59,7 @@ class Cells(NamedTuple):
     sums: NDArray[np.float64]
 
     @classmethod
-    def of(
-        cls, labels: NDArray[np.uint16], image: RangeImage, variances: NDArray[np.float64]
-    ) -> Cells:
+    def of(cls, labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> Cells:
         """Sums over all measured pixels.
 
         Parameters
@@ -66,8 +68,7 @@ class Cells(NamedTuple):
             0...M.
         image : RangeImage
             (H, W).
-        variances : (4,) float64
-            See `variances`.
+        sensor : SensorModel
         """
         box, border = bounding_boxes(labels, int(labels.max(initial=0)) + 1)
         rows, columns = box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]
@@ -79,7 +80,7 @@ class Cells(NamedTuple):
         cells = cls(box, border, size, columns, start, np.zeros((start[-1], RECORD)))
         central = image.camera is not None
         upper, lower = halves(
-            _sums, len(labels), labels, image.inverse, image.rays, cells, variances, central
+            _sums, len(labels), labels, image.inverse, image.rays, cells, sensor, central
         )
         return cells._replace(sums=upper + lower)
 
@@ -88,7 +89,7 @@ class Cells(NamedTuple):
         labels: NDArray[np.uint16],
         image: RangeImage,
         theta: NDArray[np.float64],
-        variances: NDArray[np.float64],
+        sensor: SensorModel,
     ) -> tuple[Cells, NDArray[np.intp], NDArray[np.float64]]:
         """Leave out of the sums what may not belong to regions: outliers, then rims.
 
@@ -106,7 +107,7 @@ class Cells(NamedTuple):
         """
         central = image.camera is not None
         arrays = labels, image.inverse, image.rays
-        parts = halves(_doubtful, len(labels), *arrays, self, variances, theta, central)
+        parts = halves(_doubtful, len(labels), *arrays, self, sensor, theta, central)
         (pixels, outliers, rims), outlying, rim = (a + b for a, b in zip(*parts, strict=True))
         region = np.repeat(np.arange(len(self.size)), np.diff(self.start))
         few = 2 * outliers <= pixels
@@ -122,15 +123,6 @@ class Cells(NamedTuple):
         if len(filled):
             total[filled] = np.add.reduceat(self.sums, self.start[filled])
         return total
-
-
-def variances(sensor: SensorModel) -> NDArray[np.float64]:
-    """Variances of a sensor for the compiled loops.
-
-    (4,): random and systematic, each a + b y^4 at the inverse range y, as a, b.
-    """
-    parts = sensor.noise, sensor.range_noise, sensor.distortion, sensor.range_distortion
-    return np.square(parts) + np.array([FLOOR, 0, 0, 0])
 
 
 @njit(cache=True)
@@ -189,7 +181,7 @@ def _add(
     after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    variances: NDArray[np.float64],
+    sensor: SensorModel,
     central: bool,
 ) -> None:
     """Add pixels `first` to before `after` of row `i` to a cell."""
@@ -203,7 +195,7 @@ def _add(
         # Seen from one centre, the error is in the inverse range; otherwise its direction is
         # unknown, and the weights are those of plain distances from the plane (up to a constant).
         squared = y * y
-        w = 1 / (variances[0] + variances[1] * squared * squared) if central else 1 / squared
+        w = 1 / random_variance(sensor, squared) if central else 1 / squared
         count += 1
         weight += w
         x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
@@ -232,7 +224,7 @@ def _sums(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     cells: Cells,
-    variances: NDArray[np.float64],
+    sensor: SensorModel,
     central: bool,
 ) -> NDArray[np.float64]:
     """Sums (N, 25) over the measured pixels of some rows."""
@@ -248,7 +240,7 @@ def _sums(
                 j += 1
             if label > 0:
                 record = sums[_index(cells, label, i, first)]
-                _add(record, i, first, j, inverse, rays, variances, central)
+                _add(record, i, first, j, inverse, rays, sensor, central)
     return sums
 
 
@@ -260,7 +252,7 @@ def _doubtful(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     cells: Cells,
-    variances: NDArray[np.float64],
+    sensor: SensorModel,
     theta: NDArray[np.float64],
     central: bool,
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
@@ -272,8 +264,6 @@ def _doubtful(
     height, width = labels.shape
     count = np.zeros((3, len(theta)), np.intp)
     outlying, rim = np.zeros_like(cells.sums), np.zeros_like(cells.sums)
-    constant = _OUTLIER**2 * (variances[0] + variances[2])
-    quartic = _OUTLIER**2 * (variances[1] + variances[3])
     for i in range(first, after):
         above, below = max(i - _RIM, 0), min(i + _RIM, height - 1)
         for j in range(width):
@@ -286,7 +276,8 @@ def _doubtful(
             residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
             squared = y * y
             left, right = max(j - _RIM, 0), min(j + _RIM, width - 1)
-            if residual * residual > constant + quartic * squared * squared:
+            variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+            if residual * residual > _OUTLIER**2 * variance:
                 count[1, label] += 1
                 sums = outlying
             elif (
@@ -300,5 +291,5 @@ def _doubtful(
             else:
                 continue
             record = sums[_index(cells, label, i, j)]
-            _add(record, i, j, j + 1, inverse, rays, variances, central)
+            _add(record, i, j, j + 1, inverse, rays, sensor, central)
     return count, outlying, rim

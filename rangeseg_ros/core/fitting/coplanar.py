@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import pairs
+from rangeseg_ros.core.sensing.grid import Grid
 
 # Pairs of regions and how much links them, see `touching`.
 Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -48,8 +49,7 @@ def common_surfaces(fits: Fits) -> NDArray[np.intp]:
 @njit(cache=True, nogil=True)
 def touching(
     regions: NDArray[np.uint16],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     count: int,
 ) -> Stretches:
     """Where regions touch, and whether jumps are between them.
@@ -58,8 +58,7 @@ def touching(
     ----------
     regions : (H, W) uint16
         0...M.
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
+    grid : Grid
     count : int
         M + 1.
 
@@ -82,10 +81,10 @@ def touching(
             for axis in range(2):
                 if axis == 0:
                     m = int(regions[i, j + 1]) if j + 1 < width else k
-                    linked = m != k and horizontal[i, j] > 0
+                    linked = m != k and grid.right[i, j] > 0
                 else:
                     m = int(regions[i + 1, j]) if i + 1 < height else k
-                    linked = m != k and vertical[i, j] > 0
+                    linked = m != k and grid.below[i, j] > 0
                 if m == k or min(k, m) == 0:
                     continue
                 if other[axis, k] != m:

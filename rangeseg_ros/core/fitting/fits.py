@@ -8,8 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, variances
-from rangeseg_ros.core.fitting.uncertainty import Field, pairs, theta_covariances
+from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells
+from rangeseg_ros.core.fitting.uncertainty import (
+    Field,
+    pairs,
+    systematic_field,
+    theta_covariances,
+)
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -38,8 +43,7 @@ class Fits(NamedTuple):
         Of the sums of w r r^T.
     covariance : (M + 1, 3, 3) float64
         Of theta.
-    variances : (4,) float64
-        Of the sensor, see `cells.variances`.
+    sensor : SensorModel
     systematic : Field
         Its systematic errors.
     """
@@ -53,7 +57,7 @@ class Fits(NamedTuple):
     theta: NDArray[np.float64]
     inverse: NDArray[np.float64]
     covariance: NDArray[np.float64]
-    variances: NDArray[np.float64]
+    sensor: SensorModel
     systematic: Field
 
     @classmethod
@@ -76,18 +80,17 @@ class Fits(NamedTuple):
         sensor : SensorModel
             Errors of the image.
         """
-        errors = variances(sensor)
-        cells = Cells.of(labels, image, errors)
+        cells = Cells.of(labels, image, sensor)
         sums = cells.regions()
         pixels = sums[:, COUNT].astype(np.intp)
-        cells, outliers, explained = cells.without_doubtful(labels, image, _theta(sums), errors)
+        cells, outliers, explained = cells.without_doubtful(labels, image, _theta(sums), sensor)
         sums = cells.regions()
         theta, inverse = _solved(sums, image.camera is not None)
-        covariance = theta_covariances(cells, theta, inverse, sensor, errors)
-        systematic = Field(sensor.distortion_length, errors[2], errors[3])
+        covariance = theta_covariances(cells, theta, inverse, sensor)
+        systematic = systematic_field(sensor)
         parts, start = np.arange(len(theta)), np.arange(len(theta) + 1)
         counts = pixels, outliers, explained
-        return cls(cells, parts, start, *counts, theta, inverse, covariance, errors, systematic)
+        return cls(cells, parts, start, *counts, theta, inverse, covariance, sensor, systematic)
 
     def united(self, group: NDArray[np.integer], central: bool) -> Fits:
         """Planes of regions united to groups.

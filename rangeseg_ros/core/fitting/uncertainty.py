@@ -21,7 +21,12 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells
 from rangeseg_ros.core.sensing.moments import COUNT
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.sensor import (
+    FLOOR,
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
 
 # Widths of a field that a cell may span and still be treated as a unit.
 _FINE = 2.0
@@ -38,12 +43,18 @@ class Field(NamedTuple):
     quartic: float
 
 
+def systematic_field(sensor: SensorModel) -> Field:
+    """The smooth errors of a sensor."""
+    return Field(
+        sensor.distortion_length, np.square(sensor.distortion), np.square(sensor.range_distortion)
+    )
+
+
 def theta_covariances(
     cells: Cells,
     theta: NDArray[np.float64],
     inverse: NDArray[np.float64],
     sensor: SensorModel,
-    variances: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Covariance of each plane in the form theta . ray = inverse range.
 
@@ -56,22 +67,16 @@ def theta_covariances(
     inverse : (M + 1, 3, 3) float64
         A^-1.
     sensor : SensorModel
-    variances : (4,) float64
-        Of `sensor`.
 
     Returns
     -------
     (M + 1, 3, 3) float64
         Zeros where there is no plane.
     """
-    middle = _middles(
-        cells,
-        theta,
-        variances,
-        sensor.white if sensor.correlation > 0 else 1.0,
-        sensor.correlation,
-        sensor.distortion_length,
+    random = Field(
+        sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
     )
+    middle = _middles(cells, theta, sensor, random, systematic_field(sensor))
     return inverse @ ((middle + middle.transpose(0, 2, 1)) / 2) @ inverse
 
 
@@ -90,13 +95,13 @@ def plane_jacobians(
 def _middles(
     cells: Cells,
     theta: NDArray[np.float64],
-    variances: NDArray[np.float64],
-    white: float,
-    correlation: float,
-    distortion_length: float,
+    sensor: SensorModel,
+    random: Field,
+    systematic: Field,
 ) -> NDArray[np.float64]:
     """Sums over pairs of pixels of w_i w_j r_i r_j^T cov(e_i, e_j), (M + 1, 3, 3)."""
     result = np.zeros((len(theta), 3, 3))
+    white = sensor.white if sensor.correlation > 0 else 1.0
     part = np.empty((3, 3))
     for k in range(1, len(theta)):
         if not theta[k].any():
@@ -117,16 +122,14 @@ def _middles(
                 for b in range(a, 3):
                     part[a, b] = part[b, a] = own[c, entry]
                     entry += 1
-            random_square += mean * (variances[0] + variances[1] * level**4) * part
-            systematic_square += mean * (variances[2] + variances[3] * level**4) * part
+            random_square += mean * random_variance(sensor, level**2) * part
+            systematic_square += mean * systematic_variance(sensor, level**2) * part
         result[k] = white * random_square
         # Sides of pixels overstate the length of a border by 4 / pi on average.
         share = np.pi / 4 * cells.border[k] / count
         if white < 1:
-            random = Field(correlation, variances[0], variances[1])
             result[k] += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
-        if variances[2] + variances[3] > 0:
-            systematic = Field(distortion_length, variances[2], variances[3])
+        if systematic.constant + systematic.quartic > 0:
             result[k] += _field(cells, k, theta[k], systematic, systematic_square, share)
     return result
 

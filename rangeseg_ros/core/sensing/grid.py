@@ -1,10 +1,8 @@
-"""Neighbourhood weights u of eq. 5.1 on the 4-connected grid (thesis 5.5).
-
-A grid's edges are two arrays: `horizontal` (H, W-1) between a pixel and its right neighbour,
-`vertical` (H-1, W) between a pixel and the one below.
-"""
+"""The 4-connected grid of pixels and its neighbourhood weights u of eq. 5.1 (thesis 5.5)."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,9 +11,22 @@ from rangeseg_ros.core.sensing.jump_edges import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
-def weights(
-    image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform'
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+class Grid(NamedTuple):
+    """Weights of the edges between neighbouring pixels, 0 where disconnected.
+
+    Attributes
+    ----------
+    right : (H, W-1) float32
+        Of the edges from each pixel to its right neighbour.
+    below : (H-1, W) float32
+        Of those to the one below.
+    """
+
+    right: NDArray[np.float32]
+    below: NDArray[np.float32]
+
+
+def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform') -> Grid:
     """Weights of the edges between neighbouring pixels.
 
     Parameters
@@ -30,8 +41,7 @@ def weights(
 
     Returns
     -------
-    horizontal, vertical : (H, W-1), (H-1, W) float32
-        0 where disconnected.
+    Grid
     """
     valid = image.valid
     horizontal = (valid[:, 1:] & valid[:, :-1]).astype(np.float32)
@@ -48,4 +58,4 @@ def weights(
     if jumps is not None:
         horizontal[jumps[0]] = 0
         vertical[jumps[1]] = 0
-    return horizontal, vertical
+    return Grid(horizontal, vertical)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numba import njit
+from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from rangeseg_ros.core.config import Config
@@ -18,8 +19,7 @@ _MOST = 4000
 _QUANTILE = 0.4
 
 
-@dataclass(frozen=True)
-class SensorModel:
+class SensorModel(NamedTuple):
     """Error of the inverse range of a pixel, 1/m.
 
     A structured-light sensor's error is about constant in disparity, hence in inverse range; a
@@ -80,14 +80,6 @@ class SensorModel:
         alike = (1 - self.white) * np.exp(-np.array([1, 2]) / (4 * self.correlation**2))
         return float(1 + 2 * alike[0] + alike[1])
 
-    def variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
-        """Variance of the random error at an inverse range, (1/m)^2."""
-        return _variance(self.noise, self.range_noise, inverse)
-
-    def systematic_variance(self, inverse: ArrayLike) -> NDArray[np.float64]:
-        """Variance of the systematic error at an inverse range, (1/m)^2."""
-        return _variance(self.distortion, self.range_distortion, inverse)
-
     def measured(self, inverse: NDArray[np.float64], residual: NDArray[np.float64]) -> SensorModel:
         """The model with the random error an image shows, never less than its own.
 
@@ -107,12 +99,11 @@ class SensorModel:
         at = np.array([inverse[part[len(part) // 2]] for part in parts])
         ranked = [np.sort(residual[part]) for part in parts]
         shown = np.array([part[int(_QUANTILE * len(part))] for part in ranked])
-        variance = np.maximum(shown, self.variance(at))
+        variance = np.maximum(shown, random_variance(self, at**2))
         # Relative errors count the same at every range.
         terms = np.stack([np.ones(bins), at**4], axis=1) / variance[:, None]
         (constant, quartic), _ = nnls(terms, np.ones(bins))
-        return replace(
-            self,
+        return self._replace(
             noise=max(float(np.sqrt(constant)), self.noise),
             range_noise=max(float(np.sqrt(quartic)), self.range_noise),
         )
@@ -122,6 +113,16 @@ class SensorModel:
 FLOOR = 1e-12
 
 
-def _variance(constant: float, in_range: float, inverse: ArrayLike) -> NDArray[np.float64]:
-    # d(1/s) = ds / s^2
-    return FLOOR + constant**2 + (in_range * np.asarray(inverse, np.float64) ** 2) ** 2
+@njit(cache=True, inline='always')
+def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
+    """Variance of the random error at the square of an inverse range, (1/m)^2.
+
+    An error ds of the range is one of ds / s^2 of its inverse.
+    """
+    return FLOOR + sensor.noise**2 + (sensor.range_noise * squared) ** 2
+
+
+@njit(cache=True, inline='always')
+def systematic_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
+    """Variance of the systematic error at the square of an inverse range, (1/m)^2."""
+    return sensor.distortion**2 + (sensor.range_distortion * squared) ** 2

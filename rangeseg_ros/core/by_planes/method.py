@@ -1,0 +1,123 @@
+"""Method planes from a range image to a labelling, and to the regions that are flat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_planes.blocks import (
+    block_links,
+    block_moments,
+    block_size,
+    residual_noise,
+    slopes_and_residuals,
+    weighted,
+)
+from rangeseg_ros.core.by_planes.curvature import curved
+from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
+from rangeseg_ros.core.by_planes.surfaces import surfaces
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.fitting.coplanar import parts, touching
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.regions import by_falling_size, translated, without
+from rangeseg_ros.core.runtime.threads import aside
+from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+class Labelling:
+    """Planes as labels of the pixels of an image.
+
+    Attributes
+    ----------
+    labels : (H, W) int32
+        0 = no plane.
+    sensor : SensorModel
+        The errors that the image shows.
+    """
+
+    def __init__(
+        self,
+        labels: NDArray[np.int32],
+        sensor: SensorModel,
+        problem: Problem,
+        models: Models,
+    ) -> None:
+        self.labels = labels
+        self.sensor = sensor
+        self._problem = problem
+        self._models = models
+
+    def energy(self) -> float:
+        """Value of eq. 5.3."""
+        return energy(self.labels.ravel(), self._problem, self._models)
+
+    def flat(self, regions: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Regions (H, W) of the labelling without those that bend, numbered anew."""
+        return without(regions, curved(self._problem, regions, self.sensor))
+
+
+def segment(
+    image: RangeImage, grid: Grid, config: Config, lap: Callable[[str], None]
+) -> Labelling:
+    """Label every pixel with a plane.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    grid : Grid
+        Of the image.
+    config : Config
+        The sensor, `min_pixels`, `exact` and `refits` are read.
+    lap : callable
+        Told the name of every stage that ends.
+    """
+    size = block_size(image.shape)
+    blocks = block_moments(image.inverse, image.rays, grid, size)
+    slope, residual = slopes_and_residuals(blocks, image.rays, size)
+    noise = residual_noise(blocks, residual, size)
+    sensor = SensorModel.from_config(config).measured(*noise)
+    lap('blocks')
+    pending = aside(Problem.of, image, sensor, grid, size)
+    # A region may gain as much again from pixels that no block could take.
+    least = config.min_pixels // 2 or 1
+    surface, moments = surfaces(
+        weighted(blocks, sensor, slope), block_links(grid, size), size, least
+    )
+    problem = pending.result()
+    lap('surfaces')
+    labels, models = refine(problem, surface, moments, sensor, config.exact, config.refits)
+    lap('labels')
+    return Labelling(labels.reshape(image.shape), sensor, problem, models)
+
+
+def united(
+    regions: NDArray[np.uint16], image: RangeImage, sensor: SensorModel, grid: Grid
+) -> tuple[NDArray[np.uint16], Fits]:
+    """Unite regions that touch and whose planes agree; the regions and their planes.
+
+    Parameters
+    ----------
+    regions : (H, W) uint16
+        0...M.
+    image : RangeImage
+        (H, W).
+    sensor : SensorModel
+    grid : Grid
+    """
+    count = int(regions.max(initial=0)) + 1
+    edges = aside(touching, regions, grid, count)
+    fits = Fits.of(regions, image, sensor)
+    group = parts(fits, edges.result())
+    if (group == np.arange(count)).all():
+        return regions, fits
+    pixels = np.zeros(count, np.intp)
+    np.add.at(pixels, group, fits.pixels)
+    pixels[0] = 0
+    table = by_falling_size(pixels)[group]
+    return translated(regions, table), fits.united(table, image.camera is not None)
