@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 TYPES = {
     'labels': Image,

@@ -9,8 +9,9 @@ from rangeseg_ros.cli import bench
 from rangeseg_ros.cli.bench import command
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 
 @pytest.fixture

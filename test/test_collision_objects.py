@@ -18,7 +18,7 @@ from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 

@@ -10,7 +10,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import QUANTUM
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 
 KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)
 CAMERA = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)

@@ -12,8 +12,10 @@ from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.evaluation.overlap import Overlap
-from rangeseg_ros.simulation.kinect import QUANTUM, simulate_kinect, smooth_field
+from rangeseg_ros.simulation.fields import smooth_field
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import curved_scene
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 from rangeseg_ros.simulation.truth import NOT_PLANAR
 
 CAMERA = Camera(320, 240, 292.0, 292.0, 159.5, 119.5)

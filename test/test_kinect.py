@@ -9,16 +9,10 @@ import pytest
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.simulation import scenes
-from rangeseg_ros.simulation.kinect import (
-    BASELINE,
-    NOISES,
-    QUANTUM,
-    kinect_camera,
-    sensor_pattern,
-    simulate_kinect,
-    smooth_field,
-)
+from rangeseg_ros.simulation.fields import smooth_field
+from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
+from rangeseg_ros.simulation.sensors.kinect import BASELINE, QUANTUM, kinect_camera, sensor_pattern
 from rangeseg_ros.simulation.solids import box, half_space
 
 SENSORS = range(4)

@@ -17,7 +17,7 @@ from rangeseg_ros.messages.make import (
 )
 from rangeseg_ros.messages.markers import ARROW_LENGTH, markers_message
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth
 from sensor_msgs.msg import CameraInfo, Image
 
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 

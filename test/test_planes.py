@@ -8,7 +8,7 @@ from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import QUANTUM, kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera
 
 KINECT = SensorModel(0.45 * QUANTUM, 0, 0.33, 2, 0.5 * QUANTUM, 0, 35)
 CAMERA = kinect_camera()

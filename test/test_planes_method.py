@@ -18,8 +18,9 @@ from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import overlap_figures
 from rangeseg_ros.io.images import read_depth, write_image
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 ANNOTATED = Path(__file__).parents[2] / 'shared' / 'data' / 'annotated'
 SEEDS = (900, 901, 902)

@@ -14,7 +14,7 @@ import cv2
 from ros_bench import DEPTH, INFO, Bench, corner_depth
 
 from rangeseg_ros.io.bags import DepthBagWriter
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 

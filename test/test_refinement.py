@@ -17,8 +17,9 @@ from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 NOISE = 0.002
 BLOCK = 4

@@ -12,8 +12,9 @@ from rangeseg_ros.core.meaning.roles import ROLES, RolesError, roles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 from rangeseg_ros.simulation.solids import box, half_space
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)

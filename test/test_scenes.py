@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.simulation import scenes
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, prism, sphere
 from rangeseg_ros.simulation.truth import NOT_PLANAR, visible_regions
 

@@ -11,8 +11,9 @@ from rangeseg_ros.cli.simulate import command
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, read_labels
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import curved_scene
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 SMALL = ['--width', '160', '--height', '120']
 

@@ -8,7 +8,8 @@ from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import QUANTUM, smooth_field
+from rangeseg_ros.simulation.fields import smooth_field
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 
 NORMAL, DISTANCE = np.array([0.36, -0.48, -0.8]), 2.0
 # A region of 16 pixels tells its normal to ten degrees, where normal and distance are no longer

@@ -18,8 +18,9 @@ from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.params import read_config
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 VGA = (640, 480)
 SIZES = ((320, 240), VGA, (1280, 720), (1920, 1080))

@@ -1,4 +1,4 @@
-"""`rangeseg simulate`: scenes with known truth, as the three sensors see them."""
+"""`rangeseg simulate`: scenes with known truth, as depth sensors and range scanners see them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import click
 import numpy as np
 
 from rangeseg_ros.cli import options
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.files import replacing
@@ -22,7 +23,8 @@ from rangeseg_ros.segcomp.files import (
     write_segmentation,
 )
 from rangeseg_ros.segcomp.geometry import abw_calibration
-from rangeseg_ros.simulation.kinect import NOISES, Frame, kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
+from rangeseg_ros.simulation.render import Frame, simulate
 from rangeseg_ros.simulation.scanners import (
     Scan,
     abw_scene,
@@ -32,6 +34,9 @@ from rangeseg_ros.simulation.scanners import (
 )
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.segcomp_truth import ground_truth, region_angles
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.sensor import resized
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
@@ -64,25 +69,83 @@ def command() -> None:
     """Simulate range images with ground truth."""
 
 
-@command.command()
-@click.option(
+scenes_option = click.option(
     '--scenes', type=click.IntRange(min=1), default=12, show_default=True, help='How many.'
 )
-@click.option(
+frames_option = click.option(
     '--frames',
     type=click.IntRange(min=1),
     default=1,
     show_default=True,
     help='Frames of each scene, at 30 Hz from a camera that moves as if held by hand.',
 )
-@seed_option
-@click.option(
+sensor_seed_option = click.option(
     '--sensor-seed',
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help='Which sensor: its fixed distortion and bands (noise "measured").',
+    help='Which one of its kind the sensor is: its fixed distortion.',
 )
+scene_option = click.option(
+    '--scene',
+    'kind',
+    type=click.Choice(list(SCENES)),
+    default='room',
+    show_default=True,
+    help='Rooms with boxes, or with a ball and a cylinder as well.',
+)
+
+
+@command.command()
+@click.option(
+    '--sensor',
+    type=click.Choice(list(SENSORS)),
+    default='kinect',
+    show_default=True,
+    help='Structured light, active stereo, time of flight of a phone, lidar of a tablet, or a '
+    'sensor without error.',
+)
+@scenes_option
+@frames_option
+@seed_option
+@sensor_seed_option
+@scene_option
+@click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own.")
+@click.option('--height', type=click.IntRange(16, 4096), help="Rows; the sensor's own.")
+@output_option
+def rooms(
+    sensor: str,
+    scenes: int,
+    frames: int,
+    seed: int,
+    sensor_seed: int,
+    kind: str,
+    width: int | None,
+    height: int | None,
+    output: Path,
+) -> None:
+    """Rooms as depth sensors of several kinds see them.
+
+    The files are those of `simulate kinect`. Another width keeps the horizontal field of view.
+    """
+    camera = SENSORS[sensor](sensor_seed).camera
+    camera = resized(camera, width or camera.width, height or camera.height)
+
+    def see(scene: Scene, frame: int, scene_seed: int) -> Frame:
+        if sensor == 'kinect':
+            return simulate_kinect(
+                scene, camera, frame=frame, sensor_seed=sensor_seed, seed=scene_seed
+            )
+        return simulate(scene, SENSORS[sensor](sensor_seed), camera, frame=frame, seed=scene_seed)
+
+    _write_rooms(output, camera, range(seed, seed + scenes), frames, SCENES[kind], see)
+
+
+@command.command()
+@scenes_option
+@frames_option
+@seed_option
+@sensor_seed_option
 @click.option(
     '--noise',
     type=click.Choice(NOISES),
@@ -91,14 +154,7 @@ def command() -> None:
     help='As measured on real sensors; the textbook formula, correlated over 1.5 pixels or '
     'independent; or none.',
 )
-@click.option(
-    '--scene',
-    'kind',
-    type=click.Choice(list(SCENES)),
-    default='room',
-    show_default=True,
-    help='Rooms with boxes, or with a ball and a cylinder as well.',
-)
+@scene_option
 @click.option('--width', type=click.IntRange(16, 4096), default=640, show_default=True)
 @click.option('--height', type=click.IntRange(16, 4096), default=480, show_default=True)
 @output_option
@@ -113,7 +169,7 @@ def kinect(
     height: int,
     output: Path,
 ) -> None:
-    """Rooms as a Kinect sees them.
+    """Rooms as a Kinect sees them, with a choice of its noise.
 
     \b
     OUTPUT/depth/NAME.png   depth, 16 bits, millimetres, 0 = no measurement
@@ -130,24 +186,32 @@ def kinect(
     """
     camera = kinect_camera(width, height)
 
-    def simulated() -> Iterator[tuple[str, Frame]]:
-        for number in range(seed, seed + scenes):
-            scene = SCENES[kind](number, frames)
-            for frame in range(frames):
-                name = f'{number:06d}' if frames == 1 else f'{number:06d}_{frame:06d}'
-                yield (
-                    name,
-                    simulate_kinect(
-                        scene,
-                        camera,
-                        frame=frame,
-                        noise=noise,
-                        sensor_seed=sensor_seed,
-                        seed=number,
-                    ),
-                )
+    def see(scene: Scene, frame: int, scene_seed: int) -> Frame:
+        return simulate_kinect(
+            scene, camera, frame=frame, noise=noise, sensor_seed=sensor_seed, seed=scene_seed
+        )
 
-    count = scenes * frames
+    _write_rooms(output, camera, range(seed, seed + scenes), frames, SCENES[kind], see)
+
+
+def _write_rooms(
+    output: Path,
+    camera: Camera,
+    seeds: range,
+    frames: int,
+    build: Callable[[int, int], Scene],
+    see: Callable[[Scene, int, int], Frame],
+) -> None:
+    """Write what `see(scene, frame, seed)` sees in the scenes `build(seed, frames)`."""
+
+    def simulated() -> Iterator[tuple[str, Frame]]:
+        for seed in seeds:
+            scene = build(seed, frames)
+            for frame in range(frames):
+                name = f'{seed:06d}' if frames == 1 else f'{seed:06d}_{frame:06d}'
+                yield name, see(scene, frame, seed)
+
+    count = len(seeds) * frames
     with _new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
         with (

@@ -1,0 +1,99 @@
+"""What a simulated sensor is, and the geometry that all of them need."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.camera import Camera
+
+
+class Sensor(Protocol):
+    """A depth camera: how it errs, and what it does not see.
+
+    Sizes in pixels that come from matching windows and filters are those of the image at hand;
+    fixed patterns stretch with the image.
+    """
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the sensor's usual mode."""
+
+    def measure(
+        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
+    ) -> NDArray[np.uint16] | NDArray[np.float32]:
+        """Depth image as the sensor delivers it.
+
+        Parameters
+        ----------
+        depth : (H, W) float64
+            True depth along the optical axis, metres; inf where there is nothing.
+        camera : Camera
+            Intrinsics of the image.
+        random : Generator
+            Source of what is new in every frame.
+
+        Returns
+        -------
+        (H, W) uint16 or float32
+            Along the optical axis: millimetres, or metres; 0 = no measurement.
+        """
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """Camera whose image of the same horizontal field of view has another size."""
+    focal = camera.fx * width / camera.width
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def inverse_depth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """1/z, 1/m; 0 where there is nothing."""
+    return 1 / np.maximum(depth, 1e-3)
+
+
+def slopes(inverse: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Tangent of the angle of incidence of every pixel's surface.
+
+    A plane is theta . ray = 1/z, so the derivatives of 1/z along rows and columns tell its
+    normal; of the two one-sided differences the smaller one does not cross an edge.
+    """
+    rays = camera.rays.astype(np.float64)
+    theta_x, theta_y = (
+        focal * _derivative(inverse, axis) for focal, axis in ((camera.fx, 1), (camera.fy, 0))
+    )
+    theta_z = inverse - theta_x * rays[..., 0] - theta_y * rays[..., 1]
+    norm = np.sqrt(theta_x**2 + theta_y**2 + theta_z**2) * np.linalg.norm(rays, axis=-1)
+    cosine = np.clip(inverse / np.maximum(norm, 1e-12), 1e-3, 1)
+    return np.sqrt(1 - cosine**2) / cosine
+
+
+def _derivative(image: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    step = np.diff(image, axis=axis)
+    first, last = np.take(step, [0], axis), np.take(step, [-1], axis)
+    forward = np.concatenate([step, last], axis)
+    backward = np.concatenate([first, step], axis)
+    return np.where(np.abs(forward) < np.abs(backward), forward, backward)
+
+
+def unseen_from_the_right(
+    inverse: NDArray[np.float64], camera: Camera, baseline: float
+) -> NDArray[np.bool_]:
+    """Pixels that a second view, `baseline` metres to the right, does not see.
+
+    A pixel lands at u - f b / z in that view (rectified stereo); a pixel further right that
+    lands further left is nearer, and hides it. The shadows lie left of what casts them.
+    """
+    columns = np.arange(camera.width) - camera.fx * baseline * inverse
+    nearest = np.minimum.accumulate(columns[:, ::-1], axis=1)[:, ::-1]
+    hidden = np.zeros(inverse.shape, np.bool_)
+    # Within half a pixel it is the same surface, seen at a grazing angle.
+    hidden[:, :-1] = columns[:, :-1] > nearest[:, 1:] + 0.5
+    return hidden
+
+
+def millimetres(depth: NDArray[np.float64], seen: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """Depth image in millimetres; 0 where nothing is seen or 16 bits do not hold it."""
+    values = np.rint(1000 * np.where(seen, depth, 0))
+    return np.where((values >= 1) & (values <= 65535), values, 0).astype(np.uint16)

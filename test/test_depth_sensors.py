@@ -1,0 +1,181 @@
+"""The depth sensors of simulations: statistics as of real frames, and what each of them is."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rangeseg_ros.cli.simulate import command
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.sensors.sensor import resized, slopes, unseen_from_the_right
+from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense
+from rangeseg_ros.simulation.sensors.time_of_flight import TimeOfFlight
+from rangeseg_ros.simulation.solids import box, half_space
+
+
+def in_camera_frame(*solids):
+    return Scene(solids, (Pose(np.eye(3), np.zeros(3)),))
+
+
+def wall(z):
+    return half_space((0, 0, -1), (0, 0, z))
+
+
+def plate(z, size=0.4):
+    return box((size, size, 0.01), np.eye(3), (0, 0, z + 0.005))
+
+
+def metres(depth):
+    return depth / 1000 if depth.dtype == np.uint16 else depth.astype(float)
+
+
+def block_deviations(depth, labels, size):
+    """Standard deviation of the residual of a plane in blocks on one region, in 1/z, 1/m."""
+    rows, columns = (length // size for length in depth.shape)
+
+    def blocks(image):
+        image = image[: rows * size, : columns * size].reshape(rows, size, columns, size)
+        return image.swapaxes(1, 2).reshape(-1, size * size)
+
+    inverse = blocks(1 / np.where(depth > 0, depth, np.inf))
+    label = blocks(labels)
+    flat = (label.min(1) == label.max(1)) & (label[:, 0] > 0)
+    v, u = np.mgrid[:size, :size] - (size - 1) / 2
+    base, _ = np.linalg.qr(np.stack([np.ones(size * size), u.ravel(), v.ravel()], axis=1))
+    residual = inverse[flat] - inverse[flat] @ base @ base.T
+    return np.sqrt((residual**2).sum(1) / (size * size - 3))
+
+
+# Medians over the blocks of 4, 8, 16 and 32 pixels on the planes of real frames: Kinect (six
+# frames), RealSense (three), a phone's time of flight, a tablet's lidar (the single frame times
+# and over 1.5; no wider than the others scatter).
+REAL = {
+    'kinect': [(0.00068, 0.00096), (0.00095, 0.00114), (0.00123, 0.00139), (0.00141, 0.00156)],
+    'realsense': [(0.0011, 0.0018), (0.0013, 0.0021), (0.0019, 0.0029), (0.0033, 0.005)],
+    'tof': [(0.00086, 0.0019), (0.00125, 0.0028), (0.0017, 0.0038), (0.0023, 0.005)],
+    'lidar': [(0.0001, 0.00021), (0.00011, 0.00024), (0.00012, 0.00027), (0.00015, 0.00035)],
+}
+
+
+@pytest.mark.parametrize('name', REAL)
+def test_residuals_by_block_size_are_like_those_of_real_frames(name):
+    found = []
+    for seed in (0, 1):
+        frame = simulate(kinect_room(seed), SENSORS[name](seed), seed=seed)
+        found.append(
+            [
+                np.median(block_deviations(metres(frame.depth), frame.labels, size))
+                for size in (4, 8, 16, 32)
+            ]
+        )
+    for value, (low, high) in zip(np.median(found, axis=0), REAL[name], strict=True):
+        # The real ranges are those of few frames, on other scenes.
+        assert 0.9 * low <= value <= 1.1 * high
+
+
+@pytest.mark.parametrize('name', SENSORS)
+def test_same_seeds_same_frame_and_truth_where_depth_is(name):
+    camera = resized(SENSORS[name](0).camera, 160, 120)
+
+    def render(sensor_seed, seed):
+        return simulate(kinect_room(1), SENSORS[name](sensor_seed), camera, seed=seed)
+
+    frame = render(1, 1)
+    assert np.array_equal(frame.labels > 0, frame.depth > 0)
+    assert (frame.depth > 0).mean() > 0.5
+    assert np.array_equal(frame.depth, render(1, 1).depth)
+    if name != 'ideal':
+        assert not np.array_equal(frame.depth, render(1, 2).depth)
+    if name not in ('ideal', 'lidar'):
+        assert not np.array_equal(frame.depth, render(2, 1).depth)
+
+
+@pytest.mark.parametrize('name', SENSORS)
+def test_nothing_is_measured_where_nothing_is(name):
+    camera = resized(SENSORS[name](0).camera, 160, 120)
+    depth = np.full(camera.shape, np.inf)
+    assert not SENSORS[name](0).measure(depth, camera, np.random.default_rng(0)).any()
+
+
+def test_ideal_is_exact():
+    frame = simulate(in_camera_frame(wall(2.5)), SENSORS['ideal'](0))
+    assert frame.depth.dtype == np.float32 and (frame.depth == np.float32(2.5)).all()
+
+
+def test_stereo_takes_disparities_of_steps():
+    frame = simulate(kinect_room(0), RealSense(), seed=1)
+    steps = np.arange(1, 126 * STEPS + 1)
+    possible = np.rint(1000 * frame.camera.fx * BASELINE * STEPS / steps)
+    assert np.isin(frame.depth[frame.depth > 0], possible).all()
+
+
+def test_stereo_sees_nothing_left_of_an_object_and_at_the_left_border():
+    near, far = 0.5, 1.5
+    frame = simulate(in_camera_frame(wall(far), plate(near)), RealSense(), seed=0)
+    blind = (frame.depth == 0).mean(axis=0)
+    border = 424 * BASELINE / far
+    assert blind[: int(border) - 2].min() > 0.95 and blind[int(border) + 3] < 0.3
+    left = 424 - 424 * 0.2 / near
+    shadow = 424 * BASELINE * (1 / near - 1 / far)
+    rows = frame.depth[160:320]
+    assert (rows[:, int(left - shadow) + 3 : int(left) - 3] == 0).mean() > 0.95
+    right = 424 + 424 * 0.2 / near
+    assert (rows[:, int(right) + 5 : int(right + shadow)] == 0).mean() < 0.3
+
+
+def test_flying_pixels_lie_between_the_surfaces():
+    frame = simulate(in_camera_frame(wall(3.0), plate(1.0)), TimeOfFlight(), seed=0)
+    depth = metres(frame.depth)
+    flying = (depth > 1.2) & (depth < 2.6)
+    rim = 4 * 0.4 * frame.camera.fx
+    assert 0.5 * rim < flying.sum() < 3 * rim
+
+
+def test_time_of_flight_is_offset_where_stray_light_is():
+    scene = in_camera_frame(half_space((-1, 0, 0), (0.5, 0, 0)), wall(3.0))
+    error = np.median(
+        [
+            metres(simulate(scene, TimeOfFlight(), seed=seed).depth)[60:120, 20:100] - 3
+            for seed in range(4)
+        ]
+    )
+    # Up to centimetres: the light of the near side wall pulls the back wall closer.
+    assert 0.005 < abs(error) < 0.15
+
+
+def test_slopes_and_shadows_of_a_depth_image():
+    camera = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
+    angle = np.radians(50)
+    normal = np.array([0, np.sin(angle), -np.cos(angle)])
+    rays = camera.rays.astype(float)
+    inverse = rays @ normal / -2.0
+    cosine = -(rays @ normal) / np.linalg.norm(rays, axis=-1)
+    seen = cosine > 0.1
+    found = slopes(inverse, camera)
+    assert found[seen] == pytest.approx(np.tan(np.arccos(cosine[seen])), rel=1e-4)
+    inverse = np.full(camera.shape, 0.5)
+    inverse[:, 80:100] = 1.0
+    hidden = unseen_from_the_right(inverse, camera, 0.1)
+    (columns,) = np.nonzero(hidden[60])
+    assert abs(len(columns) - 146 * 0.1 * 0.5) < 1.5 and columns[-1] == 79
+
+
+@pytest.mark.parametrize('name', SENSORS)
+def test_rooms_command(tmp_path, name):
+    output = tmp_path / 'rooms'
+    options = ['rooms', '--sensor', name, '--scenes', '1', '--width', '80', '--height', '60']
+    result = CliRunner().invoke(command, [*options, '--output', str(output)])
+    assert result.exit_code == 0, result.output
+    assert (read_depth(output / 'depth' / '000000.png') > 0).mean() > 0.4
+
+
+def test_rooms_of_a_kinect_are_those_of_its_own_command(tmp_path):
+    size = ['--scenes', '1', '--width', '80', '--height', '60', '--sensor-seed', '3']
+    for name in ('kinect', 'rooms'):
+        arguments = [name, *size, '--output', str(tmp_path / name)]
+        assert CliRunner().invoke(command, arguments).exit_code == 0
+    one, other = (tmp_path / name / 'depth' / '000000.png' for name in ('kinect', 'rooms'))
+    assert one.read_bytes() == other.read_bytes()
