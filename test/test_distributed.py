@@ -7,7 +7,7 @@ import sys
 import time
 
 import pytest
-from test_replay_bags import record_walls, replay, results
+from replays import record_walls, replay, results
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.tasks import run_on_cluster

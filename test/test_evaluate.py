@@ -6,11 +6,11 @@ import json
 import cv2
 import numpy as np
 import pytest
-from test_pcd import literal_lzf
+from corner_set import CAMERA, LEFT, RIGHT, corner, depth_and_truth, segcomp_set
+from pcd_files import literal_lzf
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.evaluation.datasets import ScanCase, SegcompCase, find_cases
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.measure import Measurement, Task
@@ -26,25 +26,6 @@ from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.segcomp import files as segcomp
 from rangeseg_ros.segcomp.geometry import abw_calibration
 from rangeseg_ros.tasks import run_all
-
-CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
-# Two walls that meet in the vertical line x = 0, z = 2.
-LEFT = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
-RIGHT = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
-
-
-def corner(rays):
-    """Distance along rays from the origin to a corner of two walls, and labels 1 and 2."""
-    reach = np.stack([-plane[3] / (rays @ plane[:3]) for plane in (LEFT, RIGHT)])
-    reach[reach <= 0] = np.inf
-    return reach.min(axis=0), (reach.argmin(axis=0) + 1).astype(np.uint16)
-
-
-def depth_and_truth():
-    depth, truth = corner(CAMERA.rays.astype(float))
-    depth = np.rint(1000 * depth).astype(np.uint16)
-    depth[:6], truth[:6] = 0, 0
-    return depth, truth
 
 
 @pytest.fixture
@@ -143,19 +124,6 @@ def test_annotated_folders(tmp_path, evaluate):
     code, figures, _, _ = evaluate(tmp_path / 'set')
     assert code == 0 and list(figures['per_image']) == ['a', 'b']
     assert figures['tolerances']['0.8']['correct'] == 4
-
-
-def segcomp_set(folder):
-    """One ABW test image of the corner, 1.1 times nearer, with its truth and its angle."""
-    folder.mkdir()
-    calibration = abw_calibration(1)
-    rays = calibration.camera.rays.astype(float)
-    depth, truth = corner(rays)
-    values = np.rint(calibration.values(depth * 0.5)).clip(1, 255).astype(np.uint8)
-    segcomp.write_raster(folder / 'abw.test.1.range', values)
-    segcomp.write_segmentation(folder / 'abw.test.1.gt-seg', segcomp.to_segcomp(truth))
-    segcomp.write_angles(folder / 'abw.test.1.gt-ang', [segcomp.RegionAngle(10, 11, 90.0)])
-    return folder
 
 
 def test_segcomp_set(tmp_path, evaluate):

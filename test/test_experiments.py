@@ -6,7 +6,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from test_evaluate import CAMERA, depth_and_truth, segcomp_set
+from corner_set import CAMERA, depth_and_truth, segcomp_set
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config

@@ -47,6 +47,12 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         assert aliases.get(name, name) in keys | set(wheel_only.lower().split())
 
 
+def test_no_test_module_imports_another():
+    """What several need is in a module of its own, and comes without the tests of another."""
+    for path in (ROOT / 'test').glob('*.py'):
+        assert not re.search(r'^\s*(from|import) test_', path.read_text(), re.MULTILINE), path.name
+
+
 def test_every_module_is_packaged(setup_arguments):
     folders = {path.parent for path in (ROOT / 'rangeseg_ros').rglob('*.py')}
     names = {'.'.join(folder.relative_to(ROOT).parts) for folder in folders}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from pcd_files import literal_lzf
 
 from rangeseg_ros.io.pcd import PcdError, lzf_decompress, read_pcd
 
@@ -35,12 +36,6 @@ def records():
     array = np.zeros((2, 3), dtype)
     array['x'], array['label'], array['normal'] = X, LABEL, NORMAL
     return array
-
-
-def literal_lzf(data):
-    """LZF of incompressible data: runs of at most 32 literal bytes."""
-    runs = (data[i : i + 32] for i in range(0, len(data), 32))
-    return b''.join(bytes([len(run) - 1]) + run for run in runs)
 
 
 def encoded(kind):

@@ -171,7 +171,15 @@ def test_absurd_depths_disturb_nothing(value, where):
     assert np.isfinite(result.energy)
     for plane in result.planes:
         assert np.isfinite([*plane.normal, plane.distance]).all()
-    if where == 'part':
+    if where == 'all':
+        # Depths no sensor can measure are not measured; 1000 km is still a wall.
+        if value == 1e6:
+            (wall,) = result.planes
+            np.testing.assert_allclose(wall.normal, [0, 0, -1], atol=1e-6)
+            assert wall.distance == pytest.approx(value, rel=1e-6) and wall.count == depth.size
+        else:
+            assert not result.planes and result.reason == 'no valid depth'
+    else:
         expected = segmented(frame.depth, frame.camera)
         away = np.ones(depth.shape, bool)
         away[20:70, 30:100] = False

@@ -9,7 +9,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from test_replay_bags import record_walls, replay, walls
+from replays import record_walls, replay, walls
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.batch.replay import write_pictures

@@ -37,10 +37,18 @@ def test_halves_do_not_depend_on_the_number_of_threads(threads):
     )
 
 
+@pytest.mark.parametrize('threads', [2, 7], indirect=True)
 def test_strips_are_worked_on_at_the_same_time(threads):
     """Each waits for another; alone they would for ever."""
     barrier = threading.Barrier(min(threads, 4), timeout=20)
-    strips(lambda first, after: barrier.wait() if threads > 1 else None, 100)
+    strips(lambda first, after: barrier.wait(), 100)
+
+
+@pytest.mark.parametrize('threads', [1], indirect=True)
+def test_one_thread_is_the_callers_own(threads):
+    workers = set()
+    strips(lambda first, after: workers.add(threading.get_ident()), 100)
+    assert workers == {threading.get_ident()}
 
 
 def test_errors_come_back():

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_replay_bags import record_walls, replay, walls
+from replays import record_walls, replay, walls
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.io.images import read_labels
