@@ -20,6 +20,8 @@ _MARGIN = 2 * _WINDOW - 1
 # A step between two pixels that needs no look at their surroundings, in units of `step`: steeper
 # than all but planes seen edge-on from centimetres away.
 _CLEAR = 5
+# Response of the Sobel operator of 3 x 3 to a step of one: 1 + 2 + 1.
+_SOBEL_GAIN = 4
 
 
 def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
@@ -27,15 +29,19 @@ def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
     if config.jump_edges == 'plane':
         return plane_deviation(image, config.edge_step)
     if config.jump_edges == 'sobel':
-        return beside(sobel(image))
+        return sobel(image)
     return None
 
 
-def sobel(image: RangeImage) -> NDArray[np.bool_]:
-    """Pixels on thresholded ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
+def sobel(image: RangeImage) -> GridEdges:
+    """Edges around thresholded ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
 
     Median filter, Sobel operators, the threshold of eq. 2.6, ridge thinning, morphological
-    bridging. Windows that hold a pixel without measurement respond with nothing (section 6.7).
+    bridging; the pixels of the ridges are disconnected from all of their neighbours. A window that
+    holds a pixel without measurement responds with nothing: the change towards a shadow is none
+    of depth (section 6.7). But contours must close at a shadow, or what lies before and behind it
+    stays connected around its end: bridging counts shadows as edges, and two neighbours are also
+    disconnected when the step between them by itself exceeds the threshold, whatever lies around.
 
     Parameters
     ----------
@@ -44,28 +50,41 @@ def sobel(image: RangeImage) -> NDArray[np.bool_]:
 
     Returns
     -------
-    (H, W) bool
+    horizontal, vertical : (H, W-1), (H-1, W) bool
     """
     valid = image.valid
     with np.errstate(divide='ignore'):
         depth = np.where(valid, 1 / image.inverse, 0).astype(np.float32)
-    depth = np.where(_complete(valid), cv2.medianBlur(depth, _WINDOW), depth)
     complete = _complete(valid)
-    gx = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 1, 0), 0)
-    gy = np.where(complete, cv2.Sobel(depth, cv2.CV_32F, 0, 1), 0)
+    smooth = np.where(complete, cv2.medianBlur(depth, _WINDOW), depth)
+    gx = np.where(complete, cv2.Sobel(smooth, cv2.CV_32F, 1, 0), 0)
+    gy = np.where(complete, cv2.Sobel(smooth, cv2.CV_32F, 0, 1), 0)
     strength = gx * gx + gy * gy
-    strong = strength > 4 * strength[complete].mean() if complete.any() else complete
-    # A ridge is no lower than the pixel before and higher than the one after, across it.
+    # Infinite where nothing can be told.
+    threshold = 2 * np.sqrt(strength[complete].mean()) if complete.any() else np.float32(np.inf)
+    ridge = _ridges(strength, np.abs(gx) >= np.abs(gy)) & (strength > threshold**2)
+    pixels = bridged(ridge | ~valid) & valid
+    horizontal, vertical = beside(pixels)
+    # A step between two columns or rows responds with the sum of the kernel's one side.
+    step = threshold / _SOBEL_GAIN
+    horizontal |= (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
+    vertical |= (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]
+    return horizontal, vertical
+
+
+def _ridges(strength: NDArray[np.float32], across: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels no lower than the one before and higher than the one after, along the gradient.
+
+    `across` (H, W) says where that runs along the rows, elsewhere along the columns.
+    """
     framed = np.pad(strength, 1)
     left, right = framed[1:-1, :-2], framed[1:-1, 2:]
     upper, lower = framed[:-2, 1:-1], framed[2:, 1:-1]
-    steep = np.abs(gx) >= np.abs(gy)
-    ridge = np.where(
-        steep,
+    return np.where(
+        across,
         (strength >= left) & (strength > right),
         (strength >= upper) & (strength > lower),
     )
-    return bridged(strong & ridge)
 
 
 def beside(pixels: NDArray[np.bool_]) -> GridEdges:
