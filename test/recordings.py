@@ -58,7 +58,14 @@ class Recording:
         self.messages.append((stamp, topic, COMPRESSED, message))
 
     def add_camera(
-        self, stamp, width=64, height=48, focal=50.0, topic='/camera/depth/camera_info'
+        self,
+        stamp,
+        width=64,
+        height=48,
+        focal=50.0,
+        topic='/camera/depth/camera_info',
+        model='plumb_bob',
+        **changes,
     ):
         k = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1])
         matrices = {
@@ -66,6 +73,7 @@ class Recording:
             'k': k,
             'r': np.eye(3).ravel(),
             'p': np.insert(k, (3, 6, 9), 0.0),
+            **changes,
         }
         if self.ros1:
             matrices = {name.upper(): matrix for name, matrix in matrices.items()}
@@ -73,7 +81,7 @@ class Recording:
             header=self.header(stamp),
             height=height,
             width=width,
-            distortion_model='plumb_bob',
+            distortion_model=model,
             binning_x=0,
             binning_y=0,
             roi=self.store.types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),

@@ -1,13 +1,15 @@
 """Recordings in, depth frames out: every format, whole, odd and damaged."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from recordings import SUFFIXES, Recording, depth_images, record
 
-from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthBagWriter
+from rangeseg_ros.io.cameras import read_camera, write_camera
 
 STORAGES = tuple(SUFFIXES)
 
@@ -116,6 +118,49 @@ def test_depth_is_found_by_encoding_where_no_name_tells(tmp_path):
     recording.write(tmp_path / 'bag')
     with DepthBag(tmp_path / 'bag') as bag:
         assert (bag.depth_topic, bag.camera_topic) == ('/b/image', '/camera_info')
+
+
+D = np.array([-0.2, 0.05, 0, 0, 0])
+
+
+def one_image(path, name, raw=False, **camera):
+    """Camera of a bag of one image, whose topic has this name."""
+    recording = Recording(ros1=path.suffix == '.bag')
+    recording.add_camera(1, **camera)
+    recording.add_image(2, depth_images(1)[0], topic=f'/camera/depth/{name}')
+    recording.write(path)
+    with DepthBag(path, raw=raw) as bag:
+        (frame,) = bag
+    return frame.camera
+
+
+@pytest.mark.parametrize('path', ['bag', 'ros1.bag'])
+def test_images_are_raw_or_rectified_by_name(tmp_path, path):
+    pinhole = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    lens = replace(pinhole, distortion_model='plumb_bob', d=tuple(D))
+    path = tmp_path / path
+    with pytest.warns(CameraWarning, match='D beside P'):
+        assert one_image(path.with_stem('a'), 'image_rect_raw', d=D) == pinhole
+    with pytest.warns(CameraWarning, match='D beside P'):
+        assert one_image(path.with_stem('b'), 'image', d=D) == pinhole
+    assert one_image(path.with_stem('c'), 'image_raw', d=D) == lens
+    assert one_image(path.with_stem('d'), 'image_rect', raw=True, d=D) == lens
+    assert one_image(path.with_stem('e'), 'image', d=D, p=np.zeros(12)) == lens
+    assert one_image(path.with_stem('f'), 'image_raw') == pinhole
+    with pytest.raises(BagError, match='unknown distortion model'):
+        one_image(path.with_stem('g'), 'image_raw', model='fov', d=D)
+
+
+@pytest.mark.parametrize('lens', [{}, {'distortion_model': 'equidistant', 'skew': 2.0}])
+def test_what_is_packed_comes_back_with_its_lens(tmp_path, lens):
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, **lens)
+    with DepthBagWriter(tmp_path / 'bag', camera) as bag:
+        bag.write(depth_images(1)[0], 10**9)
+    with DepthBag(tmp_path / 'bag') as bag:
+        assert bag.depth_topic == ('/depth/image_raw' if lens else '/depth/image_rect')
+        assert [frame.camera for frame in bag] == [camera]
+    write_camera(tmp_path / 'camera.yaml', camera)
+    assert read_camera(tmp_path / 'camera.yaml') == camera
 
 
 def test_camera_changes_on_the_way(tmp_path):

@@ -10,6 +10,7 @@ from rangeseg_ros.core.sensing.camera import CameraError
 
 K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
 P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]
+WHOLE = {'image_width': 640, 'image_height': 480, 'camera_matrix': {'data': np.ravel(K).tolist()}}
 
 
 def test_rays_project_back_to_their_pixels():
@@ -31,6 +32,14 @@ def test_pickles_leave_the_rays_behind():
     assert copy == camera
     assert not copy.rays.flags.writeable
     np.testing.assert_array_equal(copy.rays, rays)
+
+
+def test_numbers_of_numpy_are_numbers():
+    values = np.int64(4), np.uint16(3), np.float32(2), np.float64(3), np.int8(1), 1
+    camera = Camera(*values)
+    assert camera == Camera(4, 3, 2.0, 3.0, 1.0, 1.0)
+    assert {type(value) for value in (camera.width, camera.height)} == {int}
+    assert {type(value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)} == {float}
 
 
 def test_projection_matrix_wins_when_rectified():
@@ -64,6 +73,8 @@ def test_calibration_file_content():
         'projection_matrix': {'data': np.ravel(P).tolist()},
     }
     assert Camera.from_calibration(calibration).fx == 450
+    calibration['projection_matrix'] = None
+    assert Camera.from_calibration(calibration).fx == 500
     del calibration['projection_matrix']
     assert Camera.from_calibration(calibration).fx == 500
 
@@ -76,6 +87,16 @@ def test_calibration_file_content():
         ({'fy': -1.0}, 'fy'),
         ({'fx': np.nan}, 'fx'),
         ({'cy': np.inf}, 'cy'),
+        ({'width': 640.7}, 'width must be a positive whole number'),
+        ({'width': '64'}, 'width'),
+        ({'height': True}, 'height'),
+        ({'width': 10**400}, 'width'),
+        ({'width': np.inf}, 'width'),
+        ({'fx': 10**400}, 'fx'),
+        ({'fx': '500'}, 'fx'),
+        ({'fx': 1e-300}, 'do not fit 4x3 pixels'),
+        ({'cx': 1e300}, 'do not fit'),
+        ({'skew': np.nan}, 'skew'),
     ],
 )
 def test_impossible_intrinsics(change, message):
@@ -91,6 +112,17 @@ def test_impossible_intrinsics(change, message):
         ({'image_width': 4, 'image_height': 3}, 'camera_matrix'),
         ({'image_width': 4, 'image_height': 3, 'camera_matrix': {'data': [1, 2]}}, '9 values'),
         ({'image_width': 4, 'image_height': 3, 'camera_matrix': 5}, 'malformed'),
+        ({**WHOLE, 'image_width': 640.7}, 'width'),
+        ({**WHOLE, 'image_width': True}, 'width'),
+        ({**WHOLE, 'image_width': np.inf}, 'width'),
+        ({**WHOLE, 'projection_matrix': 5}, 'malformed'),
+        ({**WHOLE, 'projection_matrix': {}}, 'data'),
+        ({**WHOLE, 'projection_matrix': {'data': ['a'] * 12}}, 'must be numbers'),
+        ({**WHOLE, 'camera_matrix': {'data': np.transpose(K).ravel()}}, 'row by row'),
+        ({**WHOLE, 'camera_matrix': {'data': [10**400] * 9}}, 'must be numbers'),
+        ({**WHOLE, 'distortion_model': 5}, 'distortion_model'),
+        ({**WHOLE, 'distortion_coefficients': {'data': 'abc'}}, 'must be numbers'),
+        ({**WHOLE, 'distortion_coefficients': {'data': [0.1] * 5}}, 'unknown distortion model'),
         ([], 'malformed'),
     ],
 )

@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 from message_classes import header, make_rosbags, needs_rclpy
 
 from rangeseg_ros import CameraError, RangeImage, planes_from_message
+from rangeseg_ros.messages.cameras import camera_from_message
 from rangeseg_ros.messages.clouds import CloudError, points_from_message
-from rangeseg_ros.messages.make import (
-    camera_from_message,
-)
 
 
 def camera_info(make=make_rosbags, **changes):

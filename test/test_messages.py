@@ -11,10 +11,7 @@ from rangeseg_ros import RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.clouds import planes_message
-from rangeseg_ros.messages.make import (
-    depth_from_message,
-    image_message,
-)
+from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.markers import ARROW_LENGTH, markers_message
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera

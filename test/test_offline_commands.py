@@ -9,6 +9,7 @@ import time
 import cv2
 import numpy as np
 import pytest
+import yaml
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros import Camera
@@ -172,6 +173,36 @@ def test_pack_scales_to_metres(folder, run):
         depth = next(iter(bag)).depth
     assert depth.dtype == np.float32
     np.testing.assert_allclose(depth, 0.3, rtol=1e-6)
+
+
+def test_the_largest_of_16_bits_stays_unmeasured_when_it_is_packed(folder, run):
+    write_image(folder / 'depth' / '2.png', np.full((48, 64), 65535, np.uint16))
+    for scale in ('0.001', '0.0002'):
+        bag = f'bag{scale}'
+        run('pack', 'depth', '--camera', 'camera.yaml', '--output', bag, '--depth-scale', scale)
+        with DepthBag(folder / bag) as frames:
+            assert not next(iter(frames)).range_image().valid.any()
+    _, output, _ = run('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'out')
+    assert 'no valid depth' in output
+
+
+def test_a_lens_is_not_ignored_in_silence(folder, run, recwarn):
+    calibration = yaml.safe_load((folder / 'camera.yaml').read_text())
+    calibration['distortion_coefficients']['data'] = [-0.2, 0.05, 0, 0, 0]
+    (folder / 'camera.yaml').write_text(yaml.safe_dump(calibration))
+    command = ('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output')
+    code, _, error = run(*command, 'rectified')
+    assert code == 0 and error.count('D beside P is left out') == 1 and error.count('\n') == 1
+    assert run(*command, 'raw', '--raw')[::2] == (0, '')
+    del calibration['projection_matrix']
+    (folder / 'camera.yaml').write_text(yaml.safe_dump(calibration))
+    assert run(*command, 'no_p')[::2] == (0, '')
+    tables = {name: (folder / name / '2_planes.csv').read_text() for name in ('raw', 'no_p')}
+    assert tables['raw'] == tables['no_p'] != (folder / 'rectified/2_planes.csv').read_text()
+    calibration['distortion_model'] = 'fov'
+    (folder / 'camera.yaml').write_text(yaml.safe_dump(calibration))
+    code, _, error = run(*command, 'unknown')
+    assert code == 2 and 'unknown distortion model' in error and not (folder / 'unknown').exists()
 
 
 def test_bad_input_of_pack(folder, run):

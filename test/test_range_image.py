@@ -1,16 +1,18 @@
 """Depth images and organised clouds become rays, inverse range and validity."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, RangeImage
-from rangeseg_ros.core.sensing.range_image import RangeImageError
+from rangeseg_ros.core.sensing.range_image import RangeImageError, UnitWarning
 
 CAMERA = Camera(4, 3, 2.0, 3.0, 1.5, 1.0)
 
 
 def test_millimetres_and_metres_agree():
-    depth = np.random.default_rng(0).integers(1, 65536, CAMERA.shape).astype(np.uint16)
+    depth = np.random.default_rng(0).integers(1, 65535, CAMERA.shape).astype(np.uint16)
     metres = depth / 1000
     first, second = RangeImage.from_depth(depth, CAMERA), RangeImage.from_depth(metres, CAMERA)
     np.testing.assert_allclose(first.inverse, second.inverse, rtol=1e-6)
@@ -31,6 +33,46 @@ def test_what_is_no_measurement():
     assert not image.valid[0].any() and not image.valid[1, 0]
     assert np.isnan(image.points[~image.valid]).all()
     assert np.isfinite(image.inverse).all()
+
+
+@pytest.mark.parametrize('order', ['<', '>'])
+@pytest.mark.parametrize('scale', [None, 1 / 5000])
+def test_the_largest_of_16_bits_is_not_measured(order, scale):
+    depth = np.full(CAMERA.shape, 65534, f'{order}u2')
+    depth[1, 2] = 65535
+    image = RangeImage.from_depth(depth, CAMERA, scale)
+    assert np.argwhere(~image.valid).tolist() == [[1, 2]]
+    np.testing.assert_allclose(image.points[0, 0, 2], 65534 * (scale or 0.001), rtol=1e-6)
+
+
+@pytest.mark.parametrize('kind', ['<u2', '>u2', '<f4', '>f4', '>f8', 'f2'])
+def test_masks_and_byte_orders(kind):
+    depth = np.arange(1000, 1012).reshape(CAMERA.shape).astype(kind)
+    hidden = depth % 5 == 0
+    image = RangeImage.from_depth(np.ma.masked_array(depth, hidden), CAMERA, 0.001)
+    np.testing.assert_array_equal(image.valid, ~hidden)
+    np.testing.assert_allclose(image.points[~hidden, 2], depth[~hidden] / 1000, rtol=1e-3)
+    assert RangeImage.from_depth(np.ma.masked_array(depth), CAMERA, 0.001).valid.all()
+
+
+def test_a_masked_coordinate_hides_its_point():
+    points = np.ma.masked_array(np.ones((2, 3, 3)), False)
+    points[0, 1, 2] = np.ma.masked
+    points.data[0, 1, 2] = np.nan
+    assert np.argwhere(~RangeImage.from_points(points).valid).tolist() == [[0, 1]]
+
+
+def test_clouds_in_millimetres_are_doubted():
+    far = np.full((4, 5, 3), 100.0)
+    far[:2] = 10.0
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        RangeImage.from_points(far)
+        RangeImage.from_points(np.full((4, 5, 3), 1e300))
+        RangeImage.from_points(np.full((4, 5, 3), np.nan))
+    far[1, 0] = np.nan
+    with pytest.warns(UnitWarning, match='metres'):
+        RangeImage.from_points(far)
 
 
 def test_clouds_keep_their_points():
@@ -72,7 +114,8 @@ def test_refused_depth_images(depth, scale, message):
 
 
 @pytest.mark.parametrize(
-    'points', [np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int)]
+    'points',
+    [np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int), np.zeros((0, 0, 3))],
 )
 def test_refused_clouds(points):
     with pytest.raises(RangeImageError, match='organised cloud'):

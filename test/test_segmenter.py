@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import pickle
 import subprocess
 import sys
 from dataclasses import replace
@@ -155,6 +156,20 @@ def test_dithering_repeats_with_its_seed():
     other = segment(corner(), replace(config, seed=1))
     np.testing.assert_array_equal(first.labels, again.labels)
     assert first.energy == again.energy != other.energy
+
+
+@pytest.mark.parametrize('config', [Config(min_pixels=100), NORMALS], ids=['planes', 'normals'])
+def test_a_result_can_be_pickled_with_its_energy(config):
+    result = segment(corner(), config)
+    data = pickle.dumps(result)
+    assert len(data) < 100_000  # not with the image
+    copy = pickle.loads(data)
+    assert copy.energy == result.energy
+    np.testing.assert_array_equal(copy.labels, result.labels)
+    for one, other in zip(copy.planes, result.planes, strict=True):
+        np.testing.assert_array_equal(one.hull, other.hull)
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+    assert replace(copy, planes=[]).energy == result.energy
 
 
 WARM = replace(NORMALS, warm_start=True)

@@ -17,10 +17,11 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthFrame
+from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
 BAG = 'bag'
@@ -73,6 +74,8 @@ class Replay:
         Topics of the node to record, names of `OUTPUTS`.
     copy : bool
         Copy the topics of the recording into the bag.
+    raw : bool
+        See `DepthBag`.
     """
 
     recording: Path
@@ -82,6 +85,7 @@ class Replay:
     camera_topic: str | None = None
     topics: tuple[str, ...] = ('labels', 'planes', 'markers')
     copy: bool = False
+    raw: bool = False
 
     def check(self) -> str:
         """Topics that will be read; BagError when the recording or the folder will not do."""
@@ -144,7 +148,7 @@ class Replay:
         return outcome
 
     def _open(self) -> DepthBag:
-        return DepthBag(self.recording, self.depth_topic, self.camera_topic)
+        return DepthBag(self.recording, self.depth_topic, self.camera_topic, self.raw)
 
     def _clear(self) -> None:
         """Remove what other or interrupted runs have left."""
@@ -176,7 +180,7 @@ def segmented(
     sequence = SequenceSegmenter(config)
     sequence.warm_up()
     for frame in frames:
-        image = RangeImage.from_depth(frame.depth, frame.camera)
+        image = frame.range_image()
         yield frame, image, sequence.segment(image, frame.stamp)
 
 

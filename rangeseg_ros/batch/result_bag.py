@@ -16,8 +16,9 @@ from rosbags.typesys import Stores
 
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.io.bags import BagError, DepthFrame
-from rangeseg_ros.io.recordings import message_types
+from rangeseg_ros.io.bags import BagError
+from rangeseg_ros.io.recordings import make_rosbags, message_types
+from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.outputs import OUTPUTS
 
 NAMESPACE = '/segment_planes'
@@ -27,11 +28,6 @@ _KEY = 'rangeseg_replay'
 
 Timed = tuple[int, Connection, bytes]
 """When, where and what is written."""
-
-
-def make_rosbags(kind: str, **fields: Any) -> Any:
-    """Make a message of `rosbags`' Jazzy types."""
-    return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
 
 
 class ResultBag:

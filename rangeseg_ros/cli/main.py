@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from importlib import import_module
+from typing import Any
 
 import click
 
@@ -46,9 +48,14 @@ def rangeseg() -> None:
     """Segment depth images into planes."""
 
 
+def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
+    print(f'rangeseg: warning: {message}', file=sys.stderr)
+
+
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     interrupts.watch()
+    warnings.showwarning = _warn
     try:
         # Without its standalone mode click returns the code that a command exits with.
         sys.exit(rangeseg.main(prog_name='rangeseg', standalone_mode=False))

@@ -25,6 +25,11 @@ camera: Callable[..., Any] = click.option(
     required=True,
     help='Intrinsics: a ROS camera-calibration YAML file.',
 )
+raw: Callable[..., Any] = click.option(
+    '--raw',
+    is_flag=True,
+    help='The images are raw: lens distortion D and K count, not P of rectified images.',
+)
 params: Callable[..., Any] = click.option(
     '--params',
     'params_file',

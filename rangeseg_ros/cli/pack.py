@@ -8,6 +8,7 @@ import click
 import numpy as np
 
 from rangeseg_ros.cli import options
+from rangeseg_ros.core.sensing.range_image import NOT_MEASURED
 from rangeseg_ros.io.bags import BagError, DepthBagWriter
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import natural_order
@@ -20,6 +21,7 @@ SUFFIXES = ('.png', '.tif', '.tiff')
 @click.command()
 @click.argument('frames_dir', type=options.FOLDER)
 @options.camera
+@options.raw
 @click.option(
     '--output',
     type=click.Path(path_type=Path),
@@ -43,6 +45,7 @@ SUFFIXES = ('.png', '.tif', '.tiff')
 def command(
     frames_dir: Path,
     camera_file: Path,
+    raw: bool,
     output: Path,
     rate: float,
     depth_scale: float | None,
@@ -50,9 +53,9 @@ def command(
 ) -> None:
     """Pack the depth images (PNG, TIFF) of FRAMES_DIR into a rosbag2.
 
-    Images are taken in the order of their names, 2 before 10. The topics are /depth/image_rect
-    and /depth/camera_info. Images of 16 bits and 0.001 m stay as they are (16UC1), others become
-    metres (32FC1).
+    Images are taken in the order of their names, 2 before 10. The topics are /depth/image_rect,
+    or /depth/image_raw for raw images whose lens distorts, and /depth/camera_info. Images of 16
+    bits and 0.001 m stay as they are (16UC1), others become metres (32FC1).
 
     A pose is a text file of 16 numbers, row by row: p_world = T p_camera, metres. That of an image
     is <stem>.txt or <stem>.pose.txt, or else the one with the same number in its name. Poses
@@ -65,7 +68,7 @@ def command(
     )
     if not paths:
         raise click.ClickException(f'{frames_dir}: no {", ".join(SUFFIXES)} images')
-    camera = read_camera(camera_file)
+    camera = read_camera(camera_file, raw)
     poses = match_poses(paths, poses_dir) if poses_dir else {}
     without: list[str] = []
     with DepthBagWriter(output, camera) as bag:
@@ -74,7 +77,8 @@ def command(
             if depth.dtype != np.uint16:
                 depth = np.float32(depth_scale or 1) * depth.astype(np.float32)
             elif depth_scale not in (None, 0.001):
-                depth = np.float32(depth_scale) * depth.astype(np.float32)
+                metres = np.float32(depth_scale) * depth.astype(np.float32)
+                depth = np.where(depth == NOT_MEASURED, np.float32(np.nan), metres)
             # Time 0 means 'not set' in ROS, so the first image is at one second.
             stamp = 10**9 + round(index * 1e9 / rate)
             try:

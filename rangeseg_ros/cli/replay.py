@@ -29,6 +29,7 @@ from rangeseg_ros.tasks import run_all, run_on_cluster
 )
 @click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.raw
 @click.option(
     '--topic',
     'topics',
@@ -55,6 +56,7 @@ def command(
     output: Path,
     depth_topic: str | None,
     camera_topic: str | None,
+    raw: bool,
     topics: tuple[str, ...],
     copy: bool,
     jobs: int | None,
@@ -84,7 +86,7 @@ def command(
         folders = [folder.absolute() for folder in folders]
     topics = tuple(name for name in OUTPUTS if name in topics)
     tasks = [
-        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy)
+        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy, raw)
         for bag, folder in zip(bags, folders, strict=True)
     ]
     # All are opened, and so checked, before anything is written.

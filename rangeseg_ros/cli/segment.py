@@ -21,6 +21,7 @@ from rangeseg_ros.io.planes import PlaneTable
 @click.command()
 @click.argument('depth', nargs=-1, required=True, type=options.FILE)
 @options.camera
+@options.raw
 @click.option(
     '--output',
     type=click.Path(file_okay=False, path_type=Path),
@@ -33,6 +34,7 @@ from rangeseg_ros.io.planes import PlaneTable
 def command(
     depth: tuple[Path, ...],
     camera_file: Path,
+    raw: bool,
     output: Path,
     depth_scale: float | None,
     params_file: Path | None,
@@ -46,7 +48,7 @@ def command(
     name, count = Counter(path.stem for path in depth).most_common(1)[0]
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
-    camera = read_camera(camera_file)
+    camera = read_camera(camera_file, raw)
     segmenter = Segmenter(options.read_parameters(params_file, exact))
     for path in options.progress(depth, len(depth), 'image'):
         try:

@@ -31,6 +31,7 @@ ARROW_LENGTH = 0.2
 )
 @click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.raw
 @options.params
 @options.exact
 def command(
@@ -38,6 +39,7 @@ def command(
     output: Path,
     depth_topic: str | None,
     camera_topic: str | None,
+    raw: bool,
     params_file: Path | None,
     exact: bool,
 ) -> None:
@@ -48,7 +50,7 @@ def command(
     """
     config = options.read_parameters(params_file, exact)
     rerun = _rerun()
-    with DepthBag(bag, depth_topic, camera_topic) as source, replacing(output) as partial:
+    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as partial:
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)
         log.save(partial)
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,20 +43,22 @@ class Segmentation:
         Milliseconds per stage, in the order of the stages.
     reason : str
         Why there is no plane; empty when there is one.
-    energy_of_labels : callable
-        Evaluates `energy`.
     """
 
     labels: NDArray[np.uint16]
     planes: list[Plane]
     timings: dict[str, float]
     reason: str
-    energy_of_labels: Callable[[], float]
+    _energy: Callable[[], float] = field(repr=False)
 
     @cached_property
     def energy(self) -> float:
         """Value of eq. 5.3 for the labelling the regions were made from, worked out when read."""
-        return self.energy_of_labels()
+        return self._energy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # With the value of the energy in place of all that it is worked out from.
+        return {**self.__dict__, 'energy': self.energy, '_energy': partial(float, self.energy)}
 
 
 class Segmenter:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,13 +19,15 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.recordings import RecordingError, message_types, open_recording
-from rangeseg_ros.messages.images import (
-    PIXEL_TYPES,
-    EncodingError,
-    decode_compressed,
-    decode_image,
+from rangeseg_ros.io.recordings import (
+    RecordingError,
+    make_rosbags,
+    message_types,
+    open_recording,
 )
+from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message, raw_by_name
+from rangeseg_ros.messages.frames import DepthFrame
+from rangeseg_ros.messages.images import PIXEL_TYPES, image_message
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -42,31 +43,6 @@ class DamagedBagError(BagError):
     """A recording that cannot be read further than here."""
 
 
-@dataclass(frozen=True, eq=False)
-class DepthFrame:
-    """A depth image of a recording.
-
-    Attributes
-    ----------
-    stamp : int
-        Time of the measurement (header stamp), nanoseconds.
-    time : int
-        When it was recorded, nanoseconds.
-    frame_id : str
-        Optical frame of the camera.
-    depth : (H, W) uint16 or float32
-        Millimetres with 0 invalid, or metres with non-finite or <= 0 invalid.
-    camera : Camera
-        The latest camera_info before the image, or else the first one.
-    """
-
-    stamp: int
-    time: int
-    frame_id: str
-    depth: NDArray[np.uint16] | NDArray[np.float32]
-    camera: Camera
-
-
 class DepthBag:
     """Iterates over the depth frames of one recording, in the order of the recording.
 
@@ -77,6 +53,8 @@ class DepthBag:
     depth_topic, camera_topic : str, optional
         Where to find images and intrinsics. By default the depth image is found by type and
         name, or encoding; its camera_info is the sibling topic, or the only one there is.
+    raw : bool
+        The images are raw whatever the name of their topic says, see `raw_by_name`.
 
     Attributes
     ----------
@@ -93,9 +71,14 @@ class DepthBag:
     """
 
     def __init__(
-        self, path: Path, depth_topic: str | None = None, camera_topic: str | None = None
+        self,
+        path: Path,
+        depth_topic: str | None = None,
+        camera_topic: str | None = None,
+        raw: bool = False,
     ) -> None:
         self.path = path
+        self._raw = raw
         try:
             self._recording = open_recording(path)
         except OSError as error:
@@ -108,7 +91,9 @@ class DepthBag:
             self.camera_topic = camera_topic or self._find_camera_topic()
             self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
             self._first_camera = self._read_camera(self._first_message(self.camera_topic))
-            self._frame(self._first_message(self.depth_topic), self._first_camera, time=0)
+            self._check(
+                DepthFrame(self._first_message(self.depth_topic), self._first_camera, time=0)
+            )
         except BaseException:
             self.close()
             raise
@@ -134,10 +119,11 @@ class DepthBag:
             topics = (self.depth_topic, self.camera_topic)
             for topic, time, message in self._recording.messages(topics):
                 if topic == self.camera_topic:
-                    latest = self._read_camera(message)
-                    camera = camera if latest == camera else latest  # keeps its cached rays
+                    camera = self._read_camera(message)
                 else:
-                    yield self._frame(message, camera, time)
+                    frame = DepthFrame(message, camera, time)
+                    self._check(frame)
+                    yield frame
                     count += 1
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
@@ -146,46 +132,25 @@ class DepthBag:
                 f'{self.path}: damaged after {count} frames: {reason}'
             ) from error
 
-    def _frame(self, message: Any, camera: Camera, time: int) -> DepthFrame:
-        where = f'{self.path}: {self.depth_topic}'
-        try:
-            if hasattr(message, 'format'):
-                depth = decode_compressed(message.format, message.data)
-            else:
-                depth = decode_image(
-                    message.height,
-                    message.width,
-                    message.encoding,
-                    bool(message.is_bigendian),
-                    message.step,
-                    message.data,
-                )
-        except EncodingError as error:
-            raise BagError(f'{where}: {error}') from None
-        if depth.shape != camera.shape:
-            raise BagError(
-                f'{where} is {depth.shape[1]}x{depth.shape[0]}, but {self.camera_topic} '
-                f'{camera.width}x{camera.height}'
-            )
-        stamp = message.header.stamp
-        return DepthFrame(
-            stamp.sec * 10**9 + stamp.nanosec, time, message.header.frame_id, depth, camera
-        )
-
     def _read_camera(self, message: Any) -> Camera:
-        ros1 = hasattr(message, 'K')
-        roi = message.roi
+        raw = True if self._raw else raw_by_name(self.depth_topic)
         try:
-            return Camera.from_matrices(
-                message.width,
-                message.height,
-                message.K if ros1 else message.k,
-                message.P if ros1 else message.p,
-                (message.binning_x, message.binning_y),
-                (roi.x_offset, roi.y_offset, roi.width, roi.height),
-            )
+            return camera_from_message(message, raw)
         except CameraError as error:
             raise BagError(f'{self.path}: {self.camera_topic}: {error}') from None
+
+    def _check(self, frame: DepthFrame) -> None:
+        where, message, camera = f'{self.path}: {self.depth_topic}', frame.message, frame.camera
+        size = getattr(message, 'height', None), getattr(message, 'width', None)
+        if camera and size[0] is not None and size != camera.shape:
+            raise BagError(
+                f'{where} is {size[1]}x{size[0]}, but {self.camera_topic} '
+                f'{camera.width}x{camera.height}'
+            )
+        try:
+            frame.range_image()
+        except ValueError as error:
+            raise BagError(f'{where}: {error}') from None
 
     def _first_message(self, topic: str) -> Any:
         try:
@@ -252,8 +217,8 @@ def _sibling_camera_info(image_topic: str) -> str:
 class DepthBagWriter:
     """Writes depth frames of one camera to a new rosbag2 (mcap).
 
-    The topics are those to which the node listens by default. The recording appears under its
-    name once it is complete.
+    The topics are those to which the node listens by default; raw images of a camera that is no
+    pinhole go to image_raw. The recording appears under its name once it is complete.
 
     Parameters
     ----------
@@ -275,7 +240,6 @@ class DepthBagWriter:
     ...     bag.write(depth, stamp)
     """
 
-    depth_topic = '/depth/image_rect'
     camera_topic = '/depth/camera_info'
     transform_topic = '/tf'
 
@@ -285,6 +249,7 @@ class DepthBagWriter:
         self.path = Path(path)
         self.camera = camera
         self.frame_id = frame_id
+        self.depth_topic = '/depth/image_rect' if camera.pinhole else '/depth/image_raw'
         self._store = message_types(Stores.ROS2_JAZZY)
 
     def __enter__(self) -> DepthBagWriter:
@@ -319,34 +284,9 @@ class DepthBagWriter:
                 f'depth image must be {self.camera.shape} uint16 or float32, '
                 f'not {depth.shape} {depth.dtype}'
             )
-        types = self._store.types
         header = self._header(stamp, self.frame_id)
-        height, width = depth.shape
-        little_endian = np.ascontiguousarray(depth, depth.dtype.newbyteorder('<'))
-        image = types[IMAGE](
-            header=header,
-            height=height,
-            width=width,
-            encoding=encodings[depth.dtype],
-            is_bigendian=0,
-            step=width * depth.itemsize,
-            data=little_endian.view(np.uint8).ravel(),
-        )
-        camera = self.camera
-        k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-        info = types[CAMERA_INFO](
-            header=header,
-            height=height,
-            width=width,
-            distortion_model='plumb_bob',
-            d=np.zeros(5),
-            k=k.ravel(),
-            r=np.eye(3).ravel(),
-            p=np.column_stack([k, np.zeros(3)]).ravel(),
-            binning_x=0,
-            binning_y=0,
-            roi=types['sensor_msgs/msg/RegionOfInterest'](0, 0, 0, 0, False),
-        )
+        image = image_message(make_rosbags, header, depth, encodings[depth.dtype])
+        info = camera_info_message(make_rosbags, header, self.camera)
         for connection, message in ((self._info, info), (self._image, image)):
             self._append(connection, stamp, message)
 

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import yaml
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
 
 
-def read_camera(path: Path) -> Camera:
+def read_camera(path: Path, raw: bool = False) -> Camera:
     """Read the intrinsics of a ROS camera-calibration YAML file.
+
+    Parameters
+    ----------
+    path : Path
+    raw : bool
+        The images are raw though there is a P for rectified ones.
 
     Raises
     ------
@@ -27,28 +35,29 @@ def read_camera(path: Path) -> Camera:
     if not isinstance(calibration, dict):
         raise CameraError(f'{path}: not a camera calibration')
     try:
-        return Camera.from_calibration(calibration)
+        return Camera.from_calibration(calibration, raw or None)
     except ValueError as error:
         raise CameraError(f'{path}: {error}') from None
 
 
 def write_camera(path: Path, camera: Camera, name: str = 'depth') -> None:
-    """Write a ROS camera-calibration YAML file."""
-    k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
-    p = [camera.fx, 0.0, camera.cx, 0.0, 0.0, camera.fy, camera.cy, 0.0, 0.0, 0.0, 1.0, 0.0]
-    calibration = {
+    """Write a ROS camera-calibration YAML file: without P unless the camera is a pinhole."""
+    d = list(camera.d or (0.0,) * 5)
+    calibration: dict[str, Any] = {
         'image_width': camera.width,
         'image_height': camera.height,
         'camera_name': name,
-        'camera_matrix': {'rows': 3, 'cols': 3, 'data': k},
-        'distortion_model': 'plumb_bob',
-        'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [0.0] * 5},
+        'camera_matrix': {'rows': 3, 'cols': 3, 'data': camera.matrix.ravel().tolist()},
+        'distortion_model': camera.distortion_model or 'plumb_bob',
+        'distortion_coefficients': {'rows': 1, 'cols': len(d), 'data': d},
         'rectification_matrix': {
             'rows': 3,
             'cols': 3,
             'data': [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         },
-        'projection_matrix': {'rows': 3, 'cols': 4, 'data': p},
     }
+    if camera.pinhole:
+        p = np.pad(camera.matrix, ((0, 0), (0, 1))).ravel().tolist()
+        calibration['projection_matrix'] = {'rows': 3, 'cols': 4, 'data': p}
     with replacing(path) as partial:
         partial.write_text(yaml.safe_dump(calibration, sort_keys=False, default_flow_style=None))

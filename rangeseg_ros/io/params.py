@@ -11,7 +11,9 @@ from rangeseg_ros.core.config import Config, ConfigError
 
 NODE = 'segment_planes'
 # Parameters that the node has beyond those of the segmenter; nested ones by their first part.
-NODE_ONLY = frozenset({'input', 'use_imu', 'stall_timeout', 'qos_overrides', 'use_sim_time'})
+NODE_ONLY = frozenset(
+    {'input', 'raw', 'use_imu', 'stall_timeout', 'qos_overrides', 'use_sim_time'}
+)
 
 
 def read_params(path: Path) -> dict[str, Any]:

@@ -144,6 +144,11 @@ def message_types(distribution: Stores) -> Typestore:
     return get_typestore(distribution)
 
 
+def make_rosbags(kind: str, **fields: Any) -> Any:
+    """Make a message of `rosbags`' Jazzy types, see `messages.Make`."""
+    return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
+
+
 class _Record(NamedTuple):
     topic: str
     type: str

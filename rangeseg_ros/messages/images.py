@@ -1,7 +1,4 @@
-"""Depth images in the bytes of ROS messages: sensor_msgs/Image and compressedDepth.
-
-Plain fields in, arrays out, so that bags and the node share one decoder and neither needs ROS.
-"""
+"""Images of messages: sensor_msgs/Image and compressedDepth in, sensor_msgs/Image out."""
 
 from __future__ import annotations
 
@@ -12,6 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.messages.make import Make
+
 # REP 118: millimetres as unsigned integers, or metres as floats.
 PIXEL_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 
@@ -21,6 +20,34 @@ _HEADER = struct.Struct('<iff')
 
 class EncodingError(ValueError):
     """A message that holds no depth image, or a damaged one."""
+
+
+def depth_from_message(
+    message: Any, shape: tuple[int, int] | None = None
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Depth image (H, W) of a sensor_msgs/Image, or a CompressedImage of compressedDepth.
+
+    Parameters
+    ----------
+    message : sensor_msgs/Image or CompressedImage
+    shape : (int, int), optional
+        (H, W) that the image must have; a compressed one of another size is not decoded.
+
+    Raises
+    ------
+    EncodingError
+        The message holds no depth image, a damaged one, or one of another size.
+    """
+    if hasattr(message, 'format'):
+        return decode_compressed(message.format, message.data, shape)
+    return decode_image(
+        message.height,
+        message.width,
+        message.encoding,
+        bool(message.is_bigendian),
+        message.step,
+        message.data,
+    )
 
 
 def decode_image(
@@ -73,7 +100,9 @@ def decode_image(
     return np.ascontiguousarray(rows).view(stored).astype(dtype, copy=False)
 
 
-def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+def decode_compressed(
+    format: str, data: Any, shape: tuple[int, int] | None = None
+) -> NDArray[np.uint16] | NDArray[np.float32]:
     """Depth image of a sensor_msgs/CompressedImage written by compressed_depth_image_transport.
 
     Parameters
@@ -83,6 +112,8 @@ def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np
     data : bytes-like
         A 12-byte header and a 16-bit PNG. 32FC1 is quantised in inverse depth:
         depth = a / (value - b), 0 invalid, with a and b in the header.
+    shape : (int, int), optional
+        (H, W) that the image must have.
 
     Returns
     -------
@@ -91,7 +122,7 @@ def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np
     Raises
     ------
     EncodingError
-        Another format or compression, or damaged data.
+        Another format or compression, another size, or damaged data.
     """
     encoding, _, compression = (part.strip() for part in format.partition(';'))
     # Older publishers do not name the codec; it was always PNG.
@@ -107,8 +138,14 @@ def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np
     if raw.size <= _HEADER.size:
         raise EncodingError(f'compressed depth image of {raw.size} bytes has no PNG')
     _, a, b = _HEADER.unpack(raw[: _HEADER.size].tobytes())
+    png = raw[_HEADER.size :]
+    size = png_shape(png[:24].tobytes())
+    if size and shape and size != shape:
+        raise EncodingError(
+            f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
+        )
     try:
-        image = cv2.imdecode(raw[_HEADER.size :], cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if size else None
     except cv2.error:
         image = None
     if image is None:
@@ -124,3 +161,26 @@ def decode_compressed(format: str, data: Any) -> NDArray[np.uint16] | NDArray[np
         depth = np.float32(a) / (image.astype(np.float32) - np.float32(b))
     depth[(image == 0) | ~(depth > 0)] = np.nan
     return depth
+
+
+def png_shape(data: bytes) -> tuple[int, int] | None:
+    """(H, W) of the PNG that begins with `data`, 24 bytes or more; None when it is no PNG."""
+    if len(data) < 24 or data[:8] != b'\x89PNG\r\n\x1a\n' or data[12:16] != b'IHDR':
+        return None
+    width, height = struct.unpack('>II', data[16:24])
+    return height, width
+
+
+def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:
+    """sensor_msgs/Image of an array (H, W) or (H, W, channels)."""
+    rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
+    return make(
+        'sensor_msgs/msg/Image',
+        header=header,
+        height=rows.shape[0],
+        width=rows.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=rows.strides[0],
+        data=rows.reshape(-1).view(np.uint8),
+    )

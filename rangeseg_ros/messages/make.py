@@ -1,22 +1,18 @@
-"""Arrays <-> ROS messages, whoever implements the message classes: rclpy or rosbags.
+"""How messages are made, whoever implements their classes: rclpy or rosbags.
 
 Messages are read by their fields and made by a `Make`, so that the node and an offline replay
-publish and write the same bytes, and this module imports without ROS.
+publish and write the same bytes, and this package imports without ROS.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from functools import cache, lru_cache
+from functools import cache
 from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.messages.images import decode_compressed, decode_image
 
 # Makes a message from the name of its type and all its fields, e.g.
 # make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=1.0); octets are given as uint8 arrays.
@@ -38,62 +34,3 @@ def message_class(kind: str) -> type:
     package, _, name = kind.split('/')
     found: type = getattr(import_module(f'{package}.msg'), name)
     return found
-
-
-def depth_from_message(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Depth image (H, W) of a sensor_msgs/Image, or a CompressedImage of compressedDepth.
-
-    Raises
-    ------
-    EncodingError
-        The message holds no depth image, or a damaged one.
-    """
-    if hasattr(message, 'format'):
-        return decode_compressed(message.format, message.data)
-    return decode_image(
-        message.height,
-        message.width,
-        message.encoding,
-        bool(message.is_bigendian),
-        message.step,
-        message.data,
-    )
-
-
-def camera_from_message(info: Any) -> Camera:
-    """Camera of a sensor_msgs/CameraInfo; the same object, with its rays, while nothing changes.
-
-    Raises
-    ------
-    CameraError
-        Intrinsics that cannot belong to a pinhole camera.
-    """
-    roi = info.roi
-    return _camera(
-        info.width,
-        info.height,
-        tuple(float(value) for value in info.k),
-        tuple(float(value) for value in info.p),
-        (info.binning_x, info.binning_y),
-        (roi.x_offset, roi.y_offset, roi.width, roi.height),
-    )
-
-
-@lru_cache(maxsize=4)
-def _camera(*fields: Any) -> Camera:
-    return Camera.from_matrices(*fields)
-
-
-def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:
-    """sensor_msgs/Image of an array (H, W) or (H, W, channels)."""
-    rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
-    return make(
-        'sensor_msgs/msg/Image',
-        header=header,
-        height=rows.shape[0],
-        width=rows.shape[1],
-        encoding=encoding,
-        is_bigendian=0,
-        step=rows.strides[0],
-        data=rows.reshape(-1).view(np.uint8),
-    )

@@ -13,7 +13,8 @@ from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import planes_message, points_message
-from rangeseg_ros.messages.make import Make, image_message
+from rangeseg_ros.messages.images import image_message
+from rangeseg_ros.messages.make import Make
 from rangeseg_ros.messages.markers import markers_message
 
 

@@ -4,45 +4,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.messages.clouds import points_from_message
-from rangeseg_ros.messages.make import camera_from_message, depth_from_message
+from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
+from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.qos import MatchedSubscription
 
 IMAGE_TOPIC = 'depth/image_rect'
 CAMERA_TOPIC = 'depth/camera_info'
 POINTS_TOPIC = 'depth/points'
-
-
-@dataclass(frozen=True, eq=False)
-class DepthFrame:
-    """A message to be segmented.
-
-    Attributes
-    ----------
-    message : sensor_msgs/Image, CompressedImage or PointCloud2
-    camera : Camera or None
-        None for clouds.
-    arrival : int
-        Time of the node's clock, nanoseconds.
-    """
-
-    message: Any
-    camera: Camera | None
-    arrival: int
-
-    def range_image(self) -> RangeImage:
-        """Decode the message; ValueError says what is wrong with it."""
-        if self.camera is None:
-            return RangeImage.from_points(points_from_message(self.message))
-        return RangeImage.from_depth(depth_from_message(self.message), self.camera)
 
 
 class DepthInput:
@@ -55,6 +29,8 @@ class DepthInput:
     node : rclpy.node.Node
     source : {'image', 'compressed_depth', 'points'}
         The parameter `input`.
+    raw : bool
+        Whether the images are raw whatever the name of their topic says.
     accept : callable
         Gets every complete frame.
     lost : callable
@@ -72,6 +48,7 @@ class DepthInput:
         self,
         node: Node,
         source: str,
+        raw: bool,
         accept: Callable[[DepthFrame], None],
         lost: Callable[[int], None],
     ) -> None:
@@ -89,6 +66,7 @@ class DepthInput:
             )
             return
         image_topic = node.resolve_topic_name(IMAGE_TOPIC)
+        self._raw = raw or raw_by_name(image_topic)
         self._info_subscription = MatchedSubscription(
             node, CameraInfo, _camera_topic(node, image_topic), self._on_camera_info
         )
@@ -136,7 +114,7 @@ class DepthInput:
 
     def _on_camera_info(self, info: CameraInfo) -> None:
         try:
-            self._camera = camera_from_message(info)
+            self._camera = camera_from_message(info, self._raw)
             self._camera_frame = info.header.frame_id
         except CameraError as error:
             self._camera = None

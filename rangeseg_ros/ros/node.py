@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 import traceback
+import warnings
 from contextlib import suppress
 from itertools import pairwise
 from threading import Thread
@@ -22,9 +23,10 @@ from rclpy.time import Time
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy, message_class
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.ros.depth_input import DepthFrame, DepthInput
+from rangeseg_ros.ros.depth_input import DepthInput
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.gravity import Gravity
 from rangeseg_ros.ros.latest import Latest
@@ -70,8 +72,10 @@ class SegmentPlanes(Node):
         return not self._worker.is_alive()
 
     def _configure(self, config: NodeConfig) -> None:
-        restart = (config.input, config.use_imu) != (self._config.input, self._config.use_imu)
-        self._config = config
+        before, self._config = self._config, config
+        restart = any(
+            getattr(config, name) != getattr(before, name) for name in ('input', 'raw', 'use_imu')
+        )
         if restart and self._input:
             self._unsubscribe()
             self._follow_demand()
@@ -81,7 +85,8 @@ class SegmentPlanes(Node):
         listeners = sum(output.get_subscription_count() for output in self._outputs.values())
         if listeners and self._input is None:
             lost = self._statistics.lost.add
-            self._input = DepthInput(self, self._config.input, self._accept, lost)
+            config = self._config
+            self._input = DepthInput(self, config.input, config.raw, self._accept, lost)
             self._gravity = Gravity(self) if self._config.use_imu else None
             self._statistics.problem = ''
         elif not listeners and self._input:
@@ -135,8 +140,8 @@ class SegmentPlanes(Node):
         ticks.append(time.perf_counter())
         conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(ticks))
         self._statistics.times = FrameTimes(
-            transport=(frame.arrival - Time.from_msg(header.stamp).nanoseconds) / 1e6,
-            waiting=(start - frame.arrival) / 1e6,
+            transport=(frame.time - Time.from_msg(header.stamp).nanoseconds) / 1e6,
+            waiting=(start - frame.time) / 1e6,
             conversion=conversion,
             compute=compute,
             publication=publication,
@@ -177,6 +182,8 @@ def main() -> None:
         print(f'segment_planes: {error}', file=sys.stderr)
         rclpy.try_shutdown()
         sys.exit(2)
+    # What the core warns of, such as a lens that is left out: once each.
+    warnings.showwarning = lambda message, *where: node.get_logger().warning(str(message))
     try:
         rclpy.spin(node)
     except Exception:

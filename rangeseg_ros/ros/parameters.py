@@ -28,6 +28,11 @@ class NodeConfig(Config):
         'organised clouds (points)',
         choices=('image', 'compressed_depth', 'points'),
     )
+    raw: bool = option(
+        False,
+        'depth images are raw: lens distortion D and K of camera_info count, not P; so they do '
+        'anyway where the topic is named image_raw or P is missing',
+    )
     use_imu: bool = option(
         False,
         'take up from the accelerometer on the topic imu, once there is one in the frame of the '

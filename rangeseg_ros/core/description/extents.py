@@ -73,10 +73,10 @@ def rectangles(
     -------
     (M + 1, 2, 2) float64
         Smallest and largest coordinate along each axis, metres; of the corners of the pixels for
-        a camera, of their centres otherwise. Not finite without pixels.
+        a pinhole camera, of their centres otherwise. Not finite without pixels.
     """
     camera = image.camera
-    half = (0.5 / camera.fx, 0.5 / camera.fy) if camera else (0.0, 0.0)
+    half = (0.5 / camera.fx, 0.5 / camera.fy) if camera and camera.pinhole else (0.0, 0.0)
     arrays = labels, image.inverse, image.rays, theta, axes
     upper, lower = halves(_limits, len(labels), *arrays, *half)
     # Smallest and largest.
@@ -85,9 +85,9 @@ def rectangles(
 
 def _footprints(image: RangeImage) -> NDArray[np.float32]:
     """|du x dv . r|, (H, W), of the rays r and their differences from pixel to pixel."""
-    if image.camera is None:
-        return _ray_footprints(image.rays, image.inverse)
-    return np.full(image.shape, 1 / (image.camera.fx * image.camera.fy), np.float32)
+    if image.camera and image.camera.pinhole:
+        return np.full(image.shape, 1 / (image.camera.fx * image.camera.fy), np.float32)
+    return _ray_footprints(image.rays, image.inverse)
 
 
 @njit(cache=True)
@@ -175,12 +175,14 @@ def _limits(
     limits = np.empty((len(theta), 2, 2))
     limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
     corners = 1 if half_x == 0 else 4
-    width = labels.shape[1]
+    height, width = labels.shape
     for i in range(first, after):
         for j in range(width):
             label = labels[i, j]
-            # Rows of pixels are straight on the plane: the extremes lie at their ends.
+            # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends.
             inner = 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]
+            if inner and corners == 1:
+                inner = 0 < i < height - 1 and labels[i - 1, j] == label == labels[i + 1, j]
             if label == 0 or inner or inverse[i, j] == 0:
                 continue
             plane = theta[label]

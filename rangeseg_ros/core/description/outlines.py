@@ -80,10 +80,8 @@ class Outline:
     def _rays(self, corners: NDArray[Any]) -> NDArray[np.float64]:
         """Rays (N, 3) of corners (x, y) of pixels in the box."""
         if isinstance(self.rays, Camera):
-            camera = self.rays
-            x = (corners[:, 0] + self.column - 0.5 - camera.cx) / camera.fx
-            y = (corners[:, 1] + self.row - 0.5 - camera.cy) / camera.fy
-            return np.stack([x, y, np.ones(len(corners))], axis=1)
+            left, top = self.column - 0.5, self.row - 0.5
+            return self.rays.rays_at(corners[:, 0] + left, corners[:, 1] + top)
         total = np.zeros((len(corners), 3))
         height, width = self.mask.shape
         for i in (0, -1):

@@ -1,7 +1,9 @@
-"""Pinhole intrinsics and the rays of the pixels."""
+"""Camera intrinsics and the rays of the pixels."""
 
 from __future__ import annotations
 
+import operator
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass
 from functools import cached_property
@@ -10,14 +12,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.sensing.lens import checked_lens, undistorted
+
+# Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
+# squares of their moments leave the range of the solvers.
+_STEEPEST = 1000.0
+
 
 class CameraError(ValueError):
-    """Intrinsics that cannot belong to a pinhole camera."""
+    """Intrinsics that no camera has, or that are not known to the end."""
+
+
+class CameraWarning(UserWarning):
+    """A part of a calibration is left out."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A rectified pinhole camera in the ROS optical frame (REP 103): x right, y down, z forward.
+    """A camera in the ROS optical frame (REP 103): x right, y down, z forward.
 
     Parameters
     ----------
@@ -27,11 +39,18 @@ class Camera:
         Focal lengths, pixels.
     cx, cy : float
         Principal point, pixels; the centre of the first pixel is (0, 0).
+    skew : float
+        Shift of the columns per focal length downwards, pixels: K[0, 1].
+    distortion_model : str
+        Of the lens of raw images, see `lens.MODELS`; empty for rectified ones.
+    d : tuple of float
+        Coefficients of the model, as in CameraInfo.
 
     Raises
     ------
     CameraError
-        Empty image, non-finite intrinsics, or a focal length that is not positive.
+        Empty image, non-finite intrinsics, a focal length that is not positive, pixels that look
+        across the optical axis, or an unknown lens.
     """
 
     width: int
@@ -40,19 +59,41 @@ class Camera:
     fy: float
     cx: float
     cy: float
+    skew: float = 0.0
+    distortion_model: str = ''
+    d: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.width < 1 or self.height < 1:
-            raise CameraError(f'image size must be positive, not {self.width}x{self.height}')
-        for name in ('fx', 'fy', 'cx', 'cy'):
-            value = getattr(self, name)
-            if not np.isfinite(value):
-                raise CameraError(f'{name} must be finite, not {value}')
+        checked: dict[str, Any] = {
+            name: _whole(name, getattr(self, name)) for name in ('width', 'height')
+        }
+        checked |= {
+            name: _finite(name, getattr(self, name)) for name in ('fx', 'fy', 'cx', 'cy', 'skew')
+        }
+        try:
+            lens = checked_lens(self.distortion_model, self.d)
+        except (TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise CameraError(str(error)) from None
+        checked['distortion_model'], checked['d'] = lens
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         for name in ('fx', 'fy'):
             if getattr(self, name) <= 0:
                 raise CameraError(
                     f'focal length {name} must be positive, not {getattr(self, name)}'
                 )
+        if self.distortion_model != 'equidistant':
+            self._check_slopes()
+
+    def _check_slopes(self) -> None:
+        corners = np.array([(u, v) for u in (0, self.width - 1) for v in (0, self.height - 1)])
+        with np.errstate(over='ignore', invalid='ignore'):
+            steepest = np.abs(self._distorted(corners[:, 0], corners[:, 1])).max()
+        if not steepest <= _STEEPEST:
+            raise CameraError(
+                f'focal lengths {self.fx:g}, {self.fy:g} and principal point {self.cx:g}, '
+                f'{self.cy:g} do not fit {self.width}x{self.height} pixels'
+            )
 
     @classmethod
     def from_matrices(
@@ -63,38 +104,54 @@ class Camera:
         p: ArrayLike | None = None,
         binning: Sequence[int] = (0, 0),
         roi: Sequence[int] = (0, 0, 0, 0),
+        distortion_model: str = '',
+        d: Sequence[float] = (),
+        raw: bool | None = None,
     ) -> Camera:
-        """Camera of an image described by a CameraInfo message.
+        """Camera of an image described by a CameraInfo message, whose fields the parameters are.
+
+        Rectified images are described by P, raw ones by K and the lens. A lens that distorts,
+        beside the P of rectified images, is left out with a `CameraWarning`.
 
         Parameters
         ----------
         width, height : int
             Size of the full-resolution image, before binning and ROI.
         k, p : array_like
-            The 3x3 and 3x4 matrices, nested or flat. `p` is used when the image is rectified
-            (p[0, 0] > 0), `k` otherwise.
+            The 3x3 and 3x4 matrices, nested or flat. Zeros stand for a missing P.
         binning : (int, int)
             Binning in x and y; 0 means 1.
         roi : (int, int, int, int)
             x offset, y offset, width, height in full-resolution pixels; width or height 0 means
             the full image.
+        distortion_model, d
+            The lens, for raw images.
+        raw : bool, optional
+            Whether the image is raw; when it is not known, it is where P is missing.
 
         Raises
         ------
         CameraError
-            As the constructor, and matrices of a wrong size.
+            As the constructor; matrices of a wrong size or form; a rectified image without P of
+            a lens that distorts.
         """
-        matrix = np.asarray(k, dtype=float).ravel()
-        if matrix.size != 9:
-            raise CameraError(f'camera matrix K must have 9 values, not {matrix.size}')
-        if p is not None:
-            projection = np.asarray(p, dtype=float).ravel()
-            if projection.size != 12:
-                raise CameraError(
-                    f'projection matrix P must have 12 values, not {projection.size}'
+        width, height = _whole('width', width), _whole('height', height)
+        matrix = _matrix('camera matrix K', k, 3)
+        projection = None if p is None or raw else _matrix('projection matrix P', p, 4)
+        if projection is not None and not projection.any():
+            projection = None
+        d = _numbers('lens distortion D', d).tolist()
+        if projection is not None:
+            matrix = projection[:, :3]
+            if any(d):
+                warnings.warn(
+                    'the image is taken as rectified: the lens distortion D beside P is left out',
+                    CameraWarning,
+                    stacklevel=2,
                 )
-            if projection[0] > 0:
-                matrix = projection.reshape(3, 4)[:, :3].ravel()
+        elif raw is False and any(d):
+            raise CameraError('the image is rectified by its name, but its calibration has no P')
+        lens = (distortion_model, d) if projection is None and raw is not False else ('', ())
         bin_x, bin_y = max(int(binning[0]), 1), max(int(binning[1]), 1)
         x0, y0, roi_width, roi_height = (int(v) for v in roi)
         if roi_width == 0 or roi_height == 0:
@@ -103,29 +160,46 @@ class Camera:
         return cls(
             roi_width // bin_x,
             roi_height // bin_y,
-            float(matrix[0]) / bin_x,
-            float(matrix[4]) / bin_y,
-            (float(matrix[2]) - x0 + 0.5) / bin_x - 0.5,
-            (float(matrix[5]) - y0 + 0.5) / bin_y - 0.5,
+            float(matrix[0, 0]) / bin_x,
+            float(matrix[1, 1]) / bin_y,
+            (float(matrix[0, 2]) - x0 + 0.5) / bin_x - 0.5,
+            (float(matrix[1, 2]) - y0 + 0.5) / bin_y - 0.5,
+            float(matrix[0, 1]) / bin_x,
+            distortion_model=lens[0],
+            d=tuple(lens[1]),
         )
 
     @classmethod
-    def from_calibration(cls, calibration: Mapping[str, Any]) -> Camera:
+    def from_calibration(cls, calibration: Mapping[str, Any], raw: bool | None = None) -> Camera:
         """Camera from the parsed content of a ROS camera-calibration YAML file.
+
+        Parameters
+        ----------
+        calibration : mapping
+        raw : bool, optional
+            As for `from_matrices`.
 
         Raises
         ------
         CameraError
             A missing or malformed key, named in the message.
         """
+        if not isinstance(calibration, Mapping):
+            raise CameraError('malformed camera calibration: no mapping')
+        width, height = _entry(calibration, 'image_width'), _entry(calibration, 'image_height')
+        k = _data(calibration, 'camera_matrix')
+        if k is None:
+            raise CameraError("camera calibration lacks 'camera_matrix'")
+        p = _data(calibration, 'projection_matrix')
+        d = _data(calibration, 'distortion_coefficients')
+        model = calibration.get('distortion_model') or ''
+        if not isinstance(model, str):
+            raise CameraError(f'malformed camera calibration: distortion_model {model!r}')
         try:
-            width, height = int(calibration['image_width']), int(calibration['image_height'])
-            k = calibration['camera_matrix']['data']
-            p = calibration.get('projection_matrix', {}).get('data')
-            return cls.from_matrices(width, height, k, p)
-        except KeyError as error:
-            raise CameraError(f'camera calibration lacks {error}') from None
-        except (TypeError, AttributeError) as error:
+            return cls.from_matrices(
+                width, height, k, p, distortion_model=model, d=() if d is None else d, raw=raw
+            )
+        except (TypeError, OverflowError) as error:
             raise CameraError(f'malformed camera calibration: {error}') from None
 
     def __reduce__(self) -> tuple[type[Camera], tuple[Any, ...]]:
@@ -138,11 +212,109 @@ class Camera:
         """Shape of an image of this camera: (height, width)."""
         return self.height, self.width
 
+    @property
+    def pinhole(self) -> bool:
+        """Whether rays are evenly spaced: neither skew nor a lens that distorts."""
+        return not self.distortion_model and self.skew == 0
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """The 3x3 camera matrix K."""
+        return np.array([[self.fx, self.skew, self.cx], [0, self.fy, self.cy], [0, 0, 1]])
+
     @cached_property
     def rays(self) -> NDArray[np.float32]:
-        """Directions of the pixels scaled to z = 1, (H, W, 3), so that point = depth * ray."""
-        rays = np.ones((self.height, self.width, 3), np.float32)
-        rays[..., 0] = (np.arange(self.width) - self.cx) / self.fx
-        rays[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, None]
+        """Directions of the pixels scaled to z = 1, (H, W, 3), so that point = depth * ray.
+
+        Zeros where a lens shows no ray.
+        """
+        v, u = np.indices(self.shape, float)
+        rays = np.nan_to_num(self.rays_at(u, v), nan=0.0).astype(np.float32)
         rays.setflags(write=False)
         return rays
+
+    def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
+        """Directions scaled to z = 1, (..., 3), of places in the image.
+
+        Parameters
+        ----------
+        u, v : (...) float
+            Columns and rows, pixels.
+
+        Returns
+        -------
+        (..., 3) float64
+            NaN where a lens shows no ray.
+        """
+        x, y = self._distorted(np.asarray(u, float), np.asarray(v, float))
+        if self.distortion_model:
+            x, y = undistorted(x, y, self.distortion_model, self.d)
+            shown = (np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST)
+            x, y, z = (np.where(shown, value, np.nan) for value in (x, y, np.ones_like(x)))
+        else:
+            z = np.ones_like(x)
+        return np.stack([x, y, z], axis=-1)
+
+    def _distorted(
+        self, u: NDArray[np.floating], v: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places in the plane z = 1 behind the lens."""
+        y = (v.astype(np.float64) - self.cy) / self.fy
+        return (u - self.cx - self.skew * y) / self.fx, y
+
+
+def _whole(name: str, value: Any) -> int:
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = -1
+    # CameraInfo has 32 bits for it.
+    if isinstance(value, bool) or not 0 < number < 2**32:
+        raise CameraError(f'image size: {name} must be a positive whole number, not {value!r}')
+    return number
+
+
+def _finite(name: str, value: Any) -> float:
+    try:
+        if isinstance(value, bool | str):
+            raise TypeError
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise CameraError(f'{name} must be finite, not {value!r}')
+    return number
+
+
+def _matrix(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
+    """Matrix (3, columns) of a calibration, which has zeros below its diagonal."""
+    matrix = _numbers(name, values)
+    if matrix.size != 3 * columns:
+        raise CameraError(f'{name} must have {3 * columns} values, not {matrix.size}')
+    matrix = matrix.reshape(3, columns)
+    if matrix[1, 0] or matrix[2, 0] or matrix[2, 1]:
+        raise CameraError(f'{name} must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], row by row')
+    return matrix
+
+
+def _numbers(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    try:
+        return np.asarray(values, dtype=float).ravel()
+    except (TypeError, ValueError, OverflowError):
+        raise CameraError(f'{name} must be numbers') from None
+
+
+def _entry(calibration: Mapping[str, Any], key: str) -> Any:
+    if key not in calibration:
+        raise CameraError(f'camera calibration lacks {key!r}')
+    return calibration[key]
+
+
+def _data(calibration: Mapping[str, Any], key: str) -> Any:
+    """Values of a matrix of a calibration; None when it is not there."""
+    entry = calibration.get(key)
+    if entry is None:
+        return None
+    if not isinstance(entry, Mapping):
+        raise CameraError(f'malformed camera calibration: {key} has no data')
+    return _entry(entry, 'data')

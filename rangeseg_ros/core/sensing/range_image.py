@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -13,6 +14,16 @@ from rangeseg_ros.core.sensing.camera import Camera
 
 class RangeImageError(ValueError):
     """An array that is no depth image or organised cloud, or does not fit its camera."""
+
+
+class UnitWarning(UserWarning):
+    """Ranges that look as if they were in another unit."""
+
+
+# The farthest that 16 bits of millimetres tell, metres.
+_FAR = 65.0
+NOT_MEASURED = 65535
+"""What drivers and data sets write for it beside 0: the largest value of 16 bits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +56,9 @@ class RangeImage:
 
         Parameters
         ----------
-        depth : (H, W) uint16 or float32
-            Depth along the optical axis; 0 (integers), non-finite or <= 0 (floats) is invalid.
+        depth : (H, W) uint16 or float, of either byte order
+            Depth along the optical axis; 0 and 65535 (integers), non-finite or <= 0 (floats) and
+            what the mask of a masked array hides are invalid.
         camera : Camera
             Intrinsics; its size must be the image's.
         scale : float, optional
@@ -58,10 +70,11 @@ class RangeImage:
             Not a 2-D uint16 or float image, a size other than the camera's, a scale that is
             not positive.
         """
-        array = np.asarray(depth)
+        array, hidden = _unmasked(depth)
         if array.ndim != 2:
             raise RangeImageError(f'depth image must have one channel, not shape {array.shape}')
-        if array.dtype != np.uint16 and array.dtype.kind != 'f':
+        integers = array.dtype.kind == 'u' and array.itemsize == 2
+        if not integers and array.dtype.kind != 'f':
             raise RangeImageError(f'depth image must be uint16 or float, not {array.dtype}')
         if array.shape != camera.shape:
             raise RangeImageError(
@@ -69,10 +82,15 @@ class RangeImage:
                 f'its camera {camera.width}x{camera.height}'
             )
         if scale is None:
-            scale = 0.001 if array.dtype == np.uint16 else 1.0
+            scale = 0.001 if integers else 1.0
         if not (np.isfinite(scale) and scale > 0):
             raise RangeImageError(f'depth scale must be positive, not {scale}')
-        return cls(camera.rays, _reciprocal(array, scale), camera)
+        inverse = _reciprocal(array.astype(np.uint16, copy=False) if integers else array, scale)
+        if hidden is not None:
+            inverse[hidden] = 0
+        if camera.distortion_model:
+            inverse[camera.rays[..., 2] == 0] = 0
+        return cls(camera.rays, inverse, camera)
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> RangeImage:
@@ -81,24 +99,39 @@ class RangeImage:
         Parameters
         ----------
         points : (H, W, 3) float
-            Points in metres, the sensor at the origin; any non-finite coordinate, or a point at
-            the origin, is invalid.
+            Points in metres, the sensor at the origin; any coordinate that is not finite or
+            hidden by the mask of a masked array, or a point at the origin, is invalid.
 
         Raises
         ------
         RangeImageError
-            An array of another shape or type.
+            An array of another shape or type, or an empty one.
+
+        Warns
+        -----
+        UnitWarning
+            More than half of the points are farther than depth images in millimetres reach.
         """
-        array = np.asarray(points)
-        if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != 'f':
+        array, hidden = _unmasked(points)
+        if array.ndim != 3 or array.shape[2] != 3 or array.dtype.kind != 'f' or not array.size:
             raise RangeImageError(
                 f'organised cloud must be (H, W, 3) float, not {array.shape} {array.dtype}'
             )
         finite = np.isfinite(array).all(axis=2)
+        if hidden is not None:
+            finite &= ~hidden.any(axis=2)
         cloud = np.where(finite[..., None], array, 0).astype(np.float64)
-        distance = np.linalg.norm(cloud, axis=2)
+        with np.errstate(over='ignore'):
+            distance = np.linalg.norm(cloud, axis=2)
         inverse = _reciprocal(distance, 1.0)
         rays = (cloud * inverse[..., None]).astype(np.float32)
+        far = (inverse > 0) & (inverse < 1 / _FAR)
+        if 2 * np.count_nonzero(far) > np.count_nonzero(inverse):
+            warnings.warn(
+                f'more than half of the points are beyond {_FAR:.0f} m: are they in metres?',
+                UnitWarning,
+                stacklevel=2,
+            )
         return cls(rays, inverse)
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
@@ -152,5 +185,14 @@ def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
 
 @lru_cache(maxsize=4)
 def _reciprocals(scale: float) -> NDArray[np.float32]:
-    """Of the 65536 depths there can be."""
-    return _reciprocal(np.arange(65536, dtype=np.float64), scale)
+    """Of the 65536 values there can be."""
+    inverse = _reciprocal(np.arange(65536, dtype=np.float64), scale)
+    inverse[NOT_MEASURED] = 0
+    return inverse
+
+
+def _unmasked(values: ArrayLike) -> tuple[NDArray, NDArray[np.bool_] | None]:
+    """Values as a plain array, and where a mask hides them."""
+    if not isinstance(values, np.ma.MaskedArray):
+        return np.asarray(values), None
+    return values.data, np.ma.getmaskarray(values)
