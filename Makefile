@@ -5,7 +5,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
 
-.PHONY: test quick demo demo-ros lint release-check clean
+.PHONY: test quick demo demo-ros lint docs release-check clean
 
 test: $(VENV)/installed
 	$(BIN)/python -m pytest
@@ -37,6 +37,12 @@ lint: $(VENV)/linters
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# The site, to open in a browser: site/index.html.
+docs: $(VENV)/writers
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	! grep -rE 'src="https?:' site --include='*.html'  # nothing that is loaded from the network
+	@echo 'The site is in $(CURDIR)/site'
+
 release-check: $(VENV)/installed
 	.ci/release-check $(BIN)/python
 
@@ -57,5 +63,9 @@ $(VENV)/linters: $(VENV)/installed
 	$(BIN)/pip install --quiet --editable '.[lint]'
 	touch $@
 
+$(VENV)/writers: $(VENV)/installed
+	$(BIN)/pip install --quiet --editable '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo build install log dist *.egg-info
+	rm -rf $(VENV) demo site build install log dist *.egg-info

@@ -1,0 +1,41 @@
+"""Pages of the site that are not in docs/: README.md, CONTRIBUTING.md, and the parameters."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+from rangeseg_ros import Config
+
+ROOT = Path(__file__).parents[1]
+PAGES = {'README.md': 'index.md', 'CONTRIBUTING.md': 'contributing.md'}
+
+
+def on_files(files, config):
+    """Add the pages, their links as seen from docs/."""
+    for source, page in PAGES.items():
+        text = (ROOT / source).read_text(encoding='utf-8')
+        text = re.sub(r'\]\((?:docs/)?', '](', text)
+        for other, name in PAGES.items():
+            text = text.replace(f']({other}', f']({name}')
+        files.append(File.generated(config, page, content=text))
+    files.append(File.generated(config, 'parameters.md', content=parameters()))
+    return files
+
+
+def parameters():
+    """Table of all parameters, as `Config` has them."""
+    rows = [
+        '# Parameters\n\nOf the segmenter: fields of `Config` in Python, names in the files of '
+        '`--params`, parameters of the node.\n\n| parameter | meaning |\n|---|---|'
+    ]
+    for option in fields(Config):
+        low, high, choices = (option.metadata[key] for key in ('low', 'high', 'choices'))
+        takes = ', '.join(f'`{choice}`' for choice in choices) or 'true or false'
+        if low is not None:
+            takes = f'{low:g} to {high:g}'
+        description = option.metadata['description'].replace('|', '\\|')
+        takes += f'; default `{option.default}`'
+        rows.append(f'| `{option.name}` | {description} ({takes}) |')
+    return '\n'.join(rows) + '\n'
