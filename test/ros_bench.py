@@ -64,7 +64,7 @@ class Bench:
         self.executor.add_node(self.node)
         self.name = f'{namespace}/segment_planes'.lstrip('/')
         self.node.create_subscription(
-            DiagnosticArray, '/diagnostics', self.received['diagnostics'].append, RELIABLE
+            DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE
         )
         self.clients = {
             kind: self.node.create_client(kind, f'/{self.name}/{service}')
@@ -229,6 +229,11 @@ class Bench:
         """What there is to know when the node does not do what it should."""
         report = self.received['diagnostics'][-1:]
         return f'exit code {self.process.poll()}, {report}\n{self.log()}'
+
+    def _on_diagnostics(self, report):
+        # Other nodes report there, too.
+        if report.status[0].name.startswith(f'{self.name}:'):
+            self.received['diagnostics'].append(report)
 
     def log(self):
         """What the node has written to stderr."""

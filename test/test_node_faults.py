@@ -1,5 +1,6 @@
 """Faults the node must survive, over real DDS: the next good frame is segmented."""
 
+import sys
 import time
 from array import array
 
@@ -16,6 +17,8 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 
+LOST = 'messages lost by the middleware'
+
 
 @pytest.fixture(scope='module')
 def node():
@@ -28,6 +31,11 @@ def bench(node):
     """The node with a listener for its labels and a reliable camera."""
     with node.listening('labels'), node.camera_on():
         yield node
+
+
+def values_of(status):
+    """Values of a diagnostic status by their keys."""
+    return {value.key: value.value for value in status.values}
 
 
 def assert_segments(bench):
@@ -201,6 +209,27 @@ def test_lost_images_are_noticed(node):
         assert 'fastdds_large_images.xml' in node.received['diagnostics'][-1].status[0].message
     with node.listening('labels'), node.camera_on():
         assert_segments(node)
+
+
+def test_losses_while_sizes_change_cost_no_memory():
+    """Large and small best-effort images in turn: Fast DDS then reports 2^31 - 1 lost ones."""
+    limited = 'ulimit -v 6000000; exec "$0" "$@"'
+    command = ['/bin/sh', '-c', limited, sys.executable, '-m', 'rangeseg_ros.ros.node']
+    cameras = [kinect_camera(640, 480), kinect_camera(160, 120)]
+    topics = f'/limited{DEPTH}', f'/limited{INFO}'
+    with Bench(command=command, namespace='limited') as bench:
+        images = [bench.image(corner_depth(camera)) for camera in cameras]
+        with bench.listening('labels'), bench.camera_on(*topics, qos=BEST_EFFORT):
+            for turn in range(8):
+                for _ in range(6):
+                    bench.camera_info.publish(bench.info(cameras[turn % 2]))
+                    bench.depth.publish(images[turn % 2])
+                    bench.spin(0.05)
+            values = values_of(bench.status(lambda status: status.level == DiagnosticStatus.WARN))
+            assert bench.stream().any()
+        assert int(values['loss reports of impossible size']) > 0
+        assert 0 < int(values[LOST]) < 48
+        assert bench.log().count('said once') == 1
 
 
 @pytest.mark.parametrize('presses', [1, 2])

@@ -60,8 +60,10 @@ def points_from_message(cloud: Any) -> NDArray[np.float32] | NDArray[np.float64]
     Raises
     ------
     CloudError
-        No fields x, y, z of one floating-point type, one row only, or damaged.
+        No points, no fields x, y, z of one floating-point type, one row only, or damaged.
     """
+    if not cloud.height * cloud.width:
+        raise CloudError(f'cloud is empty ({cloud.width}x{cloud.height})')
     records = _records(cloud)
     columns: Any = records.dtype.fields or {}
     kinds = {str(columns[name][0]) if name in columns else 'missing' for name in 'xyz'}

@@ -2,27 +2,48 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.node import Node
+from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
+from rangeseg_ros.ros.counting import Losses
+from rangeseg_ros.ros.pairing import StampPairing
 from rangeseg_ros.ros.qos import MatchedSubscription
 
 IMAGE_TOPIC = 'depth/image_rect'
 CAMERA_TOPIC = 'depth/camera_info'
 POINTS_TOPIC = 'depth/points'
 
+SEGMENT_SIZE = 512 * 1024
+"""Of the shared memory of Fast DDS by default, bytes; larger best-effort messages get lost."""
+PROFILE_VARIABLE = 'FASTRTPS_DEFAULT_PROFILES_FILE'
+PROFILE_HINT = (
+    'they do not fit the default shared-memory segment of Fast DDS; set '
+    f'{PROFILE_VARIABLE} to share/rangeseg_ros/params/fastdds_large_images.xml for publisher, '
+    'node and listeners of images'
+)
+
+
+class Intrinsics(NamedTuple):
+    """What a camera_info says, and the frame it is in."""
+
+    camera: Camera
+    frame: str
+
 
 class DepthInput:
     """Subscribes to depth messages and hands on those whose camera is known.
 
     An image that arrives before its camera_info waits for it; the next image takes its place.
+    Which camera_info is an image's own: `StampPairing`.
 
     Parameters
     ----------
@@ -33,11 +54,13 @@ class DepthInput:
         Whether the images are raw whatever the name of their topic says.
     accept : callable
         Gets every complete frame.
-    lost : callable
-        Gets the number of depth messages that the middleware lost.
+    losses : Losses
+        Is told of the depth messages that arrive and of those that do not.
 
     Attributes
     ----------
+    pairing : str
+        By what the last image got its camera_info; empty for clouds.
     problem : str
         What keeps the last message from being handed on; empty when nothing does.
     last_arrival : float
@@ -50,19 +73,20 @@ class DepthInput:
         source: str,
         raw: bool,
         accept: Callable[[DepthFrame], None],
-        lost: Callable[[int], None],
+        losses: Losses,
     ) -> None:
         self._node = node
         self._accept = accept
         self._waiting: tuple[Any, int] | None = None
-        self._camera: Camera | None = None
-        self._camera_frame = ''
+        self._cameras: StampPairing[Intrinsics | CameraError] = StampPairing()
+        self._largest = 0
+        self.pairing = ''
         self.problem = ''
         self.last_arrival = time.monotonic()
         self._info_subscription: MatchedSubscription | None = None
         if source == 'points':
             self._subscription = MatchedSubscription(
-                node, PointCloud2, POINTS_TOPIC, self._on_cloud, lost
+                node, PointCloud2, POINTS_TOPIC, self._on_cloud, losses
             )
             return
         image_topic = node.resolve_topic_name(IMAGE_TOPIC)
@@ -72,11 +96,11 @@ class DepthInput:
         )
         if source == 'compressed_depth':
             self._subscription = MatchedSubscription(
-                node, CompressedImage, f'{image_topic}/compressedDepth', self._on_image, lost
+                node, CompressedImage, f'{image_topic}/compressedDepth', self._on_image, losses
             )
         else:
             self._subscription = MatchedSubscription(
-                node, Image, image_topic, self._on_image, lost
+                node, Image, image_topic, self._on_image, losses
             )
 
     @property
@@ -88,6 +112,18 @@ class DepthInput:
     def publishers(self) -> int:
         """Number of publishers of depth messages."""
         return self._subscription.publishers
+
+    def loss_hint(self) -> str:
+        """What may help against lost depth messages; empty when nothing is known to."""
+        if not get_rmw_implementation_identifier().startswith('rmw_fastrtps'):
+            return ''
+        if 0 < self._largest <= SEGMENT_SIZE:
+            return ''
+        if PROFILE_VARIABLE in os.environ:
+            return f'{PROFILE_VARIABLE} is set for the node; the publisher needs it as well'
+        if not self._largest:
+            return f'if they are over 512 KiB: {PROFILE_HINT}'
+        return f'messages over 512 KiB: {PROFILE_HINT}'
 
     def follow_publishers(self) -> None:
         """Keep the quality of service at what the publishers offer."""
@@ -102,31 +138,45 @@ class DepthInput:
             self._info_subscription.destroy()
 
     def _on_cloud(self, message: PointCloud2) -> None:
-        self.last_arrival = time.monotonic()
+        self._arrived(message)
         self._accept(DepthFrame(message, None, self._now()))
 
     def _on_image(self, message: Image | CompressedImage) -> None:
-        self.last_arrival = time.monotonic()
+        self._arrived(message)
+        if self._waiting:
+            self._cameras.give_up()
+            self._hand_on()
         self._waiting = message, self._now()
-        if self._camera is None:
-            self._warn(self.problem or f'no camera_info on {self._info_topic()} yet')
         self._hand_on()
 
+    def _arrived(self, message: Any) -> None:
+        self.last_arrival = time.monotonic()
+        self._largest = max(self._largest, len(message.data))
+
     def _on_camera_info(self, info: CameraInfo) -> None:
+        camera: Intrinsics | CameraError
         try:
-            self._camera = camera_from_message(info, self._raw)
-            self._camera_frame = info.header.frame_id
+            camera = Intrinsics(camera_from_message(info, self._raw), info.header.frame_id)
         except CameraError as error:
-            self._camera = None
+            camera = error
             self._warn(f'unusable camera_info on {self._info_topic()}: {error}')
+        self._cameras.add(_nanoseconds(info.header.stamp), camera)
         self._hand_on()
 
     def _hand_on(self) -> None:
-        """Pass the waiting image on when the camera fits it."""
-        if self._camera is None or self._waiting is None:
+        """Pass the waiting image on when its camera is there and fits it."""
+        if self._waiting is None:
             return
         message, arrival = self._waiting
-        camera = self._camera
+        found = self._cameras.find(_nanoseconds(message.header.stamp))
+        if found is None:
+            if not self._cameras.by_stamp:
+                self._warn(f'no camera_info on {self._info_topic()} yet')
+            return
+        if isinstance(found.item, CameraError):
+            self._warn(f'unusable camera_info on {self._info_topic()}: {found.item}')
+            return
+        camera, frame = found.item
         # The size of a compressed image is known once it is decoded; the core checks it then.
         if hasattr(message, 'height') and (message.height, message.width) != camera.shape:
             self._warn(
@@ -135,10 +185,10 @@ class DepthInput:
             )
             return
         self.problem = ''
-        if message.header.frame_id != self._camera_frame:
+        self.pairing = 'of the stamp of the image' if found.exact else 'the last one received'
+        if message.header.frame_id != frame:
             self._node.get_logger().warning(
-                f'image is in frame {message.header.frame_id!r}, '
-                f'its camera_info in {self._camera_frame!r}',
+                f'image is in frame {message.header.frame_id!r}, its camera_info in {frame!r}',
                 throttle_duration_sec=5.0,
             )
         self._waiting = None
@@ -154,6 +204,12 @@ class DepthInput:
     def _now(self) -> int:
         nanoseconds: int = self._node.get_clock().now().nanoseconds
         return nanoseconds
+
+
+def _nanoseconds(stamp: Any) -> int:
+    # rclpy's Time refuses negative ones, which are no reason to stop.
+    nanoseconds: int = stamp.sec * 10**9 + stamp.nanosec
+    return nanoseconds
 
 
 def _camera_topic(node: Node, image_topic: str) -> str:

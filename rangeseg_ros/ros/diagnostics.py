@@ -3,50 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from dataclasses import dataclass, field
-from threading import Lock
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.depth_input import DepthInput
-
-WINDOW = 5.0
-"""Seconds over which rates and losses are counted."""
-
-LOSS_HINT = (
-    'the middleware loses depth messages: images over 512 KiB do not fit the default '
-    'shared-memory segment of Fast DDS; set FASTRTPS_DEFAULT_PROFILES_FILE to '
-    'params/fastdds_large_images.xml of this package for publisher and node'
-)
-
-
-class Window:
-    """Events of the last seconds; used by two threads."""
-
-    def __init__(self) -> None:
-        self.total = 0
-        self._times: deque[float] = deque()
-        self._lock = Lock()
-
-    def add(self, count: int = 1) -> None:
-        """Count events of now."""
-        with self._lock:
-            self.total += count
-            self._times.extend([time.monotonic()] * count)
-
-    def recent(self) -> int:
-        """Number of events in the last `WINDOW` seconds."""
-        with self._lock:
-            while self._times and self._times[0] < time.monotonic() - WINDOW:
-                self._times.popleft()
-            return len(self._times)
-
-    def rate(self) -> float:
-        """Frequency of the events of the last `WINDOW` seconds, Hz."""
-        count = self.recent()
-        with self._lock:
-            return (count - 1) / (self._times[-1] - self._times[0]) if count > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -73,9 +35,49 @@ class FrameTimes:
     stages: dict[str, float] = field(default_factory=dict)
 
     @property
-    def latency(self) -> float:
-        """Stamp to the end of the publication."""
-        return self.transport + self.waiting + self.conversion + self.compute + self.publication
+    def work(self) -> float:
+        """Arrival to the end of the publication."""
+        return self.waiting + self.conversion + self.compute + self.publication
+
+    def values(self, longest_transport: float) -> dict[str, str]:
+        """By name as diagnostics show them; without what other clocks would make of them.
+
+        Stamps of recordings, or of clocks that differ, say nothing of the transport: messages do
+        not queue up, so that one which took longer than `longest_transport` ms did not come late.
+        """
+        shown = {'latency since arrival (ms)': f'{self.work:.2f}'}
+        if abs(self.transport) <= longest_transport:
+            shown['latency (ms)'] = f'{self.transport + self.work:.2f}'
+            shown['transport (ms)'] = f'{self.transport:.2f}'
+        else:
+            shown['latency (ms)'] = 'unknown: the stamps are not of the clock of the node'
+        for part in ('waiting', 'conversion', 'compute'):
+            shown[f'{part} (ms)'] = f'{getattr(self, part):.2f}'
+        for stage, milliseconds in self.stages.items():
+            shown[f'compute: {stage} (ms)'] = f'{milliseconds:.2f}'
+        shown['publication (ms)'] = f'{self.publication:.2f}'
+        return shown
+
+
+class Activity:
+    """What the worker is doing, and since when.
+
+    Attributes
+    ----------
+    what : str
+        Empty while it waits for a frame.
+    """
+
+    def __init__(self) -> None:
+        self.what = ''
+        self._since = time.monotonic()
+
+    def now(self, what: str = '') -> None:
+        """Begin something else."""
+        self.what, self._since = what, time.monotonic()
+
+    def __str__(self) -> str:
+        return f'{self.what} for {time.monotonic() - self._since:.1f} s' if self.what else ''
 
 
 class FrameStatistics:
@@ -83,9 +85,15 @@ class FrameStatistics:
 
     Attributes
     ----------
-    received, published, dropped, refused, lost : Window
+    received, published, dropped, refused : Window
         Frames that arrived complete; were segmented and published; were replaced by a newer
-        one; could not be segmented; never arrived.
+        one; could not be segmented.
+    losses : Losses
+        Depth messages that never arrived.
+    compiling : str
+        How far the compilation of kernels is that frames wait for; empty when none do.
+    activity : Activity
+        Of the worker.
     problem : str
         Why the last frame could not be segmented; empty when it could.
     planes : int
@@ -97,18 +105,41 @@ class FrameStatistics:
     """
 
     def __init__(self) -> None:
-        self.received, self.published, self.dropped = Window(), Window(), Window()
-        self.refused, self.lost = Window(), Window()
+        self.received, self.published = Window(), Window()
+        self.dropped, self.refused = Window(), Window()
+        self.losses = Losses()
+        self.compiling = ''
+        self.activity = Activity()
         self.problem = ''
         self.planes = 0
         self.reason = ''
         self.times: FrameTimes | None = None
+        self._unanswered: float | None = None
+
+    def accepted(self, replaced: bool) -> None:
+        """Count a frame that arrived, and the one that it replaced."""
+        self.received.add()
+        if replaced:
+            self.dropped.add()
+        if self._unanswered is None:
+            self._unanswered = time.monotonic()
+
+    def answered(self, counter: Window) -> None:
+        """Count a frame that the worker is done with: published or refused."""
+        counter.add()
+        self._unanswered = None
+
+    def stalled(self) -> float:
+        """Seconds since the first frame to which there was no answer yet; 0 when there is none."""
+        since = self._unanswered
+        return 0.0 if since is None else time.monotonic() - since
 
     def status(
         self, name: str, source: DepthInput | None, stall_timeout: float
     ) -> DiagnosticStatus:
         """Summary of now; `source` is None while nobody listens."""
         level, message = self._judge(source, stall_timeout)
+        unseen = self.losses.unseen
         values = {
             'input rate (Hz)': f'{self.received.rate():.2f}',
             'output rate (Hz)': f'{self.published.rate():.2f}',
@@ -116,16 +147,18 @@ class FrameStatistics:
             'frames published': str(self.published.total),
             'frames dropped for newer ones': str(self.dropped.total),
             'frames refused': str(self.refused.total),
-            'messages lost by the middleware': str(self.lost.total),
+            'messages lost by the middleware': str(self.losses.lost.total),
+            'loss reports of impossible size': str(self.losses.nonsense),
+            'messages lost or overwritten, by their numbers': (
+                'unknown' if unseen is None else str(unseen)
+            ),
+            'camera_info': source.pairing if source else '',
+            'doing': self.compiling or str(self.activity) or 'waiting for a frame',
             'planes': str(self.planes),
             'reason for no planes': self.reason,
         }
         if self.times:
-            for part in ('latency', 'transport', 'waiting', 'conversion', 'compute'):
-                values[f'{part} (ms)'] = f'{getattr(self.times, part):.2f}'
-            for stage, milliseconds in self.times.stages.items():
-                values[f'compute: {stage} (ms)'] = f'{milliseconds:.2f}'
-            values['publication (ms)'] = f'{self.times.publication:.2f}'
+            values.update(self.times.values(1000 * stall_timeout))
         return DiagnosticStatus(
             level=level,
             name=f'{name}: segmentation',
@@ -134,20 +167,36 @@ class FrameStatistics:
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
 
+    def lost(self, source: DepthInput) -> str:
+        """What share of the messages of `source` is lost, and what may help; empty when none."""
+        lost = self.losses.lost.recent()
+        if not lost:
+            return ''
+        share = lost / (lost + self.received.recent())
+        hint = source.loss_hint()
+        return f'{share:.0%} lost on {source.topic}' + (f': {hint}' if hint else '')
+
     def _judge(self, source: DepthInput | None, stall_timeout: float) -> tuple[bytes, str]:
         if source is None:
-            return DiagnosticStatus.OK, 'idle: nobody listens'
+            busy = f'; {self.compiling}' if self.compiling else ''
+            return DiagnosticStatus.OK, f'idle: nobody listens{busy}'
+        lost = self.lost(source)
         silence = time.monotonic() - source.last_arrival
         if silence > stall_timeout:
-            return DiagnosticStatus.ERROR, (
+            silent = (
                 f'no depth message on {source.topic} for {silence:.1f} s '
                 f'({source.publishers} publishers)'
             )
+            return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
         if problem := source.problem or self.problem:
             return DiagnosticStatus.ERROR, problem
-        if lost := self.lost.recent():
-            share = lost / (lost + self.received.recent())
-            return DiagnosticStatus.WARN, f'{share:.0%} lost on {source.topic}: {LOSS_HINT}'
+        doing = self.compiling or str(self.activity)
+        if (stalled := self.stalled()) > stall_timeout:
+            return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {doing}'
+        if self.compiling:
+            return DiagnosticStatus.WARN, self.compiling
+        if lost:
+            return DiagnosticStatus.WARN, lost
         if self.published.total and not self.planes:
             return DiagnosticStatus.WARN, f'no planes: {self.reason}'
         return DiagnosticStatus.OK, f'{self.planes} planes at {self.published.rate():.1f} Hz'

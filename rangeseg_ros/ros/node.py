@@ -14,6 +14,7 @@ from threading import Thread
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
@@ -61,7 +62,9 @@ class SegmentPlanes(Node):
             for name, output in OUTPUTS.items()
         }
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
-        self._timer = self.create_timer(1.0, self._look_around)
+        # A clock that stands still, of a simulation or a recording, must not silence the reports.
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._timer = self.create_timer(1.0, self._look_around, clock=steady)
         self._worker = Thread(target=self._work, name='segmentation', daemon=True)
         self._worker.start()
 
@@ -84,9 +87,8 @@ class SegmentPlanes(Node):
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
         listeners = sum(output.get_subscription_count() for output in self._outputs.values())
         if listeners and self._input is None:
-            lost = self._statistics.lost.add
-            config = self._config
-            self._input = DepthInput(self, config.input, config.raw, self._accept, lost)
+            config, losses = self._config, self._statistics.losses
+            self._input = DepthInput(self, config.input, config.raw, self._accept, losses)
             self._gravity = Gravity(self) if self._config.use_imu else None
             self._statistics.problem = ''
         elif not listeners and self._input:
@@ -99,9 +101,7 @@ class SegmentPlanes(Node):
         self._input = self._gravity = None
 
     def _accept(self, frame: DepthFrame) -> None:
-        self._statistics.received.add()
-        if self._frames.put(frame):
-            self._statistics.dropped.add()
+        self._statistics.accepted(replaced=self._frames.put(frame))
 
     def _work(self) -> None:
         # What goes wrong here will again on the first frame, which is where it is reported.
@@ -121,6 +121,8 @@ class SegmentPlanes(Node):
                 self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
 
     def _segment(self, frame: DepthFrame) -> None:
+        doing = self._statistics.activity.now
+        doing('converting the message')
         ticks = [time.perf_counter()]
         start = self.get_clock().now().nanoseconds
         header = frame.message.header
@@ -129,10 +131,12 @@ class SegmentPlanes(Node):
         # Here and not where parameters change, so that one frame is of one configuration.
         if (config := self._config) is not self._sequence.config:
             self._sequence.config = config
+        doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         gravity = self._gravity
         up = gravity.up(header.frame_id) if gravity else None
         result = self._sequence.segment(image, Time.from_msg(header.stamp).nanoseconds, up)
         ticks.append(time.perf_counter())
+        doing('publishing')
         for name, output in OUTPUTS.items():
             publisher = self._outputs[name]
             if publisher.get_subscription_count():
@@ -149,17 +153,21 @@ class SegmentPlanes(Node):
         )
         self._statistics.planes = len(result.planes)
         self._statistics.reason = result.reason
-        self._statistics.published.add()
+        self._statistics.answered(self._statistics.published)
+        doing()
 
     def _refuse(self, problem: str) -> None:
         self._statistics.problem = problem
-        self._statistics.refused.add()
+        self._statistics.answered(self._statistics.refused)
+        self._statistics.activity.now()
         self.get_logger().warning(f'frame refused: {problem}', throttle_duration_sec=5.0)
 
     def _look_around(self) -> None:
         """Once a second: follow the publishers, report."""
         if self._input:
             self._input.follow_publishers()
+            if lost := self._statistics.lost(self._input):
+                self.get_logger().warning(f'{lost} (said once; see /diagnostics)', once=True)
         if self._gravity:
             self._gravity.follow_publishers()
         name = self.get_fully_qualified_name().lstrip('/')

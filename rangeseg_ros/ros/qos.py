@@ -6,11 +6,13 @@ from collections.abc import Callable
 from typing import Any
 
 from rcl_interfaces.msg import SetParametersResult
-from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+
+from rangeseg_ros.ros.counting import Losses
 
 
 class MatchedSubscription:
@@ -28,8 +30,8 @@ class MatchedSubscription:
     topic : str
     callback : callable
         Gets every message.
-    lost : callable, optional
-        Gets the number of messages that the middleware lost, each time it notices a loss.
+    losses : Losses, optional
+        Is told of every message that arrives, and of those that do not.
     """
 
     def __init__(
@@ -38,14 +40,17 @@ class MatchedSubscription:
         kind: type,
         topic: str,
         callback: Callable[[Any], None],
-        lost: Callable[[int], None] = lambda count: None,
+        losses: Losses | None = None,
     ) -> None:
         self._node = node
-        self._arguments = kind, topic, callback
+        self._callback = callback
+        self._losses = losses or Losses()
+        # rclpy's annotation does not know of callbacks that get the message's info as well.
+        self._arguments: tuple[type, str, Any] = kind, topic, self._on_message
         self._events = SubscriptionEventCallbacks(
-            matched=lambda event: self.follow_publishers(),
+            matched=lambda event: self._on_matched(),
             incompatible_qos=lambda event: self.follow_publishers(),
-            message_lost=lambda event: lost(_newly_lost(event)),
+            message_lost=self._on_lost,
         )
         self._subscription = self._create()
 
@@ -67,6 +72,7 @@ class MatchedSubscription:
         Called by the middleware's events, and to be called now and then: the event of a
         publisher that leaves may come before the list of publishers is without it.
         """
+        self._single = self.publishers == 1
         # A topic that has lost its last publisher keeps its policies for when that comes back.
         best = self._best_offered(self.topic)
         if best and best != self._offered and not self._overridden:
@@ -77,8 +83,20 @@ class MatchedSubscription:
         """Unsubscribe."""
         self._node.destroy_subscription(self._subscription)
 
+    def _on_message(self, message: Any, info: dict[str, Any]) -> None:
+        self._losses.arrived(info.get('publication_sequence_number') if self._single else None)
+        self._callback(message)
+
+    def _on_matched(self) -> None:
+        self._losses.arrived(None)  # the numbers to come may be those of another publisher
+        self.follow_publishers()
+
+    def _on_lost(self, event: Any) -> None:
+        self._losses.report(event.total_count_change)
+
     def _create(self) -> Subscription:
         kind, topic, callback = self._arguments
+        self._single = True
         # While nobody publishes, what fits any publisher.
         self._offered = self._best_offered(self._node.resolve_topic_name(topic)) or (
             ReliabilityPolicy.BEST_EFFORT,
@@ -111,8 +129,3 @@ class MatchedSubscription:
             DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
         return best if offers else None
-
-
-def _newly_lost(event: QoSMessageLostInfo) -> int:
-    count: int = event.total_count_change
-    return count
