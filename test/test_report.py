@@ -12,7 +12,7 @@ import pytest
 from replays import record_walls, replay, walls
 
 from rangeseg_ros import Camera, Config, RangeImage
-from rangeseg_ros.batch.replay import write_pictures
+from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.report import charts
@@ -52,7 +52,8 @@ def report(tmp_path):
         image = RangeImage.from_depth(depth, CAMERA)
         stamp = 10**18 + index * 500_000_000
         result = sequence.segment(image, stamp)
-        page.add(stamp, result, write_pictures(tmp_path, f'{index}', image, result))
+        files = write_frame(tmp_path, f'{index}', image, result, ['overlay'])
+        page.add(stamp, result, files['overlay'])
     page.write(tmp_path / 'report.html', 'file ends within a record')
     return tmp_path / 'report.html'
 

@@ -10,22 +10,23 @@ from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
-from rangeseg_ros.drawing import overlay
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.planes import PlaneTable
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
 BAG = 'bag'
 """Name of the bag among the results."""
+PICTURES = ('labels', 'overlay')
+"""Which of `FRAME_FILES` every frame has."""
 
 Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
 
@@ -127,9 +128,9 @@ class Replay:
                     for index, (frame, image, result) in enumerate(segmented(frames, self.config)):
                         stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                         stem = f'{index:06d}_{stamp}'
-                        picture = write_pictures(self.folder, stem, image, result)
+                        files = write_frame(self.folder, stem, image, result, PICTURES)
                         table.write(result.planes, index, stamp)
-                        report.add(frame.stamp, result, picture)
+                        report.add(frame.stamp, result, files['overlay'])
                         yield from bag.messages(frame, image, result)
                 except DamagedBagError as error:
                     damage.append(str(error))
@@ -152,7 +153,8 @@ class Replay:
 
     def _clear(self) -> None:
         """Remove what other or interrupted runs have left."""
-        own = re.compile(r'\d{6,}_\d+\.\d{9}_(labels|overlay)\.png|planes\.csv|report\.html')
+        endings = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
+        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|planes\.csv|report\.html')
         partial = re.compile(rf'\.\d+\.({own.pattern}|{BAG})')
         shutil.rmtree(self.folder / BAG, ignore_errors=True)
         for path in self.folder.glob('*'):
@@ -182,11 +184,3 @@ def segmented(
     for frame in frames:
         image = frame.range_image()
         yield frame, image, sequence.segment(image, frame.stamp)
-
-
-def write_pictures(folder: Path, stem: str, image: RangeImage, result: Segmentation) -> Path:
-    """Write <stem>_labels.png and <stem>_overlay.png; the path of the latter."""
-    path = folder / f'{stem}_overlay.png'
-    write_image(folder / f'{stem}_labels.png', result.labels)
-    write_image(path, overlay(image.inverse, result.labels, result.planes))
-    return path

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import click
 
-from rangeseg_ros.batch.replay import write_pictures
+from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
-from rangeseg_ros.io.planes import PlaneTable
 
 
 @click.command()
@@ -50,17 +49,14 @@ def command(
         raise click.UsageError(f'{count} images named {name} would write the same results')
     camera = read_camera(camera_file, raw)
     segmenter = Segmenter(options.read_parameters(params_file, exact))
+    files = tuple(FRAME_FILES)
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path), camera, depth_scale)
         except RangeImageError as error:
             raise click.ClickException(f'{path}: {error}') from None
         result = segmenter.segment(image)
-        write_pictures(output, path.stem, image, result)
-        with (
-            replacing(output / f'{path.stem}_planes.csv') as partial,
-            PlaneTable(partial) as table,
-        ):
-            table.write(with_roles(result.planes, segmenter.config))
+        result = replace(result, planes=with_roles(result.planes, segmenter.config))
+        write_frame(output, path.stem, image, result, files)
         found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
         click.echo(f'{path}: {found}')

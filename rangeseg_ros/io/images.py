@@ -60,12 +60,19 @@ def read_labels(path: Path) -> NDArray[np.uint16]:
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Write a PNG: (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB."""
+    """Write a PNG or TIFF, by the suffix of `path`.
+
+    Parameters
+    ----------
+    path : Path
+    image : (H, W) uint8, uint16 or float32, or (H, W, 3) uint8 or float32
+        Three channels are R, G, B; floats are for TIFF.
+    """
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, png = cv2.imencode('.png', image)
+    _, data = cv2.imencode(path.suffix, image)
     with replacing(path) as partial:
-        partial.write_bytes(png.tobytes())
+        partial.write_bytes(data.tobytes())
 
 
 def _read(path: Path) -> NDArray:
