@@ -25,6 +25,8 @@ TYPES = {
     'planes': PointCloud2,
     'markers': MarkerArray,
     'overlay': Image,
+    'normals': Image,
+    'edges': Image,
     'ground': PointCloud2,
     'obstacles': PointCloud2,
 }

@@ -97,7 +97,7 @@ def test_node_and_replay_write_the_same_bytes(name, planes):
     for number in range(len(planes)):
         labels[:, 4 * number :] = number + 1
     image = RangeImage.from_depth(np.full(camera.shape, 2000, np.uint16), camera)
-    result = Segmentation(labels, planes, {}, '', lambda: 0.0)
+    result = Segmentation(labels, planes, {}, '')
     output = OUTPUTS[name]
     live = output.message(make, header(make), image, result)
     offline = output.message(make_rosbags, header(), image, result)

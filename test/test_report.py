@@ -60,7 +60,7 @@ def report(tmp_path):
 
 def test_a_page_is_self_contained(report):
     page = Page(report)
-    assert len(page.sources) == 4 + 3
+    assert len(page.sources) == 4 + 4 + 3  # overlays, normals, charts
     assert all(source.startswith('data:image/') for source in page.sources)
     assert not re.search(r'url\(|@import|<link', report.read_text())
 
@@ -217,4 +217,4 @@ def test_a_browser_shows_the_pictures_and_enlarges_them(report, tmp_path):
         text=True,
         timeout=120,
     )
-    assert '<title>seen true -1 0 true 3 0 -1 -1</title>' in shown.stdout, shown.stderr
+    assert '<title>seen true -1 0 true 7 0 -1 -1</title>' in shown.stdout, shown.stderr

@@ -38,6 +38,10 @@ def _overlay(path: Path, image: RangeImage, result: Segmentation) -> None:
     write_image(path, overlay(image.inverse, result.labels, result.planes))
 
 
+def _normals(path: Path, image: RangeImage, result: Segmentation) -> None:
+    write_image(path, result.normals)
+
+
 def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
     with replacing(path) as partial, PlaneTable(partial) as table:
         table.write(result.planes)
@@ -46,6 +50,7 @@ def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
 FRAME_FILES = {
     'labels': FrameFile('_labels.png', _labels),
     'overlay': FrameFile('_overlay.png', _overlay),
+    'normals': FrameFile('_normals.tiff', _normals),
     'planes': FrameFile('_planes.csv', _planes),
 }
 

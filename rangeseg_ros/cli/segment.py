@@ -30,6 +30,12 @@ from rangeseg_ros.io.images import read_depth
 @options.depth_scale
 @options.params
 @options.exact
+@click.option(
+    '--normals',
+    is_flag=True,
+    help='Also write <stem>_normals.tiff: the reconstructed normals, float32, red, green and blue '
+    'are x, y and z towards the sensor, NaN where there is no plane.',
+)
 def command(
     depth: tuple[Path, ...],
     camera_file: Path,
@@ -38,6 +44,7 @@ def command(
     depth_scale: float | None,
     params_file: Path | None,
     exact: bool,
+    normals: bool,
 ) -> None:
     """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
 
@@ -49,7 +56,7 @@ def command(
         raise click.UsageError(f'{count} images named {name} would write the same results')
     camera = read_camera(camera_file, raw)
     segmenter = Segmenter(options.read_parameters(params_file, exact))
-    files = tuple(FRAME_FILES)
+    files = [name for name in FRAME_FILES if name != 'normals' or normals]
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path), camera, depth_scale)

@@ -3,30 +3,49 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from typing import Any
+from functools import cached_property
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals import coarse_to_fine
-from rangeseg_ros.core.by_normals.directions import directions
-from rangeseg_ros.core.by_normals.normals import observed_normals
+from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, described
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.graphcut import moves
-from rangeseg_ros.core.graphcut.energy import angle, energy
 from rangeseg_ros.core.regions import plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
-from rangeseg_ros.core.sensing.jump_edges import jump_edges
+from rangeseg_ros.core.sensing.jump_edges import GridEdges, jump_edges, pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+class Labelling(Protocol):
+    """What a method labels the pixels with, as far as results are made of it."""
+
+    def energy(self) -> float:
+        """Value of eq. 5.3."""
+
+    def normals(self) -> NDArray[np.float32] | None:
+        """Normals (H, W, 3) that the labels stand for; None where the planes have them."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorkedOut:
+    """A `Labelling` without the image it is of: what remains of it in a pickle."""
+
+    value: float
+    field: NDArray[np.float32] | None
+
+    def energy(self) -> float:
+        return self.value
+
+    def normals(self) -> NDArray[np.float32] | None:
+        return self.field
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,22 +62,50 @@ class Segmentation:
         Milliseconds per stage, in the order of the stages.
     reason : str
         Why there is no plane; empty when there is one.
+    labelling : Labelling
+        What the regions were made from.
+    jumps : (horizontal, vertical) of bool or None
+        Edges of the grid that cross a jump; None where none were looked for.
     """
 
     labels: NDArray[np.uint16]
     planes: list[Plane]
     timings: dict[str, float]
     reason: str
-    _energy: Callable[[], float] = field(repr=False)
+    labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
+    jumps: GridEdges | None = field(default=None, repr=False)
+
+    @cached_property
+    def normals(self) -> NDArray[np.float32]:
+        """Reconstructed surface normals (thesis 5.11), worked out when read.
+
+        (H, W, 3), unit vectors towards the sensor in the frame of the image: with method normals
+        the direction that the pixel was given, with method planes the normal of its plane. NaN
+        where there is no label.
+        """
+        normals = self.labelling.normals()
+        if normals is not None:
+            return np.where((self.labels > 0)[..., None], normals, np.float32(np.nan))
+        table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
+        for plane in self.planes:
+            table[plane.label] = plane.normal
+        return table[self.labels]
+
+    @cached_property
+    def edges(self) -> NDArray[np.bool_]:
+        """(H, W) True on either side of a jump edge, worked out when read."""
+        if self.jumps is None:
+            return np.zeros(self.labels.shape, np.bool_)
+        return pixels_beside(self.jumps)
 
     @cached_property
     def energy(self) -> float:
         """Value of eq. 5.3 for the labelling the regions were made from, worked out when read."""
-        return self._energy()
+        return self.labelling.energy()
 
     def __getstate__(self) -> dict[str, Any]:
-        # With the value of the energy in place of all that it is worked out from.
-        return {**self.__dict__, 'energy': self.energy, '_energy': partial(float, self.energy)}
+        kept = WorkedOut(self.energy, self.labelling.normals())
+        return {**self.__dict__, 'labelling': kept}
 
 
 class Segmenter:
@@ -71,66 +118,52 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self._directions = directions(
-            self.config.directions, self.config.direction_count, self.config.seed
-        )
         self.reset()
         keep_freed_memory()
 
     def reset(self) -> None:
         """Forget the frame before, from which `warm_start` begins."""
-        self._before: tuple[Camera | None, NDArray[np.intp]] | None = None
+        self._before: tuple[Camera | None, NDArray[np.integer]] | None = None
 
     def segment(self, image: RangeImage) -> Segmentation:
         """Label every pixel of `image` with the plane it belongs to."""
         config, watch = self.config, Stopwatch()
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        grid = weights(image, jump_edges(image, config), config.weighting)
+        jumps = jump_edges(image, config)
+        grid = weights(image, jumps, config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, fits, value = method(image, grid, watch)
+        regions, fits, labelling = method(image, grid, watch)
         planes = described(regions, image, fits)
         watch.lap('planes')
-        return Segmentation(regions, planes, watch.laps, _reason(image, planes), value)
+        reason = _reason(image, planes)
+        return Segmentation(regions, planes, watch.laps, reason, labelling, jumps)
 
     def _by_planes(
         self, image: RangeImage, grid: Grid, watch: Stopwatch
-    ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
-        """Regions, their planes and the energy, by planes as labels."""
+    ) -> tuple[NDArray[np.uint16], Fits, by_planes.Labelling]:
+        """Regions, their planes and the labelling they are made from, by planes as labels."""
         labelling = by_planes.segment(image, grid, self.config, watch.lap)
         labels = labelling.labels
         regions = labelling.flat(plane_regions(labels, labels > 0, grid, self.config))
         watch.lap('regions')
-        regions, fits = by_planes.united(regions, image, labelling.sensor, grid)
-        return regions, fits, labelling.energy
+        return *by_planes.united(regions, image, labelling.sensor, grid), labelling
 
     def _by_normals(
         self, image: RangeImage, grid: Grid, watch: Stopwatch
-    ) -> tuple[NDArray[np.uint16], Fits, Callable[[], float]]:
-        """The same by discretised normals as labels (thesis 5.11)."""
-        config = self.config
-        normals = observed_normals(image, *grid, config)
-        watch.lap('normals')
-        problem = normals, self._directions, *grid, config.smoothness
-        if config.exact:
-            labels = moves.minimise(*problem, config.cycles, config.moves)
-        else:
-            labels = coarse_to_fine.minimise(*problem, self._labels_before(image))
-            if config.warm_start:
-                self._before = image.camera, labels
-        watch.lap('labels')
-        regions = plane_regions(labels, image.valid, grid, config)
+    ) -> tuple[NDArray[np.uint16], Fits, by_normals.Labelling]:
+        """The same by discretised normals as labels."""
+        before = self._labels_before(image)
+        labelling = by_normals.segment(image, grid, self.config, before, watch.lap)
+        if self.config.warm_start:
+            self._before = image.camera, labelling.labels
+        regions = plane_regions(labelling.labels, image.valid, grid, self.config)
         watch.lap('regions')
+        fits = Fits.of(regions, image, SensorModel.from_config(self.config))
+        return regions, fits, labelling
 
-        def value() -> float:
-            chosen = self._directions.T.astype(np.float32)[:, labels]
-            data = angle(np.moveaxis(normals, 2, 0), chosen)
-            return energy(data, labels, *grid, config.smoothness)
-
-        return regions, Fits.of(regions, image, SensorModel.from_config(config)), value
-
-    def _labels_before(self, image: RangeImage) -> NDArray[np.intp] | None:
+    def _labels_before(self, image: RangeImage) -> NDArray[np.integer] | None:
         """Directions of the frame before, if it was taken like this one."""
         if self._before is None:
             return None

@@ -51,6 +51,14 @@ def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -
     return image_message(make, header, picture, 'rgb8')
 
 
+def _normals(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return image_message(make, header, result.normals, '32FC3')
+
+
+def _edges(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return image_message(make, header, 255 * result.edges.astype(np.uint8), 'mono8')
+
+
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
     return _points(make, header, image, _on_floor(result))
 
@@ -76,6 +84,8 @@ OUTPUTS = {
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
     'markers': Output('visualization_msgs/msg/MarkerArray', _markers),
     'overlay': Output('sensor_msgs/msg/Image', _overlay),
+    'normals': Output('sensor_msgs/msg/Image', _normals),
+    'edges': Output('sensor_msgs/msg/Image', _edges),
     'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
     'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
 }

@@ -86,8 +86,14 @@ def _svg(text: str) -> str:
 
 
 def _jpeg(path: Path) -> str:
-    picture = np.asarray(cv2.imread(str(path)))
-    _, jpeg = cv2.imencode('.jpg', picture, [cv2.IMWRITE_JPEG_QUALITY, 85])
+    bgr = np.asarray(cv2.imread(str(path)), np.uint8)
+    return as_jpeg(bgr[..., ::-1])
+
+
+def as_jpeg(picture: NDArray[np.uint8]) -> str:
+    """An RGB picture (H, W, 3) as the address of an image in a page."""
+    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+    _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])
     return _data('image/jpeg', jpeg.tobytes())
 
 

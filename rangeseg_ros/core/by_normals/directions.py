@@ -7,6 +7,7 @@ z forward). The equator is left out, as a surface seen edge-on does not appear i
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -17,6 +18,7 @@ from rangeseg_ros.core.config import PLATONIC_COUNTS, check_directions
 _EQUATOR = 1e-9
 
 
+@lru_cache(maxsize=8)
 def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float64]:
     """Discretise the hemisphere of normals that face the sensor.
 
@@ -34,7 +36,7 @@ def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float
     Returns
     -------
     (count, 3) float64
-        Unit vectors with z < 0.
+        Unit vectors with z < 0; the same array for the same arguments, not to be written to.
 
     Raises
     ------
@@ -43,12 +45,15 @@ def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float
     """
     check_directions(distribution, count)
     if distribution == 'platonic':
-        return platonic(PLATONIC_COUNTS.index(count))
-    if distribution == 'regular':
-        return regular((math.isqrt(count) + 1) // 2)
-    if distribution == 'spiral':
-        return spiral(count)
-    return hypercube_rejection(count, seed)
+        found = platonic(PLATONIC_COUNTS.index(count))
+    elif distribution == 'regular':
+        found = regular((math.isqrt(count) + 1) // 2)
+    elif distribution == 'spiral':
+        found = spiral(count)
+    else:
+        found = hypercube_rejection(count, seed)
+    found.setflags(write=False)
+    return found
 
 
 def platonic(subdivisions: int) -> NDArray[np.float64]:

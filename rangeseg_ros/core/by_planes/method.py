@@ -56,6 +56,9 @@ class Labelling:
         """Value of eq. 5.3."""
         return energy(self.labels.ravel(), self._problem, self._models)
 
+    def normals(self) -> None:
+        """None: regions have planes, and these their normals."""
+
     def flat(self, regions: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Regions (H, W) of the labelling without those that bend, numbered anew."""
         return without(regions, curved(self._problem, regions, self.sensor))

@@ -92,6 +92,15 @@ def beside(pixels: NDArray[np.bool_]) -> GridEdges:
     return pixels[:, 1:] | pixels[:, :-1], pixels[1:] | pixels[:-1]
 
 
+def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
+    """Pixels (H, W) that a jump separates from one of their four neighbours or more."""
+    right, below = (np.pad(edges[0], ((0, 0), (0, 1))), np.pad(edges[1], ((0, 1), (0, 0))))
+    pixels: NDArray[np.bool_] = right | below
+    pixels[:, 1:] |= edges[0]
+    pixels[1:] |= edges[1]
+    return pixels
+
+
 def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels whose 3 x 3 window, as far as it lies in the image, was measured throughout."""
     return cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0

@@ -1,0 +1,86 @@
+"""Method normals from a range image to a labelling (thesis 5.11): labels are directions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.normals import observed_normals
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.graphcut import moves
+from rangeseg_ros.core.graphcut.energy import angle, energy
+from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+
+class Labelling:
+    """Discretised normals as labels of the pixels of an image.
+
+    Attributes
+    ----------
+    labels : (H, W) integer
+        Numbers of directions.
+    directions : (K, 3) float64
+        Unit vectors towards the sensor.
+    """
+
+    def __init__(
+        self,
+        labels: NDArray[np.integer],
+        directions: NDArray[np.float64],
+        normals: NDArray[np.float32],
+        grid: Grid,
+        smoothness: float,
+    ) -> None:
+        self.labels = labels
+        self.directions = directions
+        self._normals = normals
+        self._grid = grid
+        self._smoothness = smoothness
+
+    def normals(self) -> NDArray[np.float32]:
+        """The reconstructed normals (H, W, 3)."""
+        return self.directions.astype(np.float32)[self.labels]
+
+    def energy(self) -> float:
+        """Value of eq. 5.3."""
+        data = angle(np.moveaxis(self._normals, 2, 0), np.moveaxis(self.normals(), 2, 0))
+        return energy(data, self.labels, *self._grid, self._smoothness)
+
+
+def segment(
+    image: RangeImage,
+    grid: Grid,
+    config: Config,
+    before: NDArray[np.integer] | None,
+    lap: Callable[[str], None],
+) -> Labelling:
+    """Give every pixel a direction.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    grid : Grid
+        Of the image.
+    config : Config
+        All that is said to be of method normals is read.
+    before : (H, W) integer or None
+        Labels to begin from, those of the frame before; not with `exact`.
+    lap : callable
+        Told the name of every stage that ends.
+    """
+    normals = observed_normals(image, *grid, config)
+    lap('normals')
+    labels_of = directions(config.directions, config.direction_count, config.seed)
+    problem = normals, labels_of, *grid, config.smoothness
+    if config.exact:
+        labels = moves.minimise(*problem, config.cycles, config.moves)
+    else:
+        labels = coarse_to_fine.minimise(*problem, before)
+    lap('labels')
+    return Labelling(labels, labels_of, normals, grid, config.smoothness)
