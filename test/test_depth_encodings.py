@@ -1,6 +1,7 @@
 """Bytes of messages to depth images: exact small cases, and malformed input of any kind."""
 
 import struct
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -112,6 +113,24 @@ def test_a_truncated_png_is_no_image():
     for length in (100, len(data) // 2, len(data) - 20):
         with pytest.raises(EncodingError, match='no readable PNG'):
             decode_compressed('16UC1; compressedDepth png', data[:length])
+
+
+def test_lengths_that_promise_more_than_can_follow_are_refused_before_memory_is_taken():
+    good = _compressed(np.zeros((20, 20), np.uint16))
+    image, data = good.index(b'IHDR'), good.index(b'IDAT')
+    lie = struct.pack('>I', 2**30)
+    for damaged in (
+        good[: image + 4] + lie + good[image + 8 :],
+        good[: data - 4] + lie + good[data:],
+    ):
+        refused = pytest.raises(EncodingError, match='no readable PNG')
+        with mock.patch.object(cv2, 'imdecode') as decode, refused:
+            decode_compressed('16UC1; compressedDepth png', damaged)
+        assert not decode.called
+    # As dense as PNG gets: one value all over.
+    flat = np.full((2000, 2000), 1000, np.uint16)
+    decoded = decode_compressed('16UC1; compressedDepth png', _compressed(flat))
+    np.testing.assert_array_equal(decoded, flat)
 
 
 @given(st.binary(max_size=60), st.integers(0, 80))

@@ -145,7 +145,7 @@ def decode_compressed(
             f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
         )
     try:
-        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if size else None
+        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if size and _fits(png, size) else None
     except cv2.error:
         image = None
     if image is None:
@@ -169,6 +169,19 @@ def png_shape(data: bytes) -> tuple[int, int] | None:
         return None
     width, height = struct.unpack('>II', data[16:24])
     return height, width
+
+
+def _fits(png: NDArray[np.uint8], size: tuple[int, int]) -> bool:
+    """Whether a PNG can hold what it promises: OpenCV would take gigabytes for a damaged length.
+
+    Its chunks must lie within it, and deflate packs no more than 1032 bytes into one.
+    """
+    at = 8
+    while at + 12 <= len(png):
+        if png[at + 4 : at + 8].tobytes() == b'IEND':
+            return 2 * size[0] * size[1] <= 1032 * len(png)
+        at += 12 + int(png[at : at + 4].view('>u4')[0])
+    return False
 
 
 def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:
