@@ -120,11 +120,11 @@ def kinect(kind, shape, unit, random):
 
 
 def normalised_square(camera, sensor, errors, quantum=0.0):
-    """Mean over 120 renderings of error^T covariance^+ error per degree of freedom."""
+    """Mean over 200 renderings of error^T covariance^+ error per degree of freedom."""
     exact = inverse_range(camera)
     labels = np.ones(camera.shape, np.uint16)
     squares = []
-    for _ in range(120):
+    for _ in range(200):
         inverse = exact + errors()
         if quantum:
             inverse = np.rint(inverse / quantum) * quantum

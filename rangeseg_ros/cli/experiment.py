@@ -11,7 +11,7 @@ from typing import Any
 import click
 import yaml
 
-from rangeseg_ros.cli import options
+from rangeseg_ros.cli import options, sensitivity
 from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import experiments, plots
@@ -192,6 +192,9 @@ def timing(setting: Setting, limit: int) -> None:
     """
     rows = experiments.timing(setting.bench, setting.split('train'), setting.base, limit)
     setting.save('timing', rows, plots.plot_timing)
+
+
+command.add_command(sensitivity.command, 'sensitivity')
 
 
 def _lambdas(step: int) -> list[float]:

@@ -1,0 +1,238 @@
+"""How far a constant of the core may move before results get worse.
+
+A constant is compiled into the kernels that read it, and into those that call them. So each trial
+runs `rangeseg evaluate` in a copy of the package in which that one expression is changed. Compiled
+code is taken along only of modules that import nothing of the changed one.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rangeseg_ros.digest import code_digest
+from rangeseg_ros.io.files import replacing
+
+PACKAGE = Path(__file__).parents[1]
+TOLERATED_LOSS = 0.003
+"""Mean IoU that a constant may cost within its range."""
+
+
+class Constant(NamedTuple):
+    """A number, or some, in capitals at the top level of a module of the core.
+
+    Attributes
+    ----------
+    module : str
+        Below core/, e.g. `by_planes/patches`.
+    name : str
+    value : number or tuple of numbers
+    source : str
+        The expression that gives it.
+    """
+
+    module: str
+    name: str
+    value: Any
+    source: str
+
+    def __str__(self) -> str:
+        return f'{self.module}.{self.name}'
+
+
+def find_constants() -> list[Constant]:
+    """All constants of the core, in the order of its modules and lines."""
+    found = []
+    for path in sorted((PACKAGE / 'core').rglob('*.py')):
+        module = path.relative_to(PACKAGE / 'core').with_suffix('').as_posix()
+        text = path.read_text(encoding='utf-8')
+        for name, node in _assigned(ast.parse(text)):
+            value = getattr(importlib.import_module(_dotted(path)), name)
+            if name.isupper() and _is_numeric(value):
+                found.append(Constant(module, name, value, ast.unparse(node)))
+    return found
+
+
+def _assigned(tree: ast.Module) -> list[tuple[str, ast.expr]]:
+    """Names and expressions of the top-level assignments; of tuples, element by element."""
+    pairs = []
+    for statement in tree.body:
+        if not isinstance(statement, ast.Assign):
+            continue
+        (target,), value = statement.targets, statement.value
+        if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple):
+            pairs += list(zip(target.elts, value.elts, strict=True))
+        else:
+            pairs.append((target, value))
+    return [(target.id, value) for target, value in pairs if isinstance(target, ast.Name)]
+
+
+def _is_numeric(value: Any) -> bool:
+    if isinstance(value, tuple):
+        return len(value) > 0 and all(_is_numeric(entry) for entry in value)
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _dotted(path: Path) -> str:
+    parts = path.relative_to(PACKAGE.parent).with_suffix('').parts
+    return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+
+def write_changed(constant: Constant, factor: float, folder: Path) -> None:
+    """Copy the package into `folder`, one constant in it `factor` times as large."""
+    shutil.copytree(PACKAGE, folder / PACKAGE.name)
+    path = PACKAGE / 'core' / f'{constant.module}.py'
+    copy = folder / path.relative_to(PACKAGE.parent)
+    text = path.read_text(encoding='utf-8')
+    lines = text.splitlines(keepends=True)
+    node = dict(_assigned(ast.parse(text)))[constant.name]
+    assert node.end_lineno is not None and node.end_col_offset is not None
+    start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+    copy.write_text(text[:start] + repr(_scaled(constant.value, factor)) + text[end:], 'utf-8')
+    for touched in _dependents(path):
+        compiled = folder / touched.parent.relative_to(PACKAGE.parent) / '__pycache__'
+        for file in compiled.glob(f'{touched.stem}.*'):
+            file.unlink()
+
+
+def _scaled(value: Any, factor: float) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_scaled(entry, factor) for entry in value)
+    return round(value * factor) if isinstance(value, int) else value * factor
+
+
+def _dependents(changed: Path) -> set[Path]:
+    """`changed` and all modules that import it, or one that does."""
+    imports = {}
+    for path in PACKAGE.rglob('*.py'):
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        imports[path] = {
+            name
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ImportFrom) and node.module
+            for name in (node.module, *(f'{node.module}.{item.name}' for item in node.names))
+        }
+    found, last = {changed}, 0
+    while len(found) > last:
+        last = len(found)
+        names = {_dotted(path) for path in found}
+        found |= {path for path, imported in imports.items() if imported & names}
+    return found
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A constant times a factor, on one set; `factor` 1 is the package as it is.
+
+    Attributes
+    ----------
+    constant : Constant
+    factor : float
+    folder : Path
+        A set that `rangeseg evaluate` knows.
+    arguments : tuple of str
+        More of its arguments.
+    cache : Path
+        Folder of finished trials: what is there is not done again.
+    """
+
+    constant: Constant
+    factor: float
+    folder: Path
+    arguments: tuple[str, ...]
+    cache: Path
+
+    def run(self) -> dict[str, float] | None:
+        """Mean IoU and regions correct at tolerance 0.8; None where the segmenter fails."""
+        path = self.cache / f'{self._key()}.json'
+        if not path.exists():
+            figures = self._measure()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replacing(path) as partial:
+                partial.write_text(json.dumps(figures))
+        found: dict[str, float] | None = json.loads(path.read_text())
+        return found
+
+    def _measure(self) -> dict[str, float] | None:
+        with tempfile.TemporaryDirectory() as temporary:
+            folder, result = Path(temporary), Path(temporary, 'figures.json')
+            write_changed(self.constant, self.factor, folder)
+            code = 'from rangeseg_ros.cli.main import main; main()'
+            command = [sys.executable, '-c', code, 'evaluate', str(self.folder.resolve())]
+            command += ['--jobs', '1', '--tolerance', '0.8', '--json', str(result)]
+            environment = {**os.environ, 'PYTHONPATH': str(folder)}
+            environment.pop('NUMBA_CACHE_DIR', None)
+            done = subprocess.run(
+                [*command, *self.arguments], env=environment, cwd=folder, capture_output=True
+            )
+            if done.returncode:
+                return None
+            row = json.loads(result.read_text())['tolerances']['0.8']
+            return {key: row[key] for key in ('mean_iou', 'correct', 'regions')}
+
+    def _key(self) -> str:
+        # Without a change, all constants are alike.
+        constant = '' if self.factor == 1 else str(self.constant)
+        words = constant, self.factor, str(self.folder.resolve()), self.arguments
+        return hashlib.sha256(code_digest() + repr(words).encode()).hexdigest()[:16]
+
+
+def ranges(
+    trials: Sequence[Trial], results: Sequence[dict[str, float] | None]
+) -> list[dict[str, Any]]:
+    """Of each constant, the factors around 1 that cost no set more than `TOLERATED_LOSS`.
+
+    Returns
+    -------
+    list of dict
+        `constant`, `value`, `low`, `high` (factors), `loss`: the largest of any factor tried (1
+        where the segmenter failed), `set`: where; the constants that matter most first.
+    """
+    plain = {
+        trial.folder: result['mean_iou']
+        for trial, result in zip(trials, results, strict=True)
+        if trial.factor == 1 and result
+    }
+    losses: dict[Constant, dict[float, tuple[float, str]]] = {}
+    for trial, result in zip(trials, results, strict=True):
+        loss = plain[trial.folder] - result['mean_iou'] if result else 1.0
+        by_factor = losses.setdefault(trial.constant, {})
+        worst = by_factor.get(trial.factor, (-1.0, ''))
+        by_factor[trial.factor] = max(worst, (loss, trial.folder.name))
+    rows = []
+    for constant, by_factor in losses.items():
+        low = high = 1.0
+        for factor in sorted(by_factor):
+            if factor > 1 and all(
+                by_factor[f][0] <= TOLERATED_LOSS for f in by_factor if 1 < f <= factor
+            ):
+                high = factor
+        for factor in sorted(by_factor, reverse=True):
+            if factor < 1 and all(
+                by_factor[f][0] <= TOLERATED_LOSS for f in by_factor if factor <= f < 1
+            ):
+                low = factor
+        loss, where = max(by_factor.values())
+        rows.append(
+            {
+                'constant': str(constant),
+                'value': constant.value,
+                'low': low,
+                'high': high,
+                'loss': loss,
+                'set': where,
+            }
+        )
+    return sorted(rows, key=lambda row: -row['loss'])

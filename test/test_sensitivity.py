@@ -1,0 +1,114 @@
+"""How far constants may move: changed copies of the package, and what is made of the figures."""
+
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+from rangeseg_ros.cli.experiment import command
+from rangeseg_ros.evaluation import sensitivity
+from rangeseg_ros.evaluation.sensitivity import Constant, Trial, find_constants, ranges
+
+CONSTANTS = {str(constant): constant for constant in find_constants()}
+
+
+def value_in(folder, constant):
+    """Value that the copy of the package in `folder` has."""
+    module = f'rangeseg_ros.core.{constant.module.replace("/", ".")}'
+    code = f'import {module} as module; print(module.{constant.name}, module.__file__)'
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        cwd=folder,
+        env={'PYTHONPATH': f'{folder}:{":".join(sys.path)}'},
+        capture_output=True,
+        text=True,
+    )
+    value, file = done.stdout.split()
+    assert file.startswith(str(folder)), done.stderr
+    return float(value)
+
+
+@pytest.mark.parametrize('name', ['tracking/tracker._GATE', 'tracking/tracker._SURE_OVERLAP'])
+def test_one_constant_of_a_copy_is_changed(name, tmp_path):
+    constant = CONSTANTS[name]
+    sensitivity.write_changed(constant, 0.5, tmp_path)
+    assert value_in(tmp_path, constant) == constant.value / 2
+    sources = [path.relative_to(sensitivity.PACKAGE) for path in sensitivity.PACKAGE.rglob('*.py')]
+    changed = [
+        path
+        for path in sources
+        if (tmp_path / 'rangeseg_ros' / path).read_bytes()
+        != (sensitivity.PACKAGE / path).read_bytes()
+    ]
+    assert [path.as_posix() for path in changed] == ['core/tracking/tracker.py']
+
+
+def test_only_compiled_code_that_cannot_depend_on_the_constant_is_kept(tmp_path):
+    package = tmp_path / 'package'
+    names = {'a': '', 'b': 'from package.a import x', 'c': 'from package import b', 'd': ''}
+    for name, text in names.items():
+        (package / 'core' / '__pycache__').mkdir(parents=True, exist_ok=True)
+        (package / 'core' / f'{name}.py').write_text(text.replace('package', 'package.core'))
+        (package / 'core' / '__pycache__' / f'{name}.kernel-1.nbi').touch()
+    (package / 'core' / 'a.py').write_text('X, Y = 3, 1.5**2\n')
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sensitivity, 'PACKAGE', package)
+        sensitivity.write_changed(Constant('a', 'Y', 2.25, '1.5**2'), 2, tmp_path / 'copy')
+    copy = tmp_path / 'copy/package/core'
+    assert (copy / 'a.py').read_text() == 'X, Y = 3, 4.5\n'
+    assert {path.name for path in (copy / '__pycache__').iterdir()} == {'d.kernel-1.nbi'}
+
+
+def test_ranges_end_at_the_first_factor_that_costs_too_much(tmp_path):
+    a, b = Constant('m', 'A', 1.0, '1.0'), Constant('m', 'B', 2, '2')
+    ious = {
+        a: {1: 0.9, 0.5: 0.898, 0.25: 0.95, 2: 0.5, 4: 0.9},
+        b: {1: 0.9, 0.5: None, 2: 0.9, 0.25: 0.9, 4: 0.9},
+    }
+    trials = [
+        Trial(constant, factor, tmp_path, (), tmp_path)
+        for constant, by_factor in ious.items()
+        for factor in by_factor
+    ]
+    results = [
+        iou and {'mean_iou': iou} for by_factor in ious.values() for iou in by_factor.values()
+    ]
+    rows = ranges(trials, results)
+    assert [(row['constant'], row['low'], row['high']) for row in rows] == [
+        ('m.B', 1, 4),
+        ('m.A', 0.25, 1),
+    ]
+    assert [row['loss'] for row in rows] == pytest.approx([1.0, 0.4])
+
+
+def test_command_resumes(tmp_path, monkeypatch):
+    measured = []
+
+    def measure(trial):
+        measured.append((str(trial.constant), trial.factor))
+        if len(measured) == 4:
+            raise OSError('the disk is full')
+        return {'mean_iou': 0.9 if trial.factor < 2 else 0.8, 'correct': 3, 'regions': 4}
+
+    monkeypatch.setattr(Trial, '_measure', measure)
+    (tmp_path / 'set').mkdir()
+    table = tmp_path / 'method.md'
+    table.write_text(
+        '| module | name | value | kind | reason |\n'
+        '| `tracking/tracker` | `_GATE` | 20 | d | tried |\n'
+        '| `fitting/cells` | `_RIM` | 2 | d | tried |\n'
+        '| `fitting/cells` | `MOST` | 100 | c | memory |\n'
+    )
+    arguments = ['sensitivity', tmp_path / 'set', '--output', tmp_path / 'out', '--table', table]
+    arguments += ['--factor', 0.5, '--factor', 2, '--jobs', 1]
+    assert CliRunner().invoke(command, [*map(str, arguments)]).exception
+    done = CliRunner().invoke(command, [*map(str, arguments)])
+    assert done.exit_code == 0, done.output
+    assert 'tracking/tracker._GATE: 0.5 to 1 times 20.0' in done.output
+    rows = (tmp_path / 'out/sensitivity.csv').read_text().splitlines()
+    assert len(rows) == 3 and rows[0].startswith('constant,value,low,high,loss')
+    # Unchanged once for both, every factor once for each, and the one that failed again.
+    assert len(measured) == 1 + 4 + 1 and measured[3] == measured[4]
+    unknown = CliRunner().invoke(command, [*map(str, arguments[:4]), '--constant', 'a._B'])
+    assert unknown.exit_code == 1 and 'no constant a._B' in unknown.output
