@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -210,3 +211,12 @@ def test_published_rows_are_those_of_the_thesis():
         method='normals', normal_baseline=1, jump_edges='sobel', smoothness=55.0, min_pixels=2
     )
     assert published == experiments.THESIS
+
+
+@pytest.mark.parametrize('sensor', experiments.AS_PUBLISHED)
+def test_parameter_files_hold_the_published_settings(sensor):
+    path = Path(__file__).parents[1] / 'params' / f'thesis_{sensor}.yaml'
+    assert read_config(path) == experiments.AS_PUBLISHED[sensor]
+    # Whatever the defaults become.
+    given = set(read_params(path))
+    assert {'method', 'smoothness', 'jump_edges', 'normal_baseline', 'min_pixels'} <= given

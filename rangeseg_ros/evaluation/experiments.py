@@ -31,11 +31,21 @@ THESIS = Config(
     directions='platonic',
     direction_count=305,
     smoothness=55.0,
+    weighting='uniform',
     noise_regions='identify',
     # The pixels of jump edges, disconnected one by one, are no regions (white in figure 5.6).
     min_pixels=2,
 )
 """The parameters of the thesis (6.6)."""
+
+AS_PUBLISHED = {
+    'perceptron': THESIS,
+    # sigma = 1, in the unit of the images (6.7.1).
+    'abw': replace(THESIS, dithering=0.001),
+    # No post-processing (6.7.2).
+    'kinect': replace(THESIS, smoothness=100.0, noise_regions='leave'),
+}
+"""The same for each sensor; `params/thesis_<sensor>.yaml` say it to the other commands."""
 
 DIRECTIONS: dict[str, dict[str, Any]] = {
     f'{count} {kind}': {'directions': kind, 'direction_count': count}
@@ -242,7 +252,7 @@ def variants(sensor: str) -> dict[str, Config]:
         'planes': replace(ours, method='planes'),
     }
     if sensor == 'abw':
-        rows['normals as published, dithered'] = replace(THESIS, dithering=0.001)
+        rows['normals as published, dithered'] = AS_PUBLISHED['abw']
         rows['normals, our defaults, dithered'] = replace(ours, dithering=0.001)
     return rows
 
