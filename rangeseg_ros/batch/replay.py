@@ -44,7 +44,7 @@ class Outcome:
     figures : dict
         See `ReplayReport.figures`.
     damage : str
-        Why the recording was not read to its end; empty when it was.
+        What of the recording could not be read; empty when all of it was.
     found_done : bool
         The results were there already.
     """
@@ -120,28 +120,30 @@ class Replay:
             ExitStack() as stack,
         ):
             report = ReplayReport(str(self.recording.name), self.config)
-            damage: list[str] = []
-            frames = progress(source, len(source)) if progress else source
 
             def results() -> Iterator[Timed]:
-                try:
-                    for index, (frame, image, result) in enumerate(segmented(frames, self.config)):
-                        stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
-                        stem = f'{index:06d}_{stamp}'
-                        files = write_frame(self.folder, stem, image, result, PICTURES)
-                        table.write(result.planes, index, stamp)
-                        report.add(frame.stamp, result, files['overlay'])
-                        yield from bag.messages(frame, image, result)
-                except DamagedBagError as error:
-                    damage.append(str(error))
+                for index, frame, image, result in segmented(source, self.config, progress):
+                    stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
+                    stem = f'{index:06d}_{stamp}'
+                    files = write_frame(self.folder, stem, image, result, PICTURES)
+                    table.write(result.planes, index, stamp)
+                    report.add(frame.stamp, result, files['overlay'])
+                    yield from bag.messages(frame, image, result)
 
             streams = [results()]
             if self.copy:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
+            damage = [source.damage, source.loss()]
+            if bag.lost:
+                reason, count = bag.lost.most_common(1)[0]
+                damage.append(f'{bag.lost.total()} messages not copied, {count} of {reason}')
             outcome = Outcome(
-                report.frames, dict(report.reasons), report.figures(), ''.join(damage)
+                report.frames,
+                dict(report.reasons),
+                report.figures(),
+                '; '.join(filter(None, damage)),
             )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
@@ -176,11 +178,24 @@ class Replay:
 
 
 def segmented(
-    frames: Iterable[DepthFrame], config: Config
-) -> Iterator[tuple[DepthFrame, RangeImage, Segmentation]]:
-    """Segment the frames of a recording, with persistent ids and roles."""
+    source: DepthBag, config: Config, progress: Progress | None = None
+) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
+    """Segment the frames of a recording, with persistent ids and roles, up to any damage.
+
+    Yields their numbers among the frames of the recording, of which those that cannot be read are
+    left out and counted by `source.lost`.
+    """
     sequence = SequenceSegmenter(config)
     sequence.warm_up()
-    for frame in frames:
-        image = frame.range_image()
-        yield frame, image, sequence.segment(image, frame.stamp)
+    done = 0
+    try:
+        for frame in progress(source, len(source)) if progress else source:
+            try:
+                image = frame.range_image()
+            except ValueError as error:
+                source.lose(str(error))
+                continue
+            yield done + source.lost.total(), frame, image, sequence.segment(image, frame.stamp)
+            done += 1
+    except DamagedBagError as error:
+        source.damage = str(error)
