@@ -7,19 +7,23 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
+from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
+from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.io.meshes import write_mesh
+from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -44,9 +48,13 @@ class Outcome:
     figures : dict
         See `ReplayReport.figures`.
     damage : str
-        What of the recording could not be read; empty when all of it was.
+        Why the recording was not read to its end; empty when it was.
     found_done : bool
         The results were there already.
+    mapped : int
+        Number of planes in the map.
+    unlocated : dict
+        Why frames do not count for the map -> number of these frames.
     """
 
     frames: int
@@ -54,6 +62,8 @@ class Outcome:
     figures: dict[str, float]
     damage: str = ''
     found_done: bool = False
+    mapped: int = 0
+    unlocated: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -120,30 +130,41 @@ class Replay:
             ExitStack() as stack,
         ):
             report = ReplayReport(str(self.recording.name), self.config)
+            sequence = SequenceSegmenter(self.config)
+            located = stack.enter_context(Locator(self.recording, self.config))
+            damage: list[str] = []
+            frames = progress(source, len(source)) if progress else source
 
             def results() -> Iterator[Timed]:
-                for index, frame, image, result in segmented(source, self.config, progress):
-                    stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
-                    stem = f'{index:06d}_{stamp}'
-                    files = write_frame(self.folder, stem, image, result, PICTURES)
-                    table.write(result.planes, index, stamp)
-                    report.add(frame.stamp, result, files['overlay'])
-                    yield from bag.messages(frame, image, result)
+                try:
+                    timed = segmented(frames, sequence, located.pose)
+                    for index, (frame, image, result) in enumerate(timed):
+                        stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
+                        stem = f'{index:06d}_{stamp}'
+                        files = write_frame(self.folder, stem, image, result, PICTURES)
+                        table.write(result.planes, index, stamp)
+                        report.add(frame.stamp, result, files['overlay'])
+                        yield from bag.messages(frame, image, result)
+                except DamagedBagError as error:
+                    damage.append(str(error))
 
             streams = [results()]
             if self.copy:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
-            damage = [source.damage, source.loss()]
-            if bag.lost:
-                reason, count = bag.lost.most_common(1)[0]
-                damage.append(f'{bag.lost.total()} messages not copied, {count} of {reason}')
+            planes = sequence.map.planes
+            if self.config.fixed_frame:
+                write_map(self.folder / 'map.csv', planes)
+                shades = colours([plane.id for plane in planes])
+                write_mesh(self.folder / 'map.ply', planes, shades)
             outcome = Outcome(
                 report.frames,
                 dict(report.reasons),
                 report.figures(),
-                '; '.join(filter(None, damage)),
+                ''.join(damage),
+                mapped=len(planes),
+                unlocated=dict(located.problems),
             )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
@@ -156,7 +177,8 @@ class Replay:
     def _clear(self) -> None:
         """Remove what other or interrupted runs have left."""
         endings = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
-        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|planes\.csv|report\.html')
+        whole = r'planes\.csv|map\.(csv|ply)|report\.html'
+        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|{whole}')
         partial = re.compile(rf'\.\d+\.({own.pattern}|{BAG})')
         shutil.rmtree(self.folder / BAG, ignore_errors=True)
         for path in self.folder.glob('*'):
@@ -178,24 +200,12 @@ class Replay:
 
 
 def segmented(
-    source: DepthBag, config: Config, progress: Progress | None = None
-) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
-    """Segment the frames of a recording, with persistent ids and roles, up to any damage.
-
-    Yields their numbers among the frames of the recording, of which those that cannot be read are
-    left out and counted by `source.lost`.
-    """
-    sequence = SequenceSegmenter(config)
+    frames: Iterable[DepthFrame],
+    sequence: SequenceSegmenter,
+    pose: Callable[[DepthFrame], Transform | None] = lambda frame: None,
+) -> Iterator[tuple[DepthFrame, RangeImage, Segmentation]]:
+    """Segment the frames of a recording, with persistent ids and roles; `pose` locates them."""
     sequence.warm_up()
-    done = 0
-    try:
-        for frame in progress(source, len(source)) if progress else source:
-            try:
-                image = frame.range_image()
-            except ValueError as error:
-                source.lose(str(error))
-                continue
-            yield done + source.lost.total(), frame, image, sequence.segment(image, frame.stamp)
-            done += 1
-    except DamagedBagError as error:
-        source.damage = str(error)
+    for frame in frames:
+        image = frame.range_image()
+        yield frame, image, sequence.segment(image, frame.stamp, pose=pose(frame))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from rangeseg_ros.batch.replay import segmented
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.files import replacing
@@ -35,9 +35,7 @@ ARROW_LENGTH = 0.2
 @options.raw
 @options.params
 @options.exact
-@click.pass_context
 def command(
-    ctx: click.Context,
     bag: Path,
     output: Path,
     depth_topic: str | None,
@@ -49,30 +47,24 @@ def command(
     """Segment a recording and log what is found, to look at in 3D.
 
     Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image. Needs
-    the extra view (rerun-sdk), whose telemetry is off. What is damaged is left out, and the exit
-    code is then 1.
+    the extra view (rerun-sdk), whose telemetry is off.
     """
     config = options.read_parameters(params_file, exact)
     rerun = _rerun()
-    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as file:
+    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as partial:
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)
-        log.save(file)
+        log.save(partial)
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)
+        frames = options.progress(source, len(source), 'frame')
         count = 0
-        show = partial(options.progress, unit='frame')
-        for index, frame, image, result in segmented(source, config, show):
-            log.set_time('frame', sequence=index)
+        for frame, image, result in segmented(frames, SequenceSegmenter(config)):
+            log.set_time('frame', sequence=count)
             log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
             _log_frame(rerun, log, image, result)
             count += 1
         log.flush()
         log.disconnect()
-        problems = list(filter(None, (source.damage, source.loss())))
     click.echo(f'{output}: {count} frames')
-    for problem in problems:
-        click.echo(f'rangeseg: {problem}', err=True)
-    if problems:
-        ctx.exit(1)
 
 
 def _rerun() -> Any:

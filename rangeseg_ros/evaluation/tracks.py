@@ -168,12 +168,13 @@ def track_rooms(
     segmenter, tracker = Segmenter(config), Tracker(config)
     for room in rooms:
         scene = kinect_room(room, frames * speed)
+        tracker.reset()
         for k in range(frames):
             view = simulate_kinect(scene, frame=k * speed, seed=room)
             result = segmenter.segment(RangeImage.from_depth(view.depth, view.camera))
             begin = time.perf_counter()
-            # Each room's time begins with 0, so that the tracker begins anew.
-            planes = tracker.track(result.labels, result.planes, k)
+            stamp = 10**9 + round(k * speed * 1e9 / 30)
+            planes = tracker.track(result.labels, result.planes, stamp)
             milliseconds = 1000 * (time.perf_counter() - begin)
             faces = {plane.label: (room, plane.face) for plane in view.planes}
             by_plane, by_surface = (
