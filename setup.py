@@ -61,6 +61,7 @@ setup(
         'numba>=0.58.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
+        'pillow>=9.4',
         'PyMaxflow>=1.3',
         'PyYAML>=5.4',
         'rosbags>=0.11',

@@ -6,6 +6,7 @@ from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.messages.clouds import planes_from_message
 
 __version__ = '0.1.0'
@@ -22,5 +23,6 @@ __all__ = [
     'Segmentation',
     'Segmenter',
     '__version__',
+    'corrected',
     'planes_from_message',
 ]

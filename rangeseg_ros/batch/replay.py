@@ -21,6 +21,7 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
@@ -192,6 +193,8 @@ class Replay:
         digest = hashlib.sha256(code_digest())
         settings = replace(self, recording=Path(), folder=Path())
         digest.update(repr(settings).encode())
+        if self.config.distortion_map:
+            digest.update(Path(self.config.distortion_map).read_bytes())
         parts = self.recording.iterdir() if self.recording.is_dir() else [self.recording]
         for path in sorted(parts):
             state = path.stat()
@@ -207,5 +210,5 @@ def segmented(
     """Segment the frames of a recording, with persistent ids and roles; `pose` locates them."""
     sequence.warm_up()
     for frame in frames:
-        image = frame.range_image()
+        image = corrected(frame.range_image(), sequence.config)
         yield frame, image, sequence.segment(image, frame.stamp, pose=pose(frame))

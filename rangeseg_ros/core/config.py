@@ -191,6 +191,12 @@ class Config:
         low=0.0,
         high=10.0,
     )
+    # What is known of one sensor: its fixed distortion.
+    distortion_map: str = option(
+        '',
+        'file of the fixed distortion of the sensor, as rangeseg calibrate writes it; subtracted '
+        'from the inverse depth before anything else, so that distortion is what remains',
+    )
     track_time: float = option(
         3.0,
         'seconds that a plane may be out of sight, or go unnoticed, and keep its id',

@@ -55,7 +55,8 @@ class SequenceSegmenter:
         """Have the functions of the core compiled, or loaded, before the first frame."""
         camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
         wall = np.full(camera.shape, 1000, np.uint16)
-        self._segmenter.segment(RangeImage.from_depth(wall, camera))
+        image = RangeImage.from_depth(wall, camera)
+        self._segmenter.segment(replace(image, corrected=True))
         self._segmenter.reset()
 
     def segment(

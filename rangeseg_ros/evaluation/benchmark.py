@@ -22,6 +22,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
 
@@ -96,7 +97,7 @@ def measured(
         system has no /proc. `frames`, `rounds`, `width`, `height`, `method`.
     """
     # What numba has not compiled yet is compiled and cached here, not where it is measured.
-    Segmenter(config).segment(frames.read(frames.paths[0]))
+    Segmenter(config).segment(corrected(frames.read(frames.paths[0]), config))
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
         return pool.submit(_measure, frames, config, rounds, progress).result()
 
@@ -128,7 +129,7 @@ def _laps(segmenter: Segmenter, frames: Frames, path: Path) -> dict[str, float]:
     """Milliseconds of each stage of a frame, the total and the processor time."""
     depth = read_depth(path)
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    image = frames.image(path, depth)
+    image = corrected(frames.image(path, depth), segmenter.config)
     converted = time.perf_counter()
     timings = segmenter.segment(image).timings
     end, end_cpu = time.perf_counter(), time.process_time()
@@ -181,7 +182,7 @@ def energy_ratio(
     segmenter, exact = Segmenter(config), Segmenter(replace(config, exact=True))
     ratios = []
     for path in progress(frames.paths, len(frames.paths)):
-        image = frames.read(path)
+        image = corrected(frames.read(path), config)
         energy, least = segmenter.segment(image).energy, _cached_energy(exact, image, cache)
         with np.errstate(divide='ignore'):
             ratios.append(1.0 if energy == least else float(np.divide(energy, least)))

@@ -16,6 +16,7 @@ from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.segcomp.files import (
@@ -113,7 +114,7 @@ class Task:
 
     def _measure(self) -> Measurement:
         sample = self.case.load()
-        result = Segmenter(self.config).segment(sample.image)
+        result = Segmenter(self.config).segment(corrected(sample.image, self.config))
         overlap = sample.truth.compare(result.labels)
         if self.output:
             self._save(self.output, sample, result, overlap)
@@ -143,6 +144,9 @@ class Task:
         """Digest of all that the measurement depends on: code, parameters, files."""
         digest = hashlib.sha256(code_digest())
         digest.update(repr((asdict(self.config), self.case)).encode())
-        for path in (self.case.image, self.case.truth):
+        files = [self.case.image, self.case.truth]
+        if self.config.distortion_map:
+            files.append(Path(self.config.distortion_map))
+        for path in files:
             digest.update(path.read_bytes())
         return digest.hexdigest()[:16]

@@ -22,6 +22,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.overlap import Overlap
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
@@ -171,7 +172,8 @@ def track_rooms(
         tracker.reset()
         for k in range(frames):
             view = simulate_kinect(scene, frame=k * speed, seed=room)
-            result = segmenter.segment(RangeImage.from_depth(view.depth, view.camera))
+            image = RangeImage.from_depth(view.depth, view.camera)
+            result = segmenter.segment(corrected(image, config))
             begin = time.perf_counter()
             stamp = 10**9 + round(k * speed * 1e9 / 30)
             planes = tracker.track(result.labels, result.planes, stamp)

@@ -24,6 +24,7 @@ from rclpy.time import Time
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy, message_class
 from rangeseg_ros.messages.outputs import OUTPUTS
@@ -126,11 +127,11 @@ class SegmentPlanes(Node):
         ticks = [time.perf_counter()]
         start = self.get_clock().now().nanoseconds
         header = frame.message.header
-        image = frame.range_image()
-        ticks.append(time.perf_counter())
         # Here and not where parameters change, so that one frame is of one configuration.
         if (config := self._config) is not self._sequence.config:
             self._sequence.config = config
+        image = corrected(frame.range_image(), config)
+        ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         gravity = self._gravity
         up = gravity.up(header.frame_id) if gravity else None
