@@ -215,6 +215,7 @@ def test_a_killed_replay_is_started_again(done, tmp_path):
     assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_results(tmp_path, monkeypatch):
     for name in ('a', 'b'):
         replay(record_walls(tmp_path / name, 2), tmp_path / 'local' / name)
