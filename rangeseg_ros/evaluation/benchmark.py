@@ -72,7 +72,7 @@ def _silent(paths: Iterable[Path], total: int) -> Iterable[Path]:
     return paths
 
 
-def measured(
+def measure(
     frames: Frames, config: Config, rounds: int = 3, progress: Progress = _silent
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
@@ -172,7 +172,7 @@ def energy_ratio(
     cache : Path
         Folder of the exact energies: what is there is not computed again.
     progress : callable
-        As for `measured`.
+        As for `measure`.
 
     Returns
     -------
@@ -203,7 +203,7 @@ def _cached_energy(segmenter: Segmenter, image: RangeImage, cache: Path) -> floa
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Text of what `measured` gives, with `energy_ratio` where there is one."""
+    """Text of what `measure` gives, with `energy_ratio` where there is one."""
     rows = [('stage', 'median ms', 'p95 ms')]
     for name, stage in (*figures['stages'].items(), ('total', figures['total'])):
         rows.append((name, f'{stage["median_ms"]:.1f}', f'{stage["p95_ms"]:.1f}'))
@@ -222,7 +222,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def scaling_table(series: dict[str, dict[str, Any]]) -> str:
-    """Text of `measured` figures of several sizes of image, each with its `ratio`."""
+    """Text of `measure` figures of several sizes of image, each with its `ratio`."""
     head = ('median ms', 'p95 ms', 'ratio', 'cpu ms', 'peak MB')
     lines = [f'{"size":<12}' + ''.join(f'{title:>11}' for title in head)]
     for size, figures in series.items():

@@ -29,7 +29,7 @@ from rangeseg_ros.segcomp.files import (
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """All that the figures of an image are computed from.
+    """Everything the figures of an image are computed from.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Task:
-    """An image, the parameters to segment it with, and where to leave what.
+    """An image, the parameters to segment it with, and where the results go.
 
     Attributes
     ----------
@@ -141,7 +141,7 @@ class Task:
             write_normals(folder / f'{name}.ms-nor', normals)
 
     def _key(self) -> str:
-        """Digest of all that the measurement depends on: code, parameters, files."""
+        """Digest of everything the measurement depends on: code, parameters, files."""
         digest = hashlib.sha256(code_digest())
         digest.update(repr((asdict(self.config), self.case)).encode())
         files = [self.case.image, self.case.truth]
