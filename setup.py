@@ -61,12 +61,10 @@ setup(
         'numba>=0.58.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
-        'pillow>=9.4',
         'PyMaxflow>=1.3',
         'PyYAML>=5.4',
         'rosbags>=0.11',
         'scipy>=1.11',
-        'shapely>=2.0',
         'tqdm>=4.60',
     ],
     extras_require={
@@ -92,8 +90,8 @@ setup(
     zip_safe=True,
     entry_points={
         'console_scripts': [
-            'rangeseg = rangeseg_ros.cli.main:main',
-            'segment_planes = rangeseg_ros.ros.node:main',
+            'rangeseg = rangeseg_ros.start:rangeseg',
+            'segment_planes = rangeseg_ros.start:segment_planes',
         ],
     },
 )

@@ -1,13 +1,16 @@
 """Planar segmentation of range images by multi-label graph cuts."""
 
-from rangeseg_ros.core.config import Config, ConfigError
-from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.roles import ROLES
-from rangeseg_ros.core.segmenter import Segmentation, Segmenter
-from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
-from rangeseg_ros.io.distortion import corrected
-from rangeseg_ros.messages.clouds import planes_from_message
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rangeseg_ros.core.config import Config, ConfigError
+    from rangeseg_ros.core.description.planes import Plane
+    from rangeseg_ros.core.meaning.roles import ROLES
+    from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+    from rangeseg_ros.core.sensing.camera import Camera, CameraError
+    from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+    from rangeseg_ros.messages.clouds import planes_from_message
 
 __version__ = '0.1.0'
 
@@ -23,6 +26,23 @@ __all__ = [
     'Segmentation',
     'Segmenter',
     '__version__',
-    'corrected',
     'planes_from_message',
 ]
+
+# Imported when used: `rangeseg --help`, and an interrupt at the start, need not wait for numba.
+_HOMES = {
+    'core.config': ('Config', 'ConfigError'),
+    'core.description.planes': ('Plane',),
+    'core.meaning.roles': ('ROLES',),
+    'core.segmenter': ('Segmentation', 'Segmenter'),
+    'core.sensing.camera': ('Camera', 'CameraError'),
+    'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
+    'messages.clouds': ('planes_from_message',),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(import_module(f'rangeseg_ros.{home}'), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')

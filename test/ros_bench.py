@@ -45,6 +45,11 @@ def corner_depth(camera):
     return np.round(1000 * 2 / (1 + np.abs(x))).astype(np.uint16)
 
 
+def values_of(status):
+    """Values of a diagnostic status by their keys."""
+    return {value.key: value.value for value in status.values}
+
+
 class Bench:
     """Starts `segment_planes` and talks to it."""
 
@@ -226,6 +231,10 @@ class Bench:
         )
         self.until(future.done)
         return future.result().result if atomically else future.result().results
+
+    def in_use(self):
+        """Wait until the parameters that were set have the kernels they need."""
+        self.status(lambda status: values_of(status)['parameters'] == 'in use')
 
     def complaints(self):
         """What there is to know when the node does not do what it should."""

@@ -220,6 +220,7 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     before = dropped(bench.status(lambda status: True))
     slow = {'method': 'normals', 'exact': True}
     assert bench.set_parameters(atomically=True, **slow).successful
+    bench.in_use()
     images = [bench.image() for _ in range(5)]
     bench.camera_info.publish(bench.info())
     bench.depth.publish(images[0])

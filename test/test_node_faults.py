@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
 from sensor_msgs.msg import CameraInfo, Image
 
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -31,11 +31,6 @@ def bench(node):
     """The node with a listener for its labels and a reliable camera."""
     with node.listening('labels'), node.camera_on():
         yield node
-
-
-def values_of(status):
-    """Values of a diagnostic status by their keys."""
-    return {value.key: value.value for value in status.values}
 
 
 def assert_segments(bench):

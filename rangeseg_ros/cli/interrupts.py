@@ -9,8 +9,9 @@ _received = False
 
 
 def watch() -> None:
-    """Remember interrupts; they raise KeyboardInterrupt as ever."""
-    signal.signal(signal.SIGINT, _on_interrupt)
+    """Remember interrupts; they raise KeyboardInterrupt as ever. Who ignores them still does."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, _on_interrupt)
 
 
 def received() -> bool:

@@ -22,6 +22,7 @@ COMMANDS = {
     'tracks': 'Measure how well planes keep their ids.',
     'experiment': 'Repeat the experiments of the thesis.',
     'bench': 'Measure the time and memory of each stage.',
+    'compile': 'Compile ahead of the first frame.',
     'play': 'Publish the messages of a recording in ROS 2.',
     'view': 'Show planes in 3D.',
 }

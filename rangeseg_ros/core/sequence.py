@@ -5,27 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.plane_map import PlaneMap
-from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.roles import roles
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
 
 
 class SequenceSegmenter:
     """Segments the frames of a sequence, live or recorded: the same frames give the same ids.
-
-    Attributes
-    ----------
-    map : PlaneMap
-        Of the frames whose pose was given.
 
     Examples
     --------
@@ -36,9 +27,7 @@ class SequenceSegmenter:
     def __init__(self, config: Config | None = None) -> None:
         self._segmenter = Segmenter(config)
         self._tracker = Tracker(config)
-        self.map = PlaneMap(config)
         self._stamp = 0
-        self._pose: Transform | None = None
 
     @property
     def config(self) -> Config:
@@ -49,49 +38,18 @@ class SequenceSegmenter:
     def config(self, config: Config) -> None:
         self._segmenter = Segmenter(config)
         self._tracker.config = config
-        self.map.config = config
 
-    def warm_up(self) -> None:
-        """Have the functions of the core compiled, or loaded, before the first frame."""
-        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-        wall = np.full(camera.shape, 1000, np.uint16)
-        image = RangeImage.from_depth(wall, camera)
-        self._segmenter.segment(replace(image, corrected=True))
-        self._segmenter.reset()
+    def segment(self, image: RangeImage, stamp: int, up: ArrayLike | None = None) -> Segmentation:
+        """Label the next frame, taken at `stamp` nanoseconds; ids and roles of its planes are set.
 
-    def segment(
-        self,
-        image: RangeImage,
-        stamp: int,
-        up: ArrayLike | None = None,
-        pose: Transform | None = None,
-    ) -> Segmentation:
-        """Label the next frame; ids and roles of its planes are set.
-
-        Parameters
-        ----------
-        image : RangeImage
-        stamp : int
-            When it was taken, nanoseconds. Before the last frame, as in a looped recording, time
-            begins anew: nothing known is matched to it.
-        up : (3,) float, optional
-            Direction in the frame of the image, the configured one when not given.
-        pose : Transform, optional
-            Fixed frame from the frame of the image: the planes then count for `map`.
+        `up` (3,) is the direction in the frame of the image, the configured one when not given.
         """
         if stamp < self._stamp:
             self._segmenter.reset()
-            self._tracker.reset()
-            self.map.clear()
-            self._pose = None
-        motion = pose.inverse().after(self._pose) if pose and self._pose else None
-        self._stamp, self._pose = stamp, pose
+        self._stamp = stamp
         result = self._segmenter.segment(image)
-        planes = self._tracker.track(result.labels, result.planes, stamp, motion)
-        planes = with_roles(planes, self.config, up)
-        if pose:
-            self.map.add(result.labels, planes, image, pose, stamp)
-        return replace(result, planes=planes)
+        planes = self._tracker.track(result.labels, result.planes, stamp)
+        return replace(result, planes=with_roles(planes, self.config, up))
 
 
 def with_roles(

@@ -1,4 +1,4 @@
-"""Contingency table of two segmentations, the pixels that regions share, and measures of it."""
+"""Which regions of two segmentations share how many pixels, and measures of that."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def check_tolerance(tolerance: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Contingency table of the regions of the truth and of a segmentation.
+    """Which regions of the truth and of a segmentation share how many pixels.
 
     Attributes
     ----------

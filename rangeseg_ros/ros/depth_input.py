@@ -206,6 +206,15 @@ class DepthInput:
         return nanoseconds
 
 
+def input_topics(node: Node, source: str) -> list[str]:
+    """Names of the topics that `DepthInput` subscribes to."""
+    if source == 'points':
+        return [node.resolve_topic_name(POINTS_TOPIC)]
+    image = node.resolve_topic_name(IMAGE_TOPIC)
+    kind = '/compressedDepth' if source == 'compressed_depth' else ''
+    return [image + kind, _camera_topic(node, image)]
+
+
 def _nanoseconds(stamp: Any) -> int:
     # rclpy's Time refuses negative ones, which are no reason to stop.
     nanoseconds: int = stamp.sec * 10**9 + stamp.nanosec

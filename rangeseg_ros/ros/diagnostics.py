@@ -92,8 +92,10 @@ class FrameStatistics:
         Depth messages that never arrived.
     compiling : str
         How far the compilation of kernels is that frames wait for; empty when none do.
-    activity : Activity
-        Of the worker.
+    activity, publishing : Activity
+        Of the thread that segments, and of that which publishes.
+    pending : str
+        What is being done with parameters that are not in use yet; empty when all are.
     problem : str
         Why the last frame could not be segmented; empty when it could.
     planes : int
@@ -109,7 +111,8 @@ class FrameStatistics:
         self.dropped, self.refused = Window(), Window()
         self.losses = Losses()
         self.compiling = ''
-        self.activity = Activity()
+        self.activity, self.publishing = Activity(), Activity()
+        self.pending = ''
         self.problem = ''
         self.planes = 0
         self.reason = ''
@@ -153,7 +156,8 @@ class FrameStatistics:
                 'unknown' if unseen is None else str(unseen)
             ),
             'camera_info': source.pairing if source else '',
-            'doing': self.compiling or str(self.activity) or 'waiting for a frame',
+            'doing': self.doing() or 'waiting for a frame',
+            'parameters': self.pending or 'in use',
             'planes': str(self.planes),
             'reason for no planes': self.reason,
         }
@@ -166,6 +170,11 @@ class FrameStatistics:
             hardware_id=source.topic if source else '',
             values=[KeyValue(key=key, value=value) for key, value in values.items()],
         )
+
+    def doing(self) -> str:
+        """What the threads are at; empty while they wait."""
+        parts = self.compiling, str(self.activity), str(self.publishing)
+        return ', '.join(part for part in parts if part)
 
     def lost(self, source: DepthInput) -> str:
         """What share of the messages of `source` is lost, and what may help; empty when none."""
@@ -190,9 +199,8 @@ class FrameStatistics:
             return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
         if problem := source.problem or self.problem:
             return DiagnosticStatus.ERROR, problem
-        doing = self.compiling or str(self.activity)
         if (stalled := self.stalled()) > stall_timeout:
-            return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {doing}'
+            return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {self.doing()}'
         if self.compiling:
             return DiagnosticStatus.WARN, self.compiling
         if lost:

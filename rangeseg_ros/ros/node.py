@@ -5,50 +5,51 @@ from __future__ import annotations
 import os
 import signal
 import sys
-import time
-import traceback
 import warnings
-from contextlib import suppress
-from itertools import pairwise
-from threading import Thread
+from typing import NoReturn
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import (
+    InvalidNamespaceException,
+    InvalidNodeNameException,
+    ParameterException,
+)
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.time import Time
 
 from rangeseg_ros.core.config import ConfigError
-from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.distortion import corrected
-from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.make import make_rclpy, message_class
+from rangeseg_ros.messages.make import message_class
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.ros.depth_input import DepthInput
-from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
-from rangeseg_ros.ros.gravity import Gravity
-from rangeseg_ros.ros.latest import Latest
-from rangeseg_ros.ros.parameters import NodeConfig, bind
+from rangeseg_ros.ros.arguments import check_arguments, check_parameters
+from rangeseg_ros.ros.depth_input import DepthInput, input_topics
+from rangeseg_ros.ros.diagnostics import FrameStatistics
+from rangeseg_ros.ros.gravity import IMU_TOPIC, Gravity
+from rangeseg_ros.ros.parameters import bind
+from rangeseg_ros.ros.pipeline import Pipeline
+from rangeseg_ros.ros.settings import Settings
+
+_BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
 
 class SegmentPlanes(Node):
     """Segments the newest depth message whenever it is free, while any output is subscribed.
 
-    The executor's thread receives, answers parameter requests and reports; one worker thread
-    computes and publishes.
+    The executor's thread receives, answers parameter requests and reports; the threads of
+    `Pipeline` compute and publish, and that of `Settings` has kernels compiled.
     """
 
     def __init__(self) -> None:
         super().__init__('segment_planes')
-        self._config = bind(self, self._configure)
-        self._sequence = SequenceSegmenter(self._config)
+        check_parameters(self, sys.argv)
+        config = bind(self, lambda config: self._settings.want(config))
+        self._config = config
         self._input: DepthInput | None = None
         self._gravity: Gravity | None = None
-        self._frames: Latest[DepthFrame] = Latest()
         self._statistics = FrameStatistics()
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
         overriding = QoSOverridingOptions.with_default_policies()
@@ -66,17 +67,43 @@ class SegmentPlanes(Node):
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._look_around, clock=steady)
-        self._worker = Thread(target=self._work, name='segmentation', daemon=True)
-        self._worker.start()
+        # What follows a change of parameters is done by the executor, as are all subscriptions.
+        self._changed = self.create_guard_condition(self._configure)
+        self._settings = Settings(config, self._on_compiling, self._changed.trigger)
+        self._pipeline = Pipeline(
+            self, self._outputs, self._settings, self._statistics, self._up_in
+        )
+        self.get_logger().info(self._waits_for())
 
     def stop(self, patience: float) -> bool:
-        """Let the worker finish the frame in hand; False when it takes more seconds than that."""
-        self._frames.close()
-        self._worker.join(patience)
-        return not self._worker.is_alive()
+        """Let the frame in hand be finished; False when it takes more seconds than that."""
+        self._settings.close()
+        return self._pipeline.stop(patience) and not self._settings.busy
 
-    def _configure(self, config: NodeConfig) -> None:
-        before, self._config = self._config, config
+    def _waits_for(self) -> str:
+        outputs = ', '.join(f'~/{name}' for name in OUTPUTS)
+        topics = ' and '.join(input_topics(self, self._config.input))
+        if self._config.use_imu:
+            topics += f', up from {self.resolve_topic_name(IMU_TOPIC)}'
+        return f'will subscribe to {topics} once somebody listens to one of {outputs}'
+
+    def _on_compiling(self, progress: str) -> None:
+        if progress:
+            self.get_logger().info(progress, throttle_duration_sec=2.0)
+        elif self._statistics.compiling:
+            self.get_logger().info('kernels are compiled')
+        self._statistics.compiling = progress
+
+    def _up_in(self, frame: str) -> NDArray | None:
+        gravity = self._gravity
+        return gravity.up(frame) if gravity else None
+
+    def _configure(self) -> None:
+        """Follow the configuration that has come into use."""
+        before, config = self._config, self._settings.in_use()
+        if config is None:
+            return
+        self._config = config
         restart = any(
             getattr(config, name) != getattr(before, name) for name in ('input', 'raw', 'use_imu')
         )
@@ -89,7 +116,7 @@ class SegmentPlanes(Node):
         listeners = sum(output.get_subscription_count() for output in self._outputs.values())
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses
-            self._input = DepthInput(self, config.input, config.raw, self._accept, losses)
+            self._input = DepthInput(self, config.input, config.raw, self._pipeline.put, losses)
             self._gravity = Gravity(self) if self._config.use_imu else None
             self._statistics.problem = ''
         elif not listeners and self._input:
@@ -101,68 +128,6 @@ class SegmentPlanes(Node):
                 subscribed.destroy()
         self._input = self._gravity = None
 
-    def _accept(self, frame: DepthFrame) -> None:
-        self._statistics.accepted(replaced=self._frames.put(frame))
-
-    def _work(self) -> None:
-        # What goes wrong here will again on the first frame, which is where it is reported.
-        with suppress(Exception):
-            self._sequence.warm_up()
-        while frame := self._frames.take():
-            try:
-                self._segment(frame)
-                self._statistics.problem = ''
-            except ValueError as error:
-                self._refuse(str(error))
-            # Whatever one frame does to the segmenter, the next one gets its chance.
-            except Exception as error:
-                if not self.context.ok():
-                    return  # publishing has ended
-                self._refuse(f'{type(error).__name__}: {error}')
-                self.get_logger().error(traceback.format_exc(), throttle_duration_sec=5.0)
-
-    def _segment(self, frame: DepthFrame) -> None:
-        doing = self._statistics.activity.now
-        doing('converting the message')
-        ticks = [time.perf_counter()]
-        start = self.get_clock().now().nanoseconds
-        header = frame.message.header
-        # Here and not where parameters change, so that one frame is of one configuration.
-        if (config := self._config) is not self._sequence.config:
-            self._sequence.config = config
-        image = corrected(frame.range_image(), config)
-        ticks.append(time.perf_counter())
-        doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
-        gravity = self._gravity
-        up = gravity.up(header.frame_id) if gravity else None
-        result = self._sequence.segment(image, Time.from_msg(header.stamp).nanoseconds, up)
-        ticks.append(time.perf_counter())
-        doing('publishing')
-        for name, output in OUTPUTS.items():
-            publisher = self._outputs[name]
-            if publisher.get_subscription_count():
-                publisher.publish(output.message(make_rclpy, header, image, result))
-        ticks.append(time.perf_counter())
-        conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(ticks))
-        self._statistics.times = FrameTimes(
-            transport=(frame.time - Time.from_msg(header.stamp).nanoseconds) / 1e6,
-            waiting=(start - frame.time) / 1e6,
-            conversion=conversion,
-            compute=compute,
-            publication=publication,
-            stages=result.timings,
-        )
-        self._statistics.planes = len(result.planes)
-        self._statistics.reason = result.reason
-        self._statistics.answered(self._statistics.published)
-        doing()
-
-    def _refuse(self, problem: str) -> None:
-        self._statistics.problem = problem
-        self._statistics.answered(self._statistics.refused)
-        self._statistics.activity.now()
-        self.get_logger().warning(f'frame refused: {problem}', throttle_duration_sec=5.0)
-
     def _look_around(self) -> None:
         """Once a second: follow the publishers, report."""
         if self._input:
@@ -171,6 +136,10 @@ class SegmentPlanes(Node):
                 self.get_logger().warning(f'{lost} (said once; see /diagnostics)', once=True)
         if self._gravity:
             self._gravity.follow_publishers()
+        if self._settings.pending:
+            self._statistics.pending = 'in preparation, those before serve'
+        else:
+            self._statistics.pending = ''
         name = self.get_fully_qualified_name().lstrip('/')
         status = self._statistics.status(name, self._input, self._config.stall_timeout)
         report = DiagnosticArray(status=[status])
@@ -178,19 +147,35 @@ class SegmentPlanes(Node):
         self._diagnostics.publish(report)
 
 
+def _refuse(error: Exception) -> NoReturn:
+    rclpy.try_shutdown()
+    # The place in rcl's own sources says nothing to users.
+    problem = str(error).split(', at ')[0]
+    if problem.startswith('['):
+        problem = f'unknown ROS arguments {problem}'
+    print(f'segment_planes: {problem}', file=sys.stderr)
+    sys.exit(2)
+
+
 def main() -> None:
-    """Run the node until it is told to stop; bad parameters end it with exit code 2."""
+    """Run the node until it is told to stop; bad arguments end it with one line, exit code 2."""
     # rclpy's own handler ends the spinning. Without this, Python's would raise KeyboardInterrupt
     # on top, wherever the code is, and again on every further Ctrl-C.
     signal.signal(signal.SIGINT, lambda number, stack: None)
-    rclpy.init()
     finished = True
     try:
+        check_arguments(sys.argv)
+        rclpy.init()
+    except (ConfigError, RuntimeError) as error:
+        _refuse(error)
+    try:
         node = SegmentPlanes()
-    except (ConfigError, ParameterException) as error:
-        print(f'segment_planes: {error}', file=sys.stderr)
-        rclpy.try_shutdown()
-        sys.exit(2)
+    except (ConfigError, ParameterException, *_BAD_NAMES) as error:
+        _refuse(error)
+    except Exception:
+        if rclpy.ok():
+            raise
+        return  # told to stop meanwhile
     # What the core warns of, such as a lens that is left out: once each.
     warnings.showwarning = lambda message, *where: node.get_logger().warning(str(message))
     try:

@@ -40,7 +40,8 @@ class NodeConfig(Config):
     )
     stall_timeout: float = option(
         2.0,
-        'seconds without a depth image, while somebody listens, that /diagnostics calls an error',
+        'seconds without a depth image while somebody listens, or with images and without an '
+        'output, that /diagnostics calls an error',
         low=0.1,
         high=3600.0,
     )

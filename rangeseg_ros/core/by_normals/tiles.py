@@ -8,14 +8,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.angles import UNIT, cell_of
-from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.by_normals.octahedral import UNIT, cell_of
 
 # Pixels across the tiles.
 TILE = 8
 # What quarters may save and yet be one piece, as a share of the prior of the edges between them.
-_SPLIT_GAIN_SHARE = 0.18
-_SPLIT_GAIN = np.float32(_SPLIT_GAIN_SHARE / UNIT)
+_KEEP = 0.18
+_SPLIT = np.float32(_KEEP / UNIT)
 
 
 class Tile(NamedTuple):
@@ -91,13 +90,13 @@ def load(
     i0: int,
     j0: int,
     cells: NDArray[np.int32],
-    grid: Grid,
+    horizontal: NDArray[np.floating],
+    vertical: NDArray[np.floating],
     smoothness: np.float32,
     tile: Tile,
 ) -> bool:
     """Fill in cells, links and what is free; whether anything is."""
     height, width = cells.shape
-    horizontal, vertical = grid
     cell, free, right, below = tile.cell, tile.free, tile.right, tile.below
     linked = False
     for a in range(TILE * TILE):
@@ -168,7 +167,7 @@ def _unite(parent: NDArray[np.int32], level: int, a: int, b: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def label_components(
+def vote(
     i0: int,
     j0: int,
     normals: NDArray[np.float32],
@@ -197,7 +196,7 @@ def label_components(
 
 
 @njit(cache=True, nogil=True)
-def mark_splits(table: NDArray[np.uint16], tile: Tile) -> None:
+def judge(table: NDArray[np.uint16], tile: Tile) -> None:
     """Tell which components fall into their parts."""
     cell, whole, first, number = tile.cell, tile.whole, tile.first, tile.number
     label, cost, parts, split = tile.label, tile.cost, tile.parts, tile.split
@@ -220,4 +219,4 @@ def mark_splits(table: NDArray[np.uint16], tile: Tile) -> None:
         for s in range(number[level]):
             p = first[level, s]
             more = cost[level, p] - parts[level, p]
-            split[level, p] |= more > _SPLIT_GAIN * tile.spared[level, p]
+            split[level, p] |= more > _SPLIT * tile.spared[level, p]

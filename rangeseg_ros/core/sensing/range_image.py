@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -42,14 +42,11 @@ class RangeImage:
         Inverse depth (pinhole) or inverse range (cloud), 1/m; 0 where nothing was measured.
     camera : Camera or None
         None for organised clouds.
-    corrected : bool
-        Whether the sensor's fixed distortion has been subtracted.
     """
 
     rays: NDArray[np.float32]
     inverse: NDArray[np.float32]
     camera: Camera | None = None
-    corrected: bool = False
 
     @classmethod
     def from_depth(
@@ -128,6 +125,8 @@ class RangeImage:
             distance = np.linalg.norm(cloud, axis=2)
         inverse = _reciprocal(distance, 1.0)
         rays = (cloud * inverse[..., None]).astype(np.float32)
+        # Like those of cameras, or every kernel that reads them is compiled twice.
+        rays.flags.writeable = False
         far = (inverse > 0) & (inverse < 1 / _FAR)
         if 2 * np.count_nonzero(far) > np.count_nonzero(inverse):
             warnings.warn(
@@ -149,7 +148,7 @@ class RangeImage:
         """
         noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
         with np.errstate(divide='ignore'):
-            return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
+            return RangeImage(self.rays, _reciprocal(1 / self.inverse + noise, 1.0), self.camera)
 
     @property
     def shape(self) -> tuple[int, int]:

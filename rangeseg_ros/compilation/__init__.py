@@ -1,0 +1,1 @@
+"""Kernels compiled ahead of the first frame, by several processes."""

@@ -1,0 +1,63 @@
+"""The pipeline on frames as small as it takes to run through all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.messages.outputs import OUTPUTS
+
+KINDS = ('image', 'points')
+"""Kinds of input whose kernels differ: depth images, and clouds."""
+
+CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
+
+
+def rehearse(config: Config, kinds: tuple[str, ...] = KINDS) -> None:
+    """Segment small frames of each of `kinds` as `config` says, and make every output of them."""
+    # The room has a few hundred pixels per plane.
+    config = replace(config, min_pixels=min(config.min_pixels, 50))
+    for kind in kinds:
+        sequence = SequenceSegmenter(config)
+        for number, image in enumerate(_frames(kind)):
+            result = sequence.segment(image, number)
+            for output in OUTPUTS.values():
+                output.message(_make, None, image, result)
+
+
+def _frames(kind: str) -> Iterator[RangeImage]:
+    # The second frame finds the planes of the first, the third has many that do not last.
+    for noise in (0.001, 0.001, 0.03):
+        image = RangeImage.from_depth(_room(noise), CAMERA)
+        yield image if kind == 'image' else RangeImage.from_points(image.points)
+
+
+def _room(noise: float) -> NDArray[np.uint16]:
+    """Depth (H, W), mm: walls and floor, a box and a ball before them, noise, holes."""
+    x, y = CAMERA.rays[..., 0], CAMERA.rays[..., 1]
+    depth = 2 / (1 + np.abs(x))
+    floor = np.where(y > 0.1, 0.6 / np.maximum(y, 0.1), np.inf)
+    depth = np.minimum(depth, floor)
+    depth[24:40, 8:24] = 1.0
+    ball = (x - 0.3) ** 2 + (y + 0.15) ** 2 < 0.03
+    depth[ball] = 1.2 + 2 * ((x - 0.3) ** 2 + (y + 0.15) ** 2)[ball]
+    depth = depth + noise * np.random.default_rng(0).normal(size=depth.shape) * depth**2
+    depth[:3, 10:20] = depth[30:34, 40:44] = 0
+    # A bar that parts the left wall without touching it.
+    depth[10:13, :28] = 0.7
+    millimetres: NDArray[np.uint16] = np.round(1000 * depth).astype(np.uint16)
+    return millimetres
+
+
+def _make(kind: str, **fields: Any) -> Any:
+    """A message of nothing but its fields."""
+    return SimpleNamespace(**fields)

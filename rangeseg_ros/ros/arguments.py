@@ -1,0 +1,105 @@
+"""The command line of the node: what nobody would take is refused in one line."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rclpy.node import Node
+from rclpy.utilities import remove_ros_args
+
+from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.ros.parameters import NodeConfig
+
+USAGE = """\
+Usage: segment_planes [--ros-args ROS_ARGUMENT...]
+
+Find the planes in depth images: the ROS 2 node. Some ROS arguments:
+
+  -r depth/image_rect:=TOPIC  the depth images; camera_info is taken from beside them
+  -p NAME:=VALUE              a parameter
+  --params-file FILE          parameters
+  -r __ns:=NAMESPACE          namespace of the node
+
+Parameters:
+"""
+
+# Of rclpy and of every node.
+_FOREIGN = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
+
+
+def check_arguments(arguments: list[str]) -> None:
+    """Refuse what is no ROS argument; print the help, and exit, when asked for it.
+
+    Raises
+    ------
+    ConfigError
+        An argument that the node does not know.
+    """
+    own = remove_ros_args(arguments)[1:]
+    if '-h' in own or '--help' in own:
+        print(USAGE + '\n'.join(_described()))
+        sys.exit(0)
+    if own:
+        raise ConfigError(
+            f'unknown argument {own[0]!r}; parameters are given as --ros-args -p NAME:=VALUE'
+        )
+
+
+def check_parameters(node: Node, arguments: list[str]) -> None:
+    """Refuse parameters that the node does not have, so that none is misspelt in silence.
+
+    Those of the wildcard section of a parameter file may be meant for other nodes: they are
+    warned of.
+
+    Raises
+    ------
+    ConfigError
+        A name that is not a parameter, and the one that it looks like.
+    """
+    known = {field.name for field in fields(NodeConfig)}
+    given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
+    unknown = sorted(set(given) - known)
+    shared = _shared(arguments)
+    for name in unknown:
+        similar = difflib.get_close_matches(name, known, n=1)
+        problem = f'unknown parameter {name!r}'
+        if similar:
+            problem += f'; is {similar[0]!r} meant?'
+        if name not in shared:
+            raise ConfigError(problem)
+        node.get_logger().warning(f'{problem} (of /**, ignored)')
+
+
+def _described() -> Iterable[str]:
+    for field in fields(NodeConfig):
+        yield f'  {field.name} (default {field.default!r}): {field.metadata["description"]}'
+
+
+def _shared(arguments: list[str]) -> set[str]:
+    """Names in the wildcard sections of the parameter files, but none given by itself."""
+    names: set[str] = set()
+    alone: set[str] = set()
+    for option, value in pairwise(arguments):
+        if option == '--params-file':
+            content = yaml.safe_load(Path(value).read_text())
+            for section, part in content.items() if isinstance(content, dict) else ():
+                if section == '/**' and isinstance(part, dict):
+                    names.update(_flat(part.get('ros__parameters') or {}))
+        elif option in ('-p', '--param'):
+            alone.add(value.partition(':=')[0].rpartition(':')[2])
+    return names - alone
+
+
+def _flat(parameters: Mapping[str, Any], prefix: str = '') -> Iterable[str]:
+    for name, value in parameters.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f'{prefix}{name}.')
+        else:
+            yield f'{prefix}{name}'

@@ -1,0 +1,105 @@
+"""Parameters that take effect once everything they need is compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import fields
+from threading import Condition, Thread
+
+from rangeseg_ros.compilation.preparation import needs, prepare
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.ros.latest import Latest
+from rangeseg_ros.ros.parameters import NodeConfig
+
+
+class Settings:
+    """The configuration in use: the newest one whose kernels are there.
+
+    Those that need no other kernels count at once. While others compile, the one before serves.
+
+    Parameters
+    ----------
+    config : NodeConfig
+        To start with.
+    report : callable
+        Gets how far a compilation is, and the empty string after the last.
+    changed : callable
+        Called after another one has come into use, by any thread.
+
+    Attributes
+    ----------
+    busy : bool
+        Whether something is being compiled or loaded.
+    """
+
+    def __init__(
+        self, config: NodeConfig, report: Callable[[str], None], changed: Callable[[], None]
+    ) -> None:
+        self._report = report
+        self._on_change = changed
+        self._in_use: NodeConfig | None = None
+        self._wanted = config
+        self._prepared: set[tuple[object, ...]] = set()
+        self._jobs: Latest[NodeConfig] = Latest()
+        self._closed = self.busy = False
+        self._came = Condition()
+        self._thread = Thread(target=self._work, name='compilation', daemon=True)
+        self._thread.start()
+        self.want(config)
+
+    @property
+    def wanted(self) -> NodeConfig:
+        """What was asked for last."""
+        return self._wanted
+
+    @property
+    def pending(self) -> bool:
+        """Whether what was asked for is not in use yet."""
+        return self._in_use is not self._wanted
+
+    def want(self, config: NodeConfig) -> None:
+        """Ask for another configuration."""
+        self._wanted = config
+        if needs(config) in self._prepared:
+            self._use(config)
+        else:
+            self._jobs.put(config)
+
+    def in_use(self) -> NodeConfig | None:
+        """The configuration for the next frame; waits for the first. None once closed."""
+        with self._came:
+            self._came.wait_for(lambda: self._closed or self._in_use is not None)
+            return None if self._closed else self._in_use
+
+    def close(self) -> None:
+        """Let those who wait go."""
+        with self._came:
+            self._closed = True
+            self._came.notify_all()
+        self._jobs.close()
+
+    def _use(self, config: NodeConfig) -> None:
+        with self._came:
+            self._in_use = config
+            self._came.notify_all()
+        self._on_change()
+
+    def _work(self) -> None:
+        while config := self._jobs.take():
+            kind = 'points' if config.input == 'points' else 'image'
+            self.busy = True
+            # What cannot be compiled will be reported by the frame that needs it.
+            try:
+                prepare(_of_core(config), (kind,), self._report)
+            except Exception as error:
+                self._report(f'not compiled ahead: {error}')
+            self._prepared.add(needs(config))
+            self._report('')
+            self.busy = False
+            if config is self._wanted:
+                self._use(config)
+
+
+def _of_core(config: NodeConfig) -> Config:
+    """Without what only the node knows, which the compiling processes need not import."""
+    return Config(**{field.name: getattr(config, field.name) for field in fields(Config)})

@@ -1,0 +1,24 @@
+"""Entry points of the executables: until they have a handler of their own, Ctrl-C just ends them.
+
+What they import takes a second or more, in which Python would answer with a traceback.
+"""
+
+import os
+import signal
+
+if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+    signal.signal(signal.SIGINT, lambda number, stack: os._exit(130))
+
+
+def rangeseg() -> None:
+    """Run the command line."""
+    from rangeseg_ros.cli.main import main
+
+    main()
+
+
+def segment_planes() -> None:
+    """Run the node."""
+    from rangeseg_ros.ros.node import main
+
+    main()

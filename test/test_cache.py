@@ -1,0 +1,111 @@
+"""Compiled kernels are kept where that is possible, and nothing fails where it is not."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rangeseg_ros.core.runtime import cache
+
+ROOT = Path(__file__).parents[1]
+
+# Nothing but the folder given may be written to, neither by us nor by numba, which both try with
+# a temporary file.
+RESTRICT = """
+import sys, tempfile
+allowed, real = sys.argv.pop(), tempfile.TemporaryFile
+
+def temporary_file(*arguments, dir=None, **options):
+    if not allowed or not str(dir).startswith(allowed):
+        raise PermissionError(13, 'Permission denied')
+    return real(*arguments, dir=dir, **options)
+
+tempfile.TemporaryFile = temporary_file
+tempfile.tempdir = allowed or '/proc'
+"""
+KERNEL = """
+import numpy as np
+from rangeseg_ros.core.sensing.moments import fit_all
+fit_all(np.zeros((1, 10)))
+"""
+
+
+def run_restricted(code, allowed='', **environment):
+    """Run Python where only one folder can be written to, or none."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ('NUMBA_CACHE_DIR', 'ROS_HOME')}
+    return subprocess.run(
+        [sys.executable, '-c', RESTRICT + code, os.fspath(allowed)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**inherited, 'HOME': '/proc/none', 'XDG_CACHE_HOME': '/proc/none', **environment},
+    )
+
+
+def test_without_a_home_kernels_are_kept_in_a_private_temporary_folder(tmp_path):
+    run = run_restricted(KERNEL, tmp_path)
+    assert (run.returncode, run.stderr) == (0, '')
+    (kept,) = tmp_path.iterdir()
+    assert kept.name == f'rangeseg_ros-{os.getuid()}'
+    assert kept.stat().st_mode & 0o777 == 0o700 and kept.stat().st_uid == os.getuid()
+    assert list(kept.rglob('*.nbi'))
+
+
+@pytest.mark.parametrize(
+    'variable, folder',
+    [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros'), ('ROS_HOME', 'rangeseg_ros')],
+)
+def test_folders_that_the_user_names_come_first(tmp_path, variable, folder):
+    named = tmp_path / 'named'
+    run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
+    assert (run.returncode, run.stderr) == (0, '')
+    assert list((named / folder).rglob('*.nbi'))
+
+
+def test_where_nothing_can_be_written_it_works_with_a_warning():
+    run = run_restricted(KERNEL)
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count('CacheWarning') == 1 and 'NUMBA_CACHE_DIR' in run.stderr
+
+
+def test_help_needs_no_place_to_write_to():
+    code = "sys.argv[1:] = ['--help']\nfrom rangeseg_ros.start import rangeseg; rangeseg()"
+    run = run_restricted(code)
+    assert (run.returncode, run.stderr) == (0, '') and 'Commands' in run.stdout
+
+
+def test_import_and_help_load_no_kernel():
+    code = (
+        'import sys, rangeseg_ros\n'
+        "assert 'numba' not in sys.modules\n"
+        'assert set(rangeseg_ros.__all__) <= set(dir(rangeseg_ros)) | set(rangeseg_ros.__all__)\n'
+        'for name in rangeseg_ros.__all__: getattr(rangeseg_ros, name)\n'
+    )
+    subprocess.run([sys.executable, '-c', code], check=True, cwd=ROOT)
+
+
+def test_temporary_folders_that_others_could_write_to_are_not_used(tmp_path):
+    assert cache._private(tmp_path / 'new')
+    (tmp_path / 'open').mkdir()
+    (tmp_path / 'open').chmod(0o777)
+    (tmp_path / 'link').symlink_to(tmp_path / 'new')
+    (tmp_path / 'file').touch()
+    for name in ('open', 'link', 'file'):
+        assert not cache._private(tmp_path / name)
+
+
+def test_what_was_compiled_into_the_package_is_taken_along(tmp_path, monkeypatch):
+    from numba.core.caching import _CacheLocator
+
+    compiled = tmp_path / 'package/core/__pycache__/grid.f-1.py311.nbi'
+    compiled.parent.mkdir(parents=True)
+    compiled.write_bytes(b'index')
+    monkeypatch.setattr(cache, 'PACKAGE', tmp_path / 'package')
+    folder = tmp_path / 'cache'
+    folder.mkdir()
+    for _ in range(2):
+        cache._copy_compiled(folder)
+    subfolder = _CacheLocator.get_suitable_cache_subpath(compiled.parents[1] / 'grid.py')
+    assert [p.relative_to(folder) for p in folder.rglob('*.*')] == [Path(subfolder, compiled.name)]
