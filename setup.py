@@ -61,10 +61,12 @@ setup(
         'numba>=0.58.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
+        'pillow>=9.4',
         'PyMaxflow>=1.3',
         'PyYAML>=5.4',
         'rosbags>=0.11',
         'scipy>=1.11',
+        'shapely>=2.0',
         'tqdm>=4.60',
     ],
     extras_require={

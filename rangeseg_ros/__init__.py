@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.segmenter import Segmentation, Segmenter
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+    from rangeseg_ros.io.distortion import corrected
     from rangeseg_ros.messages.clouds import planes_from_message
 
 __version__ = '0.1.0'
@@ -26,6 +27,7 @@ __all__ = [
     'Segmentation',
     'Segmenter',
     '__version__',
+    'corrected',
     'planes_from_message',
 ]
 
@@ -37,6 +39,7 @@ _HOMES = {
     'core.segmenter': ('Segmentation', 'Segmenter'),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
+    'io.distortion': ('corrected',),
     'messages.clouds': ('planes_from_message',),
 }
 

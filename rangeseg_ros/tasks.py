@@ -80,7 +80,7 @@ def run_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R]:
 
 
 def _begin() -> None:
-    """Make a process one of many: a thread of its own, interrupted by its parent only."""
+    """Set up a worker process: one OpenCV thread; interrupts are its parent's to handle."""
     cv2.setNumThreads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 

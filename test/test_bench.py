@@ -13,6 +13,8 @@ from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def frames(tmp_path):

@@ -16,7 +16,8 @@ def test_every_default_lies_in_its_range_and_every_parameter_is_described():
     Config()
     for f in FIELDS.values():
         assert len(f.metadata['description']) > 5
-        assert f.metadata['choices'] or f.metadata['low'] is not None or f.type == 'bool'
+        free = f.type in ('bool', 'str')  # or the name of a frame or a file
+        assert f.metadata['choices'] or f.metadata['low'] is not None or free
 
 
 def test_mapping_gives_what_the_constructor_gives():
@@ -67,3 +68,12 @@ def test_any_mapping_gives_a_valid_config_or_a_config_error(mapping):
         value, low = getattr(config, name), f.metadata['low']
         assert type(value) is type(f.default)
         assert low is None or low <= value <= f.metadata['high']
+
+
+def test_former_names_are_taken_with_a_warning():
+    with pytest.warns(FutureWarning, match='track_memory is called track_time now: track_time: 2'):
+        assert Config.from_mapping({'track_memory': 60}).track_time == 2.0
+    with pytest.warns(FutureWarning), pytest.raises(ConfigError, match='track_time'):
+        Config.from_mapping({'track_memory': 'long'})
+    with pytest.warns(FutureWarning):
+        assert Config.from_mapping({'track_memory': 60, 'track_time': 1}).track_time == 1.0

@@ -12,6 +12,8 @@ from replays import record_walls, replay, results
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.tasks import run_on_cluster
 
+pytestmark = pytest.mark.slow
+
 COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 
 

@@ -210,6 +210,7 @@ def test_measurement_survives_json(simulated):
     assert copy.overlap.pairs.shape == measurement.overlap.pairs.shape
 
 
+@pytest.mark.slow
 def test_processes_agree_and_keep_the_order(simulated):
     tasks = [Task(case, Config(method='normals')) for case in find_cases(simulated)]
     alone, pooled = list(run_all(tasks, 1)), list(run_all(tasks, 2))
@@ -288,6 +289,7 @@ def test_unknown_layout(tmp_path, evaluate):
     refuse(evaluate(folder), folder, 'known layout')
 
 
+@pytest.mark.slow
 def test_failure_in_a_process_is_one_line(simulated, evaluate):
     (simulated / 'depth' / '000002.png').write_bytes(b'no image')
     refuse(evaluate(simulated, '--jobs', '2'), '000002.png', 'not a readable image')

@@ -122,6 +122,7 @@ def statistics():
 
 # The range spanned by the four raw sensors (7-Scenes, TUM, 3DMatch, PCL), where there is one;
 # else the fit for such a region and its stated scatter of x1.5.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('name', 'low', 'high'),
     [
@@ -238,6 +239,7 @@ def six_pixel_differences(depth, labels, camera):
     return spreads
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not ANNOTATED.exists(), reason='no annotated frames')
 def test_short_differences_are_like_those_of_real_frames():
     real, simulated = [], []

@@ -8,6 +8,7 @@ from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import RangeImage, Segmentation, planes_from_message
+from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.clouds import planes_message
@@ -37,8 +38,7 @@ def plane(label, hull=SQUARE, holes=()):
         extents=np.array([2.0, 1.5]),
         centre=np.array([0.0, 0.25, 2.0]),
         orientation=np.array([1.0, 0.0, 0.0, 0.0]),
-        hull=np.array(hull, float).reshape(-1, 3),
-        holes=[np.array(hole, float) for hole in holes],
+        outline=MapOutline([[np.array(ring, float).reshape(-1, 3) for ring in (hull, *holes)]]),
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 CAMERA = Camera(40, 30, 50.0, 55.0, 19.0, 15.5)
@@ -80,7 +81,7 @@ def test_tangents_do_not_cross_disconnected_edges():
     horizontal, vertical = np.ones((30, 39), np.float32), np.ones((29, 40), np.float32)
     horizontal[12, 20] = 0  # between the pixels 20 and 21 of row 12
     config = Config(method='normals', normal_baseline=3)
-    found = np.isfinite(observed_normals(image, horizontal, vertical, config)[..., 0])
+    found = np.isfinite(observed_normals(image, Grid(horizontal, vertical), config)[..., 0])
     row = found[12, 3:-3]
     assert list(np.flatnonzero(~row) + 3) == [18, 19, 20, 21, 22, 23]
     assert found[11, 3:-3].all() and found[13, 3:-3].all()

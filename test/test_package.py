@@ -41,7 +41,7 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         element.text.removeprefix('python3-').removesuffix('-pip').lower()
         for element in package.iter('exec_depend')
     }
-    aliases = {'pyyaml': 'yaml', 'opencv-python-headless': 'opencv'}
+    aliases = {'pyyaml': 'yaml', 'pillow': 'pil', 'opencv-python-headless': 'opencv'}
     for requirement in setup_arguments['install_requires']:
         name = re.match(r'[\w-]+', requirement)[0].lower()
         assert aliases.get(name, name) in keys | set(wheel_only.lower().split())

@@ -13,7 +13,8 @@ from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, ene
 from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut import expansion
-from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -115,7 +116,7 @@ def test_links_are_the_weights_on_all_four_sides(shape):
     random = np.random.default_rng(sum(shape))
     horizontal = random.random((shape[0], shape[1] - 1)).astype(np.float32)
     vertical = random.random((shape[0] - 1, shape[1])).astype(np.float32)
-    links = expansion.grid_links(horizontal, vertical, 3.0)
+    links = link_costs(Grid(horizontal, vertical), 3.0)
     expected = np.zeros((4, *shape))
     expected[0, :, :-1] = expected[2, :, 1:] = 3 * horizontal
     expected[1, :-1] = expected[3, 1:] = 3 * vertical

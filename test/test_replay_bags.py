@@ -17,6 +17,7 @@ from rosbags import rosbag2
 from rangeseg_ros.batch.replay import Replay, segmented
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.bags import BagError, DepthBag
 from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.messages.clouds import planes_from_message
@@ -83,7 +84,7 @@ def test_messages_are_those_of_the_node(done):
     written = [data for *_, data in read(done / 'plain/bag')]
     published = []
     with DepthBag(done / 'recording') as source:
-        for frame, image, result in segmented(source, Config()):
+        for frame, image, result in segmented(source, SequenceSegmenter(Config())):
             sec, nanosec = divmod(frame.stamp, 10**9)
             stamp = make_rclpy('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
             header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id='optical')
@@ -214,6 +215,7 @@ def test_a_killed_replay_is_started_again(done, tmp_path):
     assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_results(tmp_path, monkeypatch):
     for name in ('a', 'b'):
         replay(record_walls(tmp_path / name, 2), tmp_path / 'local' / name)

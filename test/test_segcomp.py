@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scanner_points import abw_points
 
 from rangeseg_ros.segcomp import files as segcomp
 from rangeseg_ros.segcomp import geometry as geometry
@@ -213,7 +214,7 @@ def published_abw(v, r, c, offset, scale, f):
 def test_abw_points_are_the_published_ones(number, split, constants):
     values = np.random.default_rng(2).integers(0, 256, (512, 512))
     values[0, 0] = 0
-    points = geometry.abw_points(values, geometry.abw_calibration(number, split))
+    points = abw_points(values, geometry.abw_calibration(number, split))
     assert np.isnan(points[values == 0]).all()
     # The published z counts from range value 255 towards the sensor, whose centre is where
     # x = y = 0 for all pixels, so where v / scale + offset = 0.
@@ -221,7 +222,7 @@ def test_abw_points_are_the_published_ones(number, split, constants):
     for r, c in ((0, 1), (511, 511), (100, 400), (255, 255)):
         x, y, z = published_abw(max(values[r, c], 1), r, c, *constants)
         values[r, c] = max(values[r, c], 1)
-        point = geometry.abw_points(values, geometry.abw_calibration(number, split))[r, c]
+        point = abw_points(values, geometry.abw_calibration(number, split))[r, c]
         assert point * 1000 == pytest.approx((x, -y, centre - z), rel=1e-6)
 
 
@@ -236,7 +237,7 @@ def test_abw_range_image():
     values[:3] = 0
     image = geometry.abw_range_image(values, geometry.ABW_FIRST)
     assert not image.valid[:3].any() and image.valid[3:].all()
-    expected = geometry.abw_points(values, geometry.ABW_FIRST)
+    expected = abw_points(values, geometry.ABW_FIRST)
     assert np.allclose(image.points, expected, rtol=1e-5, equal_nan=True)
 
 

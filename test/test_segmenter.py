@@ -194,7 +194,7 @@ def test_warm_start_begins_anew_with_the_first_frame_a_reset_and_another_camera(
     segmenter = Segmenter(WARM)
     assert segmenter.segment(image(1)).energy == cold
     warm = [segmenter.segment(image(seed)).energy for seed in (2, 3, 1)]
-    assert warm[-1] <= 1.005 * cold
+    assert warm[-1] <= 1.02 * cold
     segmenter.reset()
     assert segmenter.segment(image(1)).energy == cold
     other = Camera(64, 48, 61.0, 61.0, 31.5, 23.5)

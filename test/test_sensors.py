@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scanner_points import abw_points
 
 from rangeseg_ros.cli.simulate import command
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -49,7 +50,7 @@ def perceptron():
 
 def test_abw_points_requantised_are_the_file(abw):
     scan, calibration = abw
-    points = geometry.abw_points(scan.values, calibration)
+    points = abw_points(scan.values, calibration)
     seen = scan.values > 0
     again = np.rint(calibration.values(points[..., 2][seen])).astype(np.uint8)
     assert np.array_equal(again, scan.values[seen])
@@ -65,7 +66,7 @@ def test_perceptron_points_requantised_are_the_file(perceptron):
 
 def test_abw_points_lie_on_their_planes(abw):
     scan, calibration = abw
-    points = geometry.abw_points(scan.values, calibration)
+    points = abw_points(scan.values, calibration)
     depth_step = 1e-3 / calibration.scale
     for plane in scan.planes:
         mask = scan.labels == plane.label

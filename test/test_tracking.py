@@ -79,7 +79,7 @@ def test_the_rest_of_a_plane_is_as_it_was():
 
 @pytest.mark.parametrize(('hidden', 'same'), [(5, True), (6, False)])
 def test_memory_is_exact(hidden, same):
-    tracker = Tracker(Config(track_memory=5))
+    tracker = Tracker(Config(track_time=5.5 / 30))
     whole = frame(*stay(), (*MIDDLE, BOX))
     assert ids(tracker, whole) == [1, 2, 3, 4]
     for _ in range(hidden):
@@ -223,12 +223,25 @@ def test_a_sliver_does_not_give_its_id_to_what_swallows_it():
     assert ids(tracker, frame((slice(0, 80), slice(0, 160), WALL), floor)) == [3, 2]
 
 
-def test_a_jump_back_in_time_begins_anew_without_reusing_ids():
+def test_a_reset_begins_anew_without_reusing_ids():
     tracker = Tracker()
-    assert ids(tracker, frame(*stay()), 100) == [1, 2, 3]
-    assert ids(tracker, frame(*stay()), 100) == [1, 2, 3]
-    assert ids(tracker, frame(*stay()), 99) == [4, 5, 6]
-    assert ids(tracker, frame(*stay()), 150) == [4, 5, 6]
+    assert ids(tracker, frame(*stay())) == [1, 2, 3]
+    tracker.reset()
+    assert ids(tracker, frame(*stay())) == [4, 5, 6]
+    assert ids(tracker, frame(*stay())) == [4, 5, 6]
+
+
+@pytest.mark.parametrize('rate', [2, 30, 120])
+def test_memory_is_of_seconds_at_any_rate(rate):
+    for hidden, same in ((0.9, True), (1.1, False)):
+        tracker, stamp = Tracker(Config(track_time=1.0)), 10**9
+        box = (*MIDDLE, BOX)
+        assert ids(tracker, frame(*stay(), box), stamp) == [1, 2, 3, 4]
+        for k in range(1, round(hidden * rate) + 1):
+            assert ids(tracker, frame(*stay()), stamp + k * 10**9 // rate) == [1, 2, 3]
+        stamp += round((hidden + 0.02) * 1e9) + 10**9 // rate
+        if rate > 2:
+            assert ids(tracker, frame(*stay(), box), stamp) == [1, 2, 3, 4 if same else 5]
 
 
 def test_another_image_size_begins_anew():
@@ -257,22 +270,24 @@ REGION = st.tuples(
 
 
 @settings(max_examples=40, deadline=None)
-@given(st.lists(st.tuples(st.integers(0, 3), st.lists(REGION, max_size=6)), max_size=8))
-def test_whatever_comes_ids_are_unique_new_after_a_jump_and_the_same_again(sequence):
+@given(st.lists(st.tuples(st.booleans(), st.lists(REGION, max_size=6)), max_size=8))
+def test_whatever_comes_ids_are_unique_new_after_a_reset_and_the_same_again(sequence):
     frames = [
-        (stamp, frame(*((slice(i, i + h), slice(j, j + w), p) for i, j, h, w, p in regions)))
-        for stamp, regions in sequence
+        (reset, frame(*((slice(i, i + h), slice(j, j + w), p) for i, j, h, w, p in regions)))
+        for reset, regions in sequence
     ]
-    tracker, again = (Tracker(Config(track_memory=2)) for _ in range(2))
-    used, last = set(), 0
-    for stamp, found in frames:
-        now = ids(tracker, found, stamp)
-        assert now == ids(again, found, stamp)
+    tracker, again = (Tracker(Config(track_time=2.5 / 30)) for _ in range(2))
+    used = set()
+    for reset, found in frames:
+        if reset:
+            tracker.reset()
+            again.reset()
+        now = ids(tracker, found)
+        assert now == ids(again, found)
         assert len(set(now)) == len(now)
-        if stamp < last:
+        if reset:
             assert not used & set(now)
         used |= set(now)
-        last = stamp
     assert used == set(range(1, len(used) + 1))
 
 
@@ -285,7 +300,7 @@ def test_simulated_rooms_keep_their_ids(seed):
     for k in range(0, 60, 2):  # every other frame, so twice the speed
         view = simulate_kinect(scene, camera, frame=k, noise='measured')
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
-        tracked = tracker.track(view.labels, planes, k)
+        tracked = tracker.track(view.labels, planes, 10**9 + k * 10**9 // 30)
         faces = {plane.label: plane.face for plane in view.planes}
         found = {plane.label: plane.id for plane in tracked}
         frames.append(ids_of_faces(view.labels, found, view.labels, faces, 100))

@@ -136,6 +136,7 @@ def normalised_square(camera, sensor, errors, quantum=0.0):
     return np.mean(squares)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', ['white', 'correlated', 'systematic', 'all'])
 @pytest.mark.parametrize(
     ('view', 'scale'), [((400, 100, 16, 16), SMALL), ((200, 150, 100, 80), 0.3)]
@@ -149,6 +150,7 @@ def test_covariance_tells_the_errors(kind, view, scale):
     assert value == pytest.approx(1, abs=0.2)
 
 
+@pytest.mark.slow
 def test_covariance_tells_the_errors_of_the_simulated_kinect():
     camera, random = part(200, 150, 100, 80), np.random.default_rng(4)
     value = normalised_square(

@@ -7,20 +7,25 @@ import re
 import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
+from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
+from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.io.meshes import write_mesh
+from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -48,6 +53,10 @@ class Outcome:
         Why the recording was not read to its end; empty when it was.
     found_done : bool
         The results were there already.
+    mapped : int
+        Number of planes in the map.
+    unlocated : dict
+        Why frames do not count for the map -> number of these frames.
     """
 
     frames: int
@@ -55,6 +64,8 @@ class Outcome:
     figures: dict[str, float]
     damage: str = ''
     found_done: bool = False
+    mapped: int = 0
+    unlocated: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -121,12 +132,15 @@ class Replay:
             ExitStack() as stack,
         ):
             report = ReplayReport(str(self.recording.name), self.config)
+            sequence = SequenceSegmenter(self.config)
+            located = stack.enter_context(Locator(self.recording, self.config))
             damage: list[str] = []
             frames = progress(source, len(source)) if progress else source
 
             def results() -> Iterator[Timed]:
                 try:
-                    for index, (frame, image, result) in enumerate(segmented(frames, self.config)):
+                    timed = segmented(frames, sequence, located.pose)
+                    for index, (frame, image, result) in enumerate(timed):
                         stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                         stem = f'{index:06d}_{stamp}'
                         files = write_frame(self.folder, stem, image, result, PICTURES)
@@ -141,8 +155,18 @@ class Replay:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
+            planes = sequence.map.planes
+            if self.config.fixed_frame:
+                write_map(self.folder / 'map.csv', planes)
+                shades = colours([plane.id for plane in planes])
+                write_mesh(self.folder / 'map.ply', planes, shades)
             outcome = Outcome(
-                report.frames, dict(report.reasons), report.figures(), ''.join(damage)
+                report.frames,
+                dict(report.reasons),
+                report.figures(),
+                ''.join(damage),
+                mapped=len(planes),
+                unlocated=dict(located.problems),
             )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
@@ -155,7 +179,8 @@ class Replay:
     def _clear(self) -> None:
         """Remove what other or interrupted runs have left."""
         endings = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
-        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|planes\.csv|report\.html')
+        whole = r'planes\.csv|map\.(csv|ply)|report\.html'
+        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|{whole}')
         partial = re.compile(rf'\.\d+\.({own.pattern}|{BAG})')
         shutil.rmtree(self.folder / BAG, ignore_errors=True)
         for path in self.folder.glob('*'):
@@ -169,6 +194,8 @@ class Replay:
         digest = hashlib.sha256(code_digest())
         settings = replace(self, recording=Path(), folder=Path())
         digest.update(repr(settings).encode())
+        if self.config.distortion_map:
+            digest.update(Path(self.config.distortion_map).read_bytes())
         parts = self.recording.iterdir() if self.recording.is_dir() else [self.recording]
         for path in sorted(parts):
             state = path.stat()
@@ -177,12 +204,13 @@ class Replay:
 
 
 def segmented(
-    frames: Iterable[DepthFrame], config: Config
+    frames: Iterable[DepthFrame],
+    sequence: SequenceSegmenter,
+    pose: Callable[[DepthFrame], Transform | None] = lambda frame: None,
 ) -> Iterator[tuple[DepthFrame, RangeImage, Segmentation]]:
-    """Segment the frames of a recording, with persistent ids and roles."""
+    """Segment the frames of a recording, with persistent ids and roles; `pose` locates them."""
     # Or the times of the first frame would be those of the compiler.
-    prepare(config, ('image',), report=lambda progress: None)
-    sequence = SequenceSegmenter(config)
+    prepare(sequence.config, ('image',), report=lambda progress: None)
     for frame in frames:
-        image = frame.range_image()
-        yield frame, image, sequence.segment(image, frame.stamp)
+        image = corrected(frame.range_image(), sequence.config)
+        yield frame, image, sequence.segment(image, frame.stamp, pose=pose(frame))

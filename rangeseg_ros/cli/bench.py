@@ -97,7 +97,7 @@ def command(
             frames = benchmark.Frames(depth, read_camera(camera_file), depth_scale)
         else:
             frames = _simulated(Path(folder), VGA, scenes)
-        figures = benchmark.measured(frames, config, rounds, progress)
+        figures = benchmark.measure(frames, config, rounds, progress)
         if exact:
             figures['energy_ratio'] = benchmark.energy_ratio(frames, config, cache, progress)
         click.echo(_title(figures))
@@ -126,7 +126,7 @@ def _series(
         figures = vga
         if size != VGA:
             frames = _simulated(folder, size, scenes)
-            figures = benchmark.measured(frames, config, rounds)
+            figures = benchmark.measure(frames, config, rounds)
         ratio = figures['total']['median_ms'] / vga['total']['median_ms']
         series[f'{size[0]}x{size[1]}'] = {**figures, 'ratio': ratio}
     return series

@@ -8,7 +8,7 @@ import click
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli import tolerances as measures
-from rangeseg_ros.evaluation.figures import Compared, compared, table
+from rangeseg_ros.evaluation.figures import Compared, comparison_figures, table
 from rangeseg_ros.evaluation.label_files import (
     as_truth,
     pair_files,
@@ -60,7 +60,7 @@ def command(
             raise ComparisonError(f'{labels_file}: {error}') from None
         angles, normals = read_angles_beside(truth_file), read_normals_beside(labels_file)
         images[name] = Compared(overlap, angles, normals)
-    figures = compared(images, tolerances)
+    figures = comparison_figures(images, tolerances)
     click.echo(table(figures))
     if json_file:
         measures.write_json(json_file, figures)

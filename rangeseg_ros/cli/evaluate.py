@@ -9,7 +9,7 @@ import click
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.datasets import find_cases
-from rangeseg_ros.evaluation.figures import evaluated, table
+from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.report.evaluation import write_evaluation
@@ -71,7 +71,7 @@ def command(
         raise click.ClickException(f'{folder}: no {split} images')
     tasks = [Task(case, config, output=output) for case in cases]
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
-    figures = evaluated(found, tolerances)
+    figures = evaluation_figures(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')
     click.echo(table(figures))
     if output:

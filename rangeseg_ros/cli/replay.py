@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,12 @@ from rangeseg_ros.tasks import run_all, run_on_cluster
     help='Run on the workers of this Dask cluster, e.g. tcp://host:8786; needs the extra dask. '
     'The workers see BAGs and output under the same names.',
 )
+@click.option(
+    '--fixed-frame',
+    metavar='FRAME',
+    help='Frame in which planes stay put, such as odom: writes the map of planes in it, where '
+    'the recording has tf.  [default: that of the parameters]',
+)
 @options.params
 @options.exact
 @click.pass_context
@@ -61,6 +67,7 @@ def command(
     copy: bool,
     jobs: int | None,
     scheduler: str | None,
+    fixed_frame: str | None,
     params_file: Path | None,
     exact: bool,
 ) -> None:
@@ -72,6 +79,7 @@ def command(
       <frame>_<stamp>_overlay.png   planes in colour
       planes.csv                    a row for each plane and frame
       bag                           what the node would publish (mcap)
+      map.csv, map.ply              the map of planes: a row each, and a mesh
       report.html                   pictures, planes over time, times
 
     Several recordings have index.html beside their folders, which leads to their reports.
@@ -79,6 +87,8 @@ def command(
     one is read up to the damage, and the exit code is 1.
     """
     config = options.read_parameters(params_file, exact)
+    if fixed_frame is not None:
+        config = replace(config, fixed_frame=fixed_frame)
     folders = _folders(bags, output)
     if scheduler:
         # The workers have working directories of their own.
@@ -132,7 +142,10 @@ def _row(task: Replay, outcome: Outcome) -> dict[str, Any]:
 def _report(task: Replay, outcome: Outcome) -> None:
     for reason, count in outcome.reasons.items():
         click.echo(f'{count} frames without a plane: {reason}')
+    for problem, count in outcome.unlocated.items():
+        click.echo(f'{count} frames not in the map: {problem}')
+    mapped = f', {outcome.mapped} planes in the map' if task.config.fixed_frame else ''
     already = ', done before' if outcome.found_done else ''
-    click.echo(f'{task.folder}: {outcome.frames} frames{already}')
+    click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')
     if outcome.damage:
         click.echo(f'rangeseg: {outcome.damage}', err=True)

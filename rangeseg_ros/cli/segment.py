@@ -11,9 +11,11 @@ import click
 from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.images import read_depth
 
 
@@ -60,7 +62,8 @@ def command(
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path), camera, depth_scale)
-        except RangeImageError as error:
+            image = corrected(image, segmenter.config)
+        except (RangeImageError, DistortionError) as error:
             raise click.ClickException(f'{path}: {error}') from None
         result = segmenter.segment(image)
         result = replace(result, planes=with_roles(result.planes, segmenter.config))

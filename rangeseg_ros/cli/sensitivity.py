@@ -10,13 +10,7 @@ import click
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.plots import write_csv
-from rangeseg_ros.evaluation.sensitivity import (
-    TOLERATED_LOSS,
-    Constant,
-    Trial,
-    find_constants,
-    ranges,
-)
+from rangeseg_ros.evaluation.sensitivity import Constant, Trial, find_constants, ranges
 from rangeseg_ros.tasks import run_all
 
 
@@ -85,8 +79,8 @@ def command(
     write_csv(output / 'sensitivity.csv', rows)
     for row in rows:
         click.echo(
-            f'{row["constant"]}: {row["low"]:g} to {row["high"]:g} times {row["value"]} costs at '
-            f'most {TOLERATED_LOSS}; beyond, up to {row["loss"]:.4f} ({row["set"]})'
+            f'{row["constant"]}: {row["low"]:g} to {row["high"]:g} times {row["value"]}; '
+            f'at worst {row["loss"]:.4f} less ({row["set"]})'
         )
 
 

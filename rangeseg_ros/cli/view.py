@@ -13,6 +13,7 @@ from rangeseg_ros.batch.replay import segmented
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.files import replacing
@@ -56,7 +57,7 @@ def command(
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)
         frames = options.progress(source, len(source), 'frame')
         count = 0
-        for frame, image, result in segmented(frames, config):
+        for frame, image, result in segmented(frames, SequenceSegmenter(config)):
             log.set_time('frame', sequence=count)
             log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
             _log_frame(rerun, log, image, result)

@@ -38,7 +38,9 @@ def _frames(kind: str) -> Iterator[RangeImage]:
     # The second frame finds the planes of the first, the third has many that do not last.
     for noise in (0.001, 0.001, 0.03):
         image = RangeImage.from_depth(_room(noise), CAMERA)
-        yield image if kind == 'image' else RangeImage.from_points(image.points)
+        image = image if kind == 'image' else RangeImage.from_points(image.points)
+        # Maps of distortion are for images of another size.
+        yield replace(image, corrected=True)
 
 
 def _room(noise: float) -> NDArray[np.uint16]:

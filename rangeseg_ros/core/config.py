@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -190,11 +191,17 @@ class Config:
         low=0.0,
         high=10.0,
     )
-    track_memory: int = option(
-        90,
-        'frames that a plane may be out of sight, or go unnoticed, and keep its id',
-        low=0,
-        high=100000,
+    # What is known of one sensor: its fixed distortion.
+    distortion_map: str = option(
+        '',
+        'file of the fixed distortion of the sensor, as rangeseg calibrate writes it; subtracted '
+        'from the inverse depth before anything else, so that distortion is what remains',
+    )
+    track_time: float = option(
+        3.0,
+        'seconds that a plane may be out of sight, or go unnoticed, and keep its id',
+        low=0.0,
+        high=100000.0,
     )
     up_x: float = option(0.0, 'up in the frame of the image, x', low=-1000.0, high=1000.0)
     up_y: float = option(
@@ -222,6 +229,34 @@ class Config:
         low=0.0,
         high=1000.0,
     )
+    # The world: frames, the map of planes.
+    fixed_frame: str = option(
+        '',
+        'frame in which planes stay put, like odom or map: the map of planes is in it, and ids '
+        'follow the motion that tf tells; without a name there is no map',
+    )
+    tf_timeout: float = option(
+        0.1, 'seconds that an image waits for its transforms', low=0.0, high=60.0
+    )
+    pose_noise: float = option(
+        0.005,
+        'standard deviation of the place of the camera in the fixed frame, metres, for each axis',
+        low=0.0,
+        high=10.0,
+    )
+    pose_turn_noise: float = option(
+        0.3,
+        'standard deviation of the direction of the camera in the fixed frame, degrees, about '
+        'each axis',
+        low=0.0,
+        high=45.0,
+    )
+    map_resolution: float = option(
+        0.03,
+        'smallest detail of outlines in the map of planes, metres',
+        low=0.001,
+        high=10.0,
+    )
     seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
     def __post_init__(self) -> None:
@@ -233,6 +268,8 @@ class Config:
             raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.warm_start and (self.method != 'normals' or self.exact):
             raise ConfigError('parameter warm_start is for method normals, without exact')
+        if self.moves == 'swap' and not (self.exact and self.method == 'normals'):
+            raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.up_x == self.up_y == self.up_z == 0:
             raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
 
@@ -244,7 +281,13 @@ class Config:
         ------
         ConfigError
             An unknown name, or a value that the named parameter does not take.
+
+        Warns
+        -----
+        FutureWarning
+            A parameter has another name now; its value is converted.
         """
+        mapping = _renamed(mapping)
         known = {option_field.name for option_field in fields(cls)}
         for name in mapping:
             if name not in known:
@@ -270,6 +313,31 @@ def check_directions(distribution: str, count: int) -> None:
             'parameter direction_count: regular angles give an odd square (1, 9, 25 ... 1225) of '
             f'directions, not {count}'
         )
+
+
+def _frames_in_seconds(frames: object) -> object:
+    """Seconds of a number of frames at 30 Hz."""
+    return frames / 30 if isinstance(frames, int | float) else frames
+
+
+# Former names of parameters, their names now, and what becomes of their values.
+RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    'track_memory': ('track_time', _frames_in_seconds),
+}
+
+
+def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
+    """Names and values of parameters as they are called now."""
+    result = {name: value for name, value in mapping.items() if name not in RENAMED}
+    for former, (name, convert) in RENAMED.items():
+        if former in mapping:
+            result.setdefault(name, convert(mapping[former]))
+            warnings.warn(
+                f'parameter {former} is called {name} now: {name}: {result[name]!r}',
+                FutureWarning,
+                stacklevel=3,
+            )
+    return result
 
 
 def _checked(option_field: Any, value: Any) -> Any:

@@ -20,7 +20,7 @@ from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.jump_edges import GridEdges, jump_edges, pixels_beside
-from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
@@ -126,8 +126,18 @@ class Segmenter:
         self._before: tuple[Camera | None, NDArray[np.integer]] | None = None
 
     def segment(self, image: RangeImage) -> Segmentation:
-        """Label every pixel of `image` with the plane it belongs to."""
+        """Label every pixel of `image` with the plane it belongs to.
+
+        Raises
+        ------
+        RangeImageError
+            There is a `distortion_map`, and nobody has subtracted it: the core reads no files.
+        """
         config, watch = self.config, Stopwatch()
+        if config.distortion_map and not image.corrected:
+            raise RangeImageError(
+                'distortion_map is not subtracted yet: segment corrected(image, config)'
+            )
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
         jumps = jump_edges(image, config)

@@ -9,6 +9,8 @@ from numpy.typing import ArrayLike
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.roles import roles
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -17,6 +19,11 @@ from rangeseg_ros.core.tracking.tracker import Tracker
 
 class SequenceSegmenter:
     """Segments the frames of a sequence, live or recorded: the same frames give the same ids.
+
+    Attributes
+    ----------
+    map : PlaneMap
+        Of the frames whose pose was given.
 
     Examples
     --------
@@ -27,7 +34,9 @@ class SequenceSegmenter:
     def __init__(self, config: Config | None = None) -> None:
         self._segmenter = Segmenter(config)
         self._tracker = Tracker(config)
+        self.map = PlaneMap(config)
         self._stamp = 0
+        self._pose: Transform | None = None
 
     @property
     def config(self) -> Config:
@@ -38,18 +47,41 @@ class SequenceSegmenter:
     def config(self, config: Config) -> None:
         self._segmenter = Segmenter(config)
         self._tracker.config = config
+        self.map.config = config
 
-    def segment(self, image: RangeImage, stamp: int, up: ArrayLike | None = None) -> Segmentation:
-        """Label the next frame, taken at `stamp` nanoseconds; ids and roles of its planes are set.
+    def segment(
+        self,
+        image: RangeImage,
+        stamp: int,
+        up: ArrayLike | None = None,
+        pose: Transform | None = None,
+    ) -> Segmentation:
+        """Label the next frame; ids and roles of its planes are set.
 
-        `up` (3,) is the direction in the frame of the image, the configured one when not given.
+        Parameters
+        ----------
+        image : RangeImage
+        stamp : int
+            When it was taken, nanoseconds. Before the last frame, as in a looped recording, time
+            begins anew: nothing known is matched to it.
+        up : (3,) float, optional
+            Direction in the frame of the image, the configured one when not given.
+        pose : Transform, optional
+            Fixed frame from the frame of the image: the planes then count for `map`.
         """
         if stamp < self._stamp:
             self._segmenter.reset()
-        self._stamp = stamp
+            self._tracker.reset()
+            self.map.clear()
+            self._pose = None
+        motion = pose.inverse().after(self._pose) if pose and self._pose else None
+        self._stamp, self._pose = stamp, pose
         result = self._segmenter.segment(image)
-        planes = self._tracker.track(result.labels, result.planes, stamp)
-        return replace(result, planes=with_roles(planes, self.config, up))
+        planes = self._tracker.track(result.labels, result.planes, stamp, motion)
+        planes = with_roles(planes, self.config, up)
+        if pose:
+            self.map.add(result.labels, planes, image, pose, stamp)
+        return replace(result, planes=planes)
 
 
 def with_roles(

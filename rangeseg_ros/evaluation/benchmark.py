@@ -22,6 +22,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
 
@@ -71,7 +72,7 @@ def _silent(paths: Iterable[Path], total: int) -> Iterable[Path]:
     return paths
 
 
-def measured(
+def measure(
     frames: Frames, config: Config, rounds: int = 3, progress: Progress = _silent
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
@@ -96,7 +97,7 @@ def measured(
         system has no /proc. `frames`, `rounds`, `width`, `height`, `method`.
     """
     # What numba has not compiled yet is compiled and cached here, not where it is measured.
-    Segmenter(config).segment(frames.read(frames.paths[0]))
+    Segmenter(config).segment(corrected(frames.read(frames.paths[0]), config))
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
         return pool.submit(_measure, frames, config, rounds, progress).result()
 
@@ -128,7 +129,7 @@ def _laps(segmenter: Segmenter, frames: Frames, path: Path) -> dict[str, float]:
     """Milliseconds of each stage of a frame, the total and the processor time."""
     depth = read_depth(path)
     begin, begin_cpu = time.perf_counter(), time.process_time()
-    image = frames.image(path, depth)
+    image = corrected(frames.image(path, depth), segmenter.config)
     converted = time.perf_counter()
     timings = segmenter.segment(image).timings
     end, end_cpu = time.perf_counter(), time.process_time()
@@ -171,7 +172,7 @@ def energy_ratio(
     cache : Path
         Folder of the exact energies: what is there is not computed again.
     progress : callable
-        As for `measured`.
+        As for `measure`.
 
     Returns
     -------
@@ -181,7 +182,7 @@ def energy_ratio(
     segmenter, exact = Segmenter(config), Segmenter(replace(config, exact=True))
     ratios = []
     for path in progress(frames.paths, len(frames.paths)):
-        image = frames.read(path)
+        image = corrected(frames.read(path), config)
         energy, least = segmenter.segment(image).energy, _cached_energy(exact, image, cache)
         with np.errstate(divide='ignore'):
             ratios.append(1.0 if energy == least else float(np.divide(energy, least)))
@@ -202,7 +203,7 @@ def _cached_energy(segmenter: Segmenter, image: RangeImage, cache: Path) -> floa
 
 
 def table(figures: dict[str, Any]) -> str:
-    """Text of what `measured` gives, with `energy_ratio` where there is one."""
+    """Text of what `measure` gives, with `energy_ratio` where there is one."""
     rows = [('stage', 'median ms', 'p95 ms')]
     for name, stage in (*figures['stages'].items(), ('total', figures['total'])):
         rows.append((name, f'{stage["median_ms"]:.1f}', f'{stage["p95_ms"]:.1f}'))
@@ -221,7 +222,7 @@ def table(figures: dict[str, Any]) -> str:
 
 
 def scaling_table(series: dict[str, dict[str, Any]]) -> str:
-    """Text of `measured` figures of several sizes of image, each with its `ratio`."""
+    """Text of `measure` figures of several sizes of image, each with its `ratio`."""
     head = ('median ms', 'p95 ms', 'ratio', 'cpu ms', 'peak MB')
     lines = [f'{"size":<12}' + ''.join(f'{title:>11}' for title in head)]
     for size, figures in series.items():

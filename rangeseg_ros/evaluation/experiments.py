@@ -1,7 +1,7 @@
 """The experiments of chapter 6 of the thesis, as tables.
 
 Each experiment is a set of parameter variations, run over the images of one set and averaged.
-Trained and chosen is on training images only.
+Training and selection use the training images only.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ THESIS = Config(
     smoothness=55.0,
     weighting='uniform',
     noise_regions='identify',
-    # The pixels of jump edges, disconnected one by one, are no regions (white in figure 5.6).
+    # Pixels on jump edges are disconnected one by one and form no regions (white in figure 5.6).
     min_pixels=2,
 )
 """The parameters of the thesis (6.6)."""

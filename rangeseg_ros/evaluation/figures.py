@@ -43,7 +43,9 @@ class Compared(NamedTuple):
     normals: Mapping[int, Any] = MappingProxyType({})
 
 
-def compared(images: Mapping[str, Compared], tolerances: Sequence[float]) -> dict[str, Any]:
+def comparison_figures(
+    images: Mapping[str, Compared], tolerances: Sequence[float]
+) -> dict[str, Any]:
     """Figures of one or more images.
 
     Returns
@@ -60,13 +62,15 @@ def compared(images: Mapping[str, Compared], tolerances: Sequence[float]) -> dic
     return {'images': len(images), **figures, 'per_image': single}
 
 
-def evaluated(measurements: Sequence[Measurement], tolerances: Sequence[float]) -> dict[str, Any]:
-    """Figures of `compared`, and the errors of the planes where the truth knows them.
+def evaluation_figures(
+    measurements: Sequence[Measurement], tolerances: Sequence[float]
+) -> dict[str, Any]:
+    """Figures of `comparison_figures`, and the errors of the planes where the truth knows them.
 
     Returns
     -------
     dict
-        As `compared`, and for each tolerance, of the planes of all correct regions,
+        As `comparison_figures`, and for each tolerance, of the planes of all correct regions,
         `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`, metres.
         `milliseconds`: median time of a segmentation.
     """
@@ -78,7 +82,7 @@ def evaluated(measurements: Sequence[Measurement], tolerances: Sequence[float]) 
         )
         for item in measurements
     }
-    figures = compared(images, tolerances)
+    figures = comparison_figures(images, tolerances)
     for tolerance in tolerances:
         figures['tolerances'][f'{tolerance:g}'].update(_plane_figures(measurements, tolerance))
     figures['milliseconds'] = float(np.median([sum(m.timings.values()) for m in measurements]))
@@ -145,7 +149,7 @@ def as_json(value: Any) -> Any:
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """Text table of `compared` or `evaluated`, one row per tolerance.
+    """Text table of `comparison_figures` or `evaluation_figures`, one row per tolerance.
 
     Counts are averages per image; of the errors of angles and planes, those that are known.
     """

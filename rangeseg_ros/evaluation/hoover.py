@@ -18,7 +18,7 @@ from rangeseg_ros.evaluation.overlap import Overlap, check_tolerance
 
 
 class RegionClass(IntEnum):
-    """What became of a region; UNMATCHED is missed in the truth, noise in a segmentation."""
+    """Class of a region; UNMATCHED means missed in the truth and noise in a segmentation."""
 
     UNMATCHED = 0
     CORRECT = 1
@@ -125,7 +125,7 @@ class _Classes:
         inside: NDArray[np.bool_],
         tolerance: float,
     ) -> None:
-        """Give `kind` to the regions here that two or more regions of `other` make up.
+        """Assign `kind` to the regions that consist of two or more regions of `other`.
 
         `whole` and `part` are the pairs' indices here and in `other`; `inside` tells the pairs
         whose part lies within the whole to the share `tolerance`.

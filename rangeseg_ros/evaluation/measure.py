@@ -16,6 +16,7 @@ from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.segcomp.files import (
@@ -28,7 +29,7 @@ from rangeseg_ros.segcomp.files import (
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """All that the figures of an image are computed from.
+    """Everything the figures of an image are computed from.
 
     Attributes
     ----------
@@ -79,7 +80,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Task:
-    """An image, the parameters to segment it with, and where to leave what.
+    """An image, the parameters to segment it with, and where the results go.
 
     Attributes
     ----------
@@ -113,7 +114,7 @@ class Task:
 
     def _measure(self) -> Measurement:
         sample = self.case.load()
-        result = Segmenter(self.config).segment(sample.image)
+        result = Segmenter(self.config).segment(corrected(sample.image, self.config))
         overlap = sample.truth.compare(result.labels)
         if self.output:
             self._save(self.output, sample, result, overlap)
@@ -140,9 +141,12 @@ class Task:
             write_normals(folder / f'{name}.ms-nor', normals)
 
     def _key(self) -> str:
-        """Digest of all that the measurement depends on: code, parameters, files."""
+        """Digest of everything the measurement depends on: code, parameters, files."""
         digest = hashlib.sha256(code_digest())
         digest.update(repr((asdict(self.config), self.case)).encode())
-        for path in (self.case.image, self.case.truth):
+        files = [self.case.image, self.case.truth]
+        if self.config.distortion_map:
+            files.append(Path(self.config.distortion_map))
+        for path in files:
             digest.update(path.read_bytes())
         return digest.hexdigest()[:16]

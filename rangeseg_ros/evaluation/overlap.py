@@ -1,4 +1,4 @@
-"""Which regions of two segmentations share how many pixels, and measures of that."""
+"""Contingency table of two segmentations, the pixels that regions share, and measures of it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def check_tolerance(tolerance: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Which regions of the truth and of a segmentation share how many pixels.
+    """Contingency table of the regions of the truth and of a segmentation.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ def angle_errors(
     for first, second, degrees in angles:
         if first in matches and second in matches:
             a, b = (np.asarray(normals[matches[label]], float) for label in (first, second))
-            # atan2 of sine and cosine: the arc cosine alone is blunt near 0.
+            # atan2 of sine and cosine: the arc cosine alone loses precision near 0.
             found = np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)))
             errors.append(abs(min(degrees, 180.0 - degrees) - found))
     return np.array(errors)

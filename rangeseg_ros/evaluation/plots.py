@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from rangeseg_ros.evaluation.experiments import Row
 from rangeseg_ros.io.files import replacing
 
-# Lines that coincide stay visible.
+# Styles in which coinciding lines stay visible.
 _LAPPING: tuple[dict[str, Any], ...] = (
     {'marker': '.'},
     {'marker': 's', 'linewidth': 4, 'alpha': 0.4},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import combinations_with_replacement
 from operator import itemgetter
@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.io.files import replacing
 
 
 def _axes(field: str, axes: str) -> dict[str, Callable[[Any], Any]]:
@@ -44,18 +46,29 @@ _PARTS: dict[str, dict[str, Callable[[Any], Any]]] = {
 }
 
 
-def columns() -> list[str]:
-    """Names of the columns, in the order of the fields of `Plane`.
+def columns(kind: type[Plane] = Plane, without: Collection[str] = ()) -> list[str]:
+    """Names of the columns, in the order of the fields of `kind`.
 
     `covariance_xd` is that of normal_x and distance. Outlines are points 'x y z' joined by ';',
     holes are joined by '|'.
     """
-    return [column for field in fields(Plane) for column in _PARTS.get(field.name, (field.name,))]
+    names = [field.name for field in fields(kind) if field.name not in without]
+    return [column for name in names for column in _PARTS.get(name, (name,))]
 
 
-def row(plane: Plane) -> list[str]:
+def row(plane: Plane, without: Collection[str] = ()) -> list[str]:
     """Values of `plane` for `columns`."""
-    return [_text(value) for value in _values(plane)]
+    return [_text(value) for value in _values(plane, without)]
+
+
+def write_map(path: Path, planes: Sequence[MapPlane]) -> None:
+    """Write the planes of a map: the columns of `Plane` but the label, and those of `MapPlane`."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator='\n')
+    table.writerow(columns(MapPlane, ('label',)))
+    table.writerows(row(plane, ('label',)) for plane in planes)
+    with replacing(path) as partial:
+        partial.write_text(text.getvalue())
 
 
 class PlaneTable:
@@ -96,8 +109,10 @@ class PlaneTable:
         self._file.flush()
 
 
-def _values(plane: Plane) -> Iterator[Any]:
-    for field in fields(Plane):
+def _values(plane: Plane, without: Collection[str]) -> Iterator[Any]:
+    for field in fields(plane):
+        if field.name in without:
+            continue
         value = getattr(plane, field.name)
         if field.name in _PARTS:
             yield from (part(value) for part in _PARTS[field.name].values())

@@ -40,6 +40,10 @@ class RecordedTransforms:
         return self
 
     def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the files."""
         self._recording.close()
 
     def lookup(self, target: str, source: str, stamp: int, time: int) -> Transform:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from mapbox_earcut import triangulate_float64
 from numpy.typing import ArrayLike
 
+from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.make import Make
@@ -77,19 +77,14 @@ def _points(make: Make, coordinates: ArrayLike) -> list[Any]:
 
 
 def _triangles(make: Make, plane: Plane) -> list[Any]:
-    """Corners of triangles that make up the hull of `plane` without its holes."""
-    if len(plane.hull) < 3:
-        return []
-    rings = plane.hull, *plane.holes
-    corners = np.concatenate(rings)
-    # Seen along the axis nearest to the normal, from the sensor's side.
-    axis = np.abs(plane.normal).argmax()
-    right, up = (axis + np.array([1, 2] if plane.normal[axis] > 0 else [2, 1])) % 3
-    flat = np.ascontiguousarray(corners[:, [right, up]])
-    ends = np.cumsum([len(ring) for ring in rings], dtype=np.uint32)
-    # A message may hold one point at several places.
-    points = _points(make, corners)
-    return [points[k] for k in triangulate_float64(flat, ends).tolist()]
+    """Corners of triangles that make up the outline of `plane` without its holes."""
+    corners = []
+    for rings in plane.outline.parts:
+        if len(rings[0]) > 2:
+            # A message may hold one point at several places.
+            points = _points(make, np.concatenate(rings))
+            corners += [points[k] for k in triangles(rings, plane.normal).ravel().tolist()]
+    return corners
 
 
 def _marker(

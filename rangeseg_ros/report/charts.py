@@ -93,7 +93,7 @@ def stage_times(
     axes.stackplot(x, *stages.values(), labels=list(stages), colors=shades)
     axes.set_ylabel('milliseconds')
     total = np.sum(list(stages.values()), axis=0)
-    # The time of a compiler or of a busy machine would hide the others.
+    # A frame that waited for the compiler or a busy machine would dwarf the others.
     axes.set_ylim(0, 1.05 * min(total.max(), CUT * np.median(total)))
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if len(x) > 1:

@@ -38,7 +38,7 @@ def write_evaluation(
     found : sequence of Measurement
         One or more.
     figures : mapping
-        Of `evaluated`.
+        Of `evaluation_figures`.
     """
     tolerances = figures['tolerances']
     # One tolerance for the single images: that of their pictures where it is among them.

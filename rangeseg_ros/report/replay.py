@@ -52,7 +52,7 @@ class ReplayReport:
         return len(self._stamps)
 
     def add(self, stamp: int, result: Segmentation, picture: Path) -> None:
-        """Take in the next frame, of `stamp` nanoseconds; `picture` is its overlay's file."""
+        """Add the next frame, taken at `stamp` nanoseconds; `picture` is its overlay's file."""
         rows = [(self.frames, p.id, p.area, p.distance, p.normal) for p in result.planes]
         self._sightings.append(np.array(rows, charts.SIGHTING))
         found = f'{len(result.planes)} planes' if result.planes else result.reason

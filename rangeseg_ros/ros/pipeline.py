@@ -16,6 +16,7 @@ from rclpy.publisher import Publisher
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
@@ -112,7 +113,7 @@ class Pipeline:
         doing('converting the message')
         ticks = [time.perf_counter()]
         start = self._node.get_clock().now().nanoseconds
-        image = frame.range_image()
+        image = corrected(frame.range_image(), sequence.config)
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         found = sequence.segment(image, frame.stamp, self._up(frame.frame_id))

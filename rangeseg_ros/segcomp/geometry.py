@@ -72,24 +72,6 @@ def abw_calibration(number: int, split: str = 'test') -> AbwCalibration:
     return ABW_FIRST if split == 'test' and number in _FIRST_TEST_IMAGES else ABW_SECOND
 
 
-def abw_points(values: ArrayLike, calibration: AbwCalibration) -> NDArray[np.float64]:
-    """Points of an ABW range image.
-
-    Parameters
-    ----------
-    values : (512, 512) integer or float
-        Range values; 0 is shadow.
-    calibration : AbwCalibration
-        From `abw_calibration`.
-
-    Returns
-    -------
-    (512, 512, 3) float64
-        Metres in the optical frame, NaN where shadow.
-    """
-    return calibration.camera.rays.astype(float) * calibration.depth(values)[..., None]
-
-
 def abw_range_image(values: ArrayLike, calibration: AbwCalibration) -> RangeImage:
     """Range image of (512, 512) ABW range values.
 

@@ -129,6 +129,30 @@ def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
     )
 
 
+def walk(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
+    """Walk with the camera in the hand along an arc about the room, at 30 frames per second.
+
+    From one side to the other and back at up to 0.5 m/s, 1.2 m to both sides, looking at the
+    middle of the room, with the swings of `camera_motion` on top.
+
+    Parameters
+    ----------
+    start : Pose
+        Over the origin, looking along x, as in `kinect_room`.
+    seed, frames : int
+        As for `camera_motion`.
+    """
+    middle, reach, period = 2.2, 0.55, 16.0
+    swings = camera_motion(start, seed, frames)
+    angle = reach * np.sin(2 * np.pi * np.arange(frames) / 30 / period)
+    turned = Rotation.from_euler('z', -angle[:, None]).as_matrix()
+    poses = []
+    for rotation, pose in zip(turned, swings, strict=True):
+        about = pose.position - (middle, 0, 0)
+        poses.append(Pose(rotation @ pose.rotation, rotation @ about + (middle, 0, 0)))
+    return tuple(poses)
+
+
 class _Room:
     """A room under construction: the camera above the origin looks along x into a corner."""
 

@@ -1,8 +1,8 @@
-"""Fast minimiser: pieces of the image first, then pixels around the boundaries.
+"""Fast minimiser: superpixels of the image first, then pixels around the boundaries.
 
-The energy of labellings that are constant on pieces is minimised: regions of pieces take labels
-as wholes, then the labels in use are expanded. Last, labels are expanded by some pixels about
-their boundaries, and give way to those beside them where these suit better.
+The energy of labellings that are constant on pieces is lowered by giving every connected region of
+pieces its best label, under a prior that grows to its full weight. Then every label is expanded
+once over the pixels around its boundaries.
 """
 
 from __future__ import annotations
@@ -11,34 +11,35 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.octahedral import UNIT
-from rangeseg_ros.core.by_normals.piece_expansion import expand
+from rangeseg_ros.core.by_normals.angles import UNIT, angles, chosen_angles, degrees
+from rangeseg_ros.core.by_normals.piece_moves import relabel_regions
 from rangeseg_ros.core.by_normals.pieces import Pieces, pieces
-from rangeseg_ros.core.by_normals.region_moves import settle, turn
-from rangeseg_ros.core.graphcut.energy import angles, degrees, mixed_angles, site_angle
-from rangeseg_ros.core.graphcut.expansion import Choice, band, choice, fronts, grid_links
-from rangeseg_ros.core.graphcut.moves import ROUNDING
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.graphcut.cut import ROUNDING
+from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.graphcut.expansion import Choice, band, choice, fronts
+from rangeseg_ros.core.sensing.grid import Grid
 
 # Shares of the smoothness under which regions grow, one after the other: under all of it at once,
 # those that come first swallow what would have grown together beside them.
-_SHARES = 0.4, 0.6, 0.8, 1.0
-# Pixels that labels advance in the end, not counting those that gain by so many degrees.
-_REACH, _ODD = 4, 15.0
-# A label and those beside it.
-_BESIDE = 8
-# Share of the pixels where the data may speak against the labels of the image before.
-_ANEW = 0.25
+_PRIOR_SHARES = 0.4, 0.6, 0.8, 1.0
+# Pixels from a boundary that a label is expanded to: half a tile, as far as a boundary of pieces
+# may lie beside that of pixels.
+_BAND_PIXELS = 4
+# A label reaches farther where it gains more than this, two steps of the 305 directions: there the
+# pixels beyond a boundary are another surface, not noise of this one.
+_OUTLIER_DEGREES = 15.0
+# Share of the pixels that may speak against the labels of the frame before: the rest is the same
+# scene.
+_MAX_CHANGED_SHARE = 0.25
 
 
 def minimise(
     normals: NDArray[np.float32],
     directions: NDArray[np.floating],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: float,
     before: NDArray[np.integer] | None = None,
-) -> NDArray[np.intp]:
+) -> NDArray[np.int32]:
     """Labelling of low energy, eq. 5.3 with the angle to the normals as data cost (eq. 5.5).
 
     Parameters
@@ -46,8 +47,8 @@ def minimise(
     normals : (H, W, 3) float32
         NaN where undefined.
     directions : (K, 3) float
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
+    grid : Grid
+        (H, W).
     smoothness : float
         Lambda.
     before : (H, W) int, optional
@@ -56,23 +57,18 @@ def minimise(
 
     Returns
     -------
-    (H, W) intp
+    (H, W) int32
         Index into `directions`.
     """
-    parts = pieces(normals, directions, horizontal, vertical, smoothness)
+    parts = pieces(normals, directions, grid, smoothness)
     warm = None if before is None else _warm(parts, before)
     labels, costs, graph = parts.votes.copy() if warm is None else warm, parts.costs, parts.graph
-    for share in _SHARES if warm is None else _SHARES[-1:]:
-        eased = graph._replace(links=np.float32(share) * graph.links)
-        settle(labels, costs, eased)
-        turn(labels, costs, eased)
-    expand(labels, costs, graph)
-    turn(labels, costs, graph)
+    for share in _PRIOR_SHARES if warm is None else _PRIOR_SHARES[-1:]:
+        relabel_regions(labels, costs, graph._replace(links=np.float32(share) * graph.links))
     # Any label will do where neither an edge nor a normal is.
     result = np.append(labels, np.int32(0))[parts.image]
-    _refine(result, normals, directions, horizontal, vertical, smoothness)
-    _replace(result, normals, directions)
-    return result.astype(np.intp)
+    _expand(result, normals, directions, grid, smoothness)
+    return result
 
 
 def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | None:
@@ -88,68 +84,30 @@ def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | Non
     bound = (links[parts.graph.start[1:]] - links[parts.graph.start[:-1]]) / 2
     lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
     against = lost > bound
-    if against[parts.image[inside]].sum() > _ANEW * inside.sum():
+    if against[parts.image[inside]].sum() > _MAX_CHANGED_SHARE * inside.sum():
         return None
     return np.where(against, parts.votes, labels)
 
 
-def _refine(
+def _expand(
     image: NDArray[np.int32],
     normals: NDArray[np.float32],
     directions: NDArray[np.floating],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: float,
 ) -> None:
-    """Expand the labels of an image by some pixels, in place."""
+    """Expand the labels of an image around their boundaries, in place."""
     width, labels = image.shape[1], image.reshape(-1)
-    sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3, 1)
+    sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3)
     vectors = directions.astype(np.float32)
-    links = grid_links(horizontal, vertical, smoothness)
-    data = mixed_angles(labels, sites, vectors)
+    links = link_costs(grid, smoothness)
+    data = chosen_angles(labels, sites, vectors)
     position = np.full(len(labels), -1, np.int32)
     start, beside = fronts(labels, links, width, len(vectors))
     for alpha in np.flatnonzero(np.diff(start)).tolist():
         front = beside[start[alpha] : start[alpha + 1]]
         move = _move(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
         move.make(alpha, labels, data, ROUNDING)
-
-
-def _replace(
-    image: NDArray[np.int32], normals: NDArray[np.float32], directions: NDArray[np.floating]
-) -> None:
-    """Replace labels by those beside them where that suits all of their pixels better, in place.
-
-    The costs of pieces, which are those of cells, cannot tell labels so close from each other.
-    """
-    vectors = directions.astype(np.float32)
-    near = np.argsort(-(vectors @ vectors.T), axis=1, kind='stable')[:, :_BESIDE]
-    # (K, 3, m): the labels beside one next to each other, for the compiler to take all at a time.
-    beside = np.ascontiguousarray(vectors[near].transpose(0, 2, 1))
-    upper, lower = halves(_costs_beside, len(image), image, normals, beside)
-    best = (upper + lower).argmin(axis=1)
-    image[...] = near[np.arange(len(near)), best].astype(np.int32)[image]
-
-
-@njit(cache=True, nogil=True)
-def _costs_beside(
-    first: int,
-    after: int,
-    image: NDArray[np.int32],
-    normals: NDArray[np.float32],
-    beside: NDArray[np.float32],
-) -> NDArray[np.float64]:
-    """Data costs (K, m) of directions (K, 3, m) at the pixels that have each label."""
-    total = np.zeros((len(beside), beside.shape[2]))
-    for i in range(first, after):
-        for j in range(image.shape[1]):
-            x, y, z = normals[i, j, 0], normals[i, j, 1], normals[i, j, 2]
-            if x == x:
-                k = np.uint32(image[i, j])
-                for m in range(beside.shape[2]):
-                    cosine = x * beside[k, 0, m] + y * beside[k, 1, m] + z * beside[k, 2, m]
-                    total[k, m] += degrees(cosine)
-    return total
 
 
 @njit(cache=True)
@@ -166,7 +124,7 @@ def _move(
 ) -> Choice:
     """Expansion of a label by the pixels about its front."""
     front = _onward(alpha, front, normals, direction, labels, data, links, width, position)
-    near = band(alpha, front, _REACH, labels, links, width, position)
+    near = band(alpha, front, _BAND_PIXELS, labels, links, width, position)
     new = angles(near, normals, direction)
     return choice(alpha, near, new, labels, data, links, width, position)
 
@@ -205,11 +163,15 @@ def _onward(
                 links[k % 2, min(p, q)] == 0
                 or labels[q] == alpha
                 or position[q] >= 0
-                or data[q] <= _ODD
+                or data[q] <= np.float32(_OUTLIER_DEGREES)
             ):
                 continue
-            cost = site_angle(normals[q], direction[0], direction[1], direction[2])
-            if data[q] - cost > _ODD:
+            cost = degrees(
+                normals[q, 0] * direction[0]
+                + normals[q, 1] * direction[1]
+                + normals[q, 2] * direction[2]
+            )
+            if data[q] - cost > np.float32(_OUTLIER_DEGREES):
                 if count == len(sites):
                     sites = np.concatenate((sites, np.empty_like(sites)))
                 position[q] = count

@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals import coarse_to_fine, exact
+from rangeseg_ros.core.by_normals.angles import angle
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.graphcut import moves
-from rangeseg_ros.core.graphcut.energy import angle, energy
+from rangeseg_ros.core.graphcut.energy import energy
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -49,7 +49,7 @@ class Labelling:
     def energy(self) -> float:
         """Value of eq. 5.3."""
         data = angle(np.moveaxis(self._normals, 2, 0), np.moveaxis(self.normals(), 2, 0))
-        return energy(data, self.labels, *self._grid, self._smoothness)
+        return energy(data, self.labels, self._grid, self._smoothness)
 
 
 def segment(
@@ -74,12 +74,12 @@ def segment(
     lap : callable
         Told the name of every stage that ends.
     """
-    normals = observed_normals(image, *grid, config)
+    normals = observed_normals(image, grid, config)
     lap('normals')
     labels_of = directions(config.directions, config.direction_count, config.seed)
-    problem = normals, labels_of, *grid, config.smoothness
+    problem = normals, labels_of, grid, config.smoothness
     if config.exact:
-        labels = moves.minimise(*problem, config.cycles, config.moves)
+        labels = exact.minimise(*problem, config.moves, config.cycles)
     else:
         labels = coarse_to_fine.minimise(*problem, before)
     lap('labels')

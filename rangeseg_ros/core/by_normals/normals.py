@@ -11,23 +11,19 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
-def observed_normals(
-    image: RangeImage,
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
-    config: Config,
-) -> NDArray[np.float32]:
+def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[np.float32]:
     """Normals by the method that `config` names.
 
     Parameters
     ----------
     image : RangeImage
         (H, W).
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights, 0 where disconnected.
+    grid : Grid
+        (H, W).
     config : Config
         `normals`, `normal_baseline`, `normal_radius` and `jump_edges` are read.
 
@@ -42,7 +38,7 @@ def observed_normals(
     normals = cross_product(image, config.normal_baseline)
     if config.jump_edges == 'plane':
         reach = config.normal_baseline
-        broken = _within(horizontal <= 0, reach) | _within(vertical.T <= 0, reach).T
+        broken = _within(grid.right <= 0, reach) | _within(grid.below.T <= 0, reach).T
         normals[broken] = np.nan
     return normals
 

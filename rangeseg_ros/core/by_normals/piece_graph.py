@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.sensing.grid import Grid
+
 
 class Graph(NamedTuple):
     """Edges between pieces, each listed from both ends.
@@ -19,21 +21,18 @@ class Graph(NamedTuple):
     neighbours : (m,) int32
     links : (m,) float32
         Weights of the edges to each neighbour times the smoothness.
-    back : (m,) int32
-        Where each edge is listed from its other end.
     """
 
     start: NDArray[np.int32]
     neighbours: NDArray[np.int32]
     links: NDArray[np.float32]
-    back: NDArray[np.int32]
 
 
+@njit(cache=True, nogil=True)
 def adjacency(
     image: NDArray[np.int32],
     count: int,
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: float,
 ) -> Graph:
     """Graph of pieces.
@@ -43,22 +42,11 @@ def adjacency(
     image : (H, W) int32
         Piece of each pixel, below `count`; -1 for pixels without any edge.
     count : int
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
+    grid : Grid
+        (H, W).
     smoothness : float
         Lambda.
     """
-    return Graph(*_adjacency(image, count, horizontal, vertical, smoothness))
-
-
-@njit(cache=True, nogil=True)
-def _adjacency(
-    image: NDArray[np.int32],
-    count: int,
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
-    smoothness: float,
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32], NDArray[np.int32]]:
     height, width = image.shape
     room = np.zeros(count + 1, np.int32)
     for filling in range(2):
@@ -72,7 +60,7 @@ def _adjacency(
                 for k in range(2):
                     if (j + 1 == width) if k == 0 else (i + 1 == height):
                         continue
-                    u = horizontal[i, j] if k == 0 else vertical[i, j]
+                    u = grid.right[i, j] if k == 0 else grid.below[i, j]
                     p = image[i, j]
                     q = image[i, j + 1] if k == 0 else image[i + 1, j]
                     if p == q or not u > 0:
@@ -98,17 +86,4 @@ def _adjacency(
             neighbours[start[p] + e] = neighbours[room[p] + e]
             links[start[p] + e] = links[room[p] + e]
     neighbours, links = neighbours[: start[count]].copy(), links[: start[count]].copy()
-    return start, neighbours, links, _back(start, neighbours)
-
-
-@njit(cache=True, nogil=True)
-def _back(start: NDArray[np.int32], neighbours: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Where each edge is listed from its other end."""
-    back = np.empty(len(neighbours), np.int32)
-    for p in range(len(start) - 1):
-        for e in range(start[p], start[p + 1]):
-            f = start[neighbours[e]]
-            while neighbours[f] != p:
-                f += 1
-            back[e] = f
-    return back
+    return Graph(start, neighbours, links)

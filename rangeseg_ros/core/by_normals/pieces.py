@@ -14,13 +14,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.octahedral import angle_table, find_cells
+from rangeseg_ros.core.by_normals.angles import angle_table, find_cells
 from rangeseg_ros.core.by_normals.piece_graph import Graph, adjacency
-from rangeseg_ros.core.by_normals.tiles import TILE, connect, empty_tile, judge, load, vote
+from rangeseg_ros.core.by_normals.tiles import (
+    TILE,
+    connect,
+    empty_tile,
+    label_components,
+    load,
+    mark_splits,
+)
 from rangeseg_ros.core.runtime.threads import aside, halves, strips
+from rangeseg_ros.core.sensing.grid import Grid
 
 # Borders of pieces run in steps: so much shorter are those that pixels draw in the end.
-SHORTER = 0.95
+STAIRCASE_FACTOR = 0.95
 
 
 class Pieces(NamedTuple):
@@ -31,7 +39,7 @@ class Pieces(NamedTuple):
     image : (H, W) int32
         Piece of each pixel, -1 for pixels without any edge or normal.
     costs : (n, K) uint16
-        Data cost of each label, summed over the pixels of each piece; `octahedral.UNIT` degrees.
+        Data cost of each label, summed over the pixels of each piece; `angles.UNIT` degrees.
     votes : (n,) int32
         Label nearest to the mean normal of each piece.
     graph : Graph
@@ -46,8 +54,7 @@ class Pieces(NamedTuple):
 def pieces(
     normals: NDArray[np.float32],
     directions: NDArray[np.floating],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: float,
 ) -> Pieces:
     """Cut an image in pieces.
@@ -57,34 +64,21 @@ def pieces(
     normals : (H, W, 3) float32
         NaN where undefined.
     directions : (K, 3) float
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
+    grid : Grid
+        (H, W).
     smoothness : float
         Lambda.
     """
-    horizontal = horizontal.astype(np.float32, copy=False)
-    vertical = vertical.astype(np.float32, copy=False)
     table, nearest = angle_table(directions.astype(np.float32).tobytes(), len(directions))
     cells = np.empty(normals.shape[:2], np.int32)
     strips(find_cells, len(cells), normals, cells)
     image = np.full(cells.shape, -1, np.int32)
     tiles = -(-len(cells) // TILE)
-    above, under = halves(
-        _cut,
-        tiles,
-        cells,
-        normals,
-        table,
-        nearest,
-        horizontal,
-        vertical,
-        smoothness,
-        image,
-    )
+    above, under = halves(_cut, tiles, cells, normals, table, nearest, grid, smoothness, image)
     below = image[tiles // 2 * TILE :]
     np.add(below, len(above), out=below, where=below >= 0)
     votes = np.concatenate([above, under])
-    graph = aside(adjacency, image, len(votes), horizontal, vertical, SHORTER * smoothness)
+    graph = aside(adjacency, image, len(votes), grid, STAIRCASE_FACTOR * smoothness)
     costs = np.empty((len(votes), len(directions)), np.uint16)
     strips(_sum_up, tiles, image, cells, table, costs)
     return Pieces(image, costs, votes, graph.result())
@@ -98,8 +92,7 @@ def _cut(
     normals: NDArray[np.float32],
     table: NDArray[np.uint16],
     nearest: NDArray[np.int32],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: float,
     image: NDArray[np.int32],
 ) -> NDArray[np.int32]:
@@ -116,11 +109,11 @@ def _cut(
     count = 0
     for i0 in range(first * TILE, min(after * TILE, height), TILE):
         for j0 in range(0, width, TILE):
-            if not load(i0, j0, cells, horizontal, vertical, np.float32(smoothness), tile):
+            if not load(i0, j0, cells, grid, np.float32(smoothness), tile):
                 continue
             connect(tile)
-            vote(i0, j0, normals, nearest, tile)
-            judge(table, tile)
+            label_components(i0, j0, normals, nearest, tile)
+            mark_splits(table, tile)
             for a in range(most):
                 if not tile.free[a]:
                     continue

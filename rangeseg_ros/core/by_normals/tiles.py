@@ -8,13 +8,14 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.octahedral import UNIT, cell_of
+from rangeseg_ros.core.by_normals.angles import UNIT, cell_of
+from rangeseg_ros.core.sensing.grid import Grid
 
 # Pixels across the tiles.
 TILE = 8
 # What quarters may save and yet be one piece, as a share of the prior of the edges between them.
-_KEEP = 0.18
-_SPLIT = np.float32(_KEEP / UNIT)
+_SPLIT_GAIN_SHARE = 0.18
+_SPLIT_GAIN = np.float32(_SPLIT_GAIN_SHARE / UNIT)
 
 
 class Tile(NamedTuple):
@@ -90,13 +91,13 @@ def load(
     i0: int,
     j0: int,
     cells: NDArray[np.int32],
-    horizontal: NDArray[np.floating],
-    vertical: NDArray[np.floating],
+    grid: Grid,
     smoothness: np.float32,
     tile: Tile,
 ) -> bool:
     """Fill in cells, links and what is free; whether anything is."""
     height, width = cells.shape
+    horizontal, vertical = grid
     cell, free, right, below = tile.cell, tile.free, tile.right, tile.below
     linked = False
     for a in range(TILE * TILE):
@@ -167,7 +168,7 @@ def _unite(parent: NDArray[np.int32], level: int, a: int, b: int) -> None:
 
 
 @njit(cache=True, nogil=True)
-def vote(
+def label_components(
     i0: int,
     j0: int,
     normals: NDArray[np.float32],
@@ -196,7 +197,7 @@ def vote(
 
 
 @njit(cache=True, nogil=True)
-def judge(table: NDArray[np.uint16], tile: Tile) -> None:
+def mark_splits(table: NDArray[np.uint16], tile: Tile) -> None:
     """Tell which components fall into their parts."""
     cell, whole, first, number = tile.cell, tile.whole, tile.first, tile.number
     label, cost, parts, split = tile.label, tile.cost, tile.parts, tile.split
@@ -219,4 +220,4 @@ def judge(table: NDArray[np.uint16], tile: Tile) -> None:
         for s in range(number[level]):
             p = first[level, s]
             more = cost[level, p] - parts[level, p]
-            split[level, p] |= more > _SPLIT * tile.spared[level, p]
+            split[level, p] |= more > _SPLIT_GAIN * tile.spared[level, p]

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
-from rangeseg_ros.core.graphcut.expansion import grid_links
+from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.runtime.threads import halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
@@ -44,7 +44,7 @@ class Problem(NamedTuple):
     weight : (n,) float32
         1 / random variance of the inverse range; 0 where nothing was measured.
     links : (2, n) float32
-        Cost of unlike labels across the edges to the right and down, see `grid_links`.
+        Cost of unlike labels across the edges to the right and down, see `link_costs`.
     width : int
         Columns of the image.
     block : int
@@ -69,7 +69,7 @@ class Problem(NamedTuple):
         """Weigh the pixels of an image by the noise of its sensor."""
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor)
-        prior = grid_links(*grid, _SMOOTHNESS * sensor.patch)
+        prior = link_costs(grid, _SMOOTHNESS * sensor.patch)
         return cls(inverse, rays, weight, prior, image.shape[1], block)
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import cv2
 import numpy as np
+from mapbox_earcut import triangulate_float64
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
@@ -47,6 +49,11 @@ class Outline:
     def holes(self) -> list[NDArray[np.float64]]:
         """Borders (N, 3) of the holes in the largest part, clockwise seen from the sensor."""
         return self._rings[1]
+
+    @property
+    def parts(self) -> list[list[NDArray[np.float64]]]:
+        """Hull and holes of each part: of the largest one."""
+        return [[self.hull, *self.holes]]
 
     @cached_property
     def _rings(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
@@ -90,3 +97,28 @@ class Outline:
                 column = np.clip(corners[:, 0] + j, 0, width - 1)
                 total += self.rays[row, column] * self.mask[row, column, None]
         return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def triangles(
+    rings: Sequence[NDArray[np.float64]], normal: NDArray[np.float64]
+) -> NDArray[np.intp]:
+    """Triangles of a polygon with holes, counter-clockwise seen from where its normal points.
+
+    Parameters
+    ----------
+    rings : sequence of (N, 3) float64
+        Border and holes.
+    normal : (3,) float64
+
+    Returns
+    -------
+    (T, 3) int
+        Numbers of corners, those of all rings counted on.
+    """
+    corners = np.concatenate(rings)
+    # Seen along the axis nearest to the normal, from the side that it points to.
+    axis = np.abs(normal).argmax()
+    right, up = (axis + np.array([1, 2] if normal[axis] > 0 else [2, 1])) % 3
+    flat = np.ascontiguousarray(corners[:, [right, up]])
+    ends = np.cumsum([len(ring) for ring in rings], dtype=np.uint32)
+    return triangulate_float64(flat, ends).astype(np.intp).reshape(-1, 3)

@@ -13,36 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.graphcut.moves import minimum_cut
+from rangeseg_ros.core.graphcut.cut import minimum_cut
 
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
-
-
-def grid_links(
-    horizontal: NDArray[np.floating], vertical: NDArray[np.floating], smoothness: float
-) -> NDArray[np.float32]:
-    """Weights of all edges times the smoothness.
-
-    Parameters
-    ----------
-    horizontal, vertical : (H, W-1), (H-1, W) float
-        Neighbourhood weights.
-    smoothness : float
-        Lambda.
-
-    Returns
-    -------
-    (2, H * W) float32
-        Of each pixel's edges to the right and down; 0 at the border. The edge between p and its
-        neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
-        the first pixel, where this counts from the end, there is a border as well.
-    """
-    height, width = len(horizontal), vertical.shape[1]
-    result = np.zeros((2, height, width), np.float32)
-    np.multiply(horizontal, np.float32(smoothness), out=result[0, :, :-1], casting='same_kind')
-    np.multiply(vertical, np.float32(smoothness), out=result[1, :-1], casting='same_kind')
-    return result.reshape(2, -1)
 
 
 @njit(cache=True)

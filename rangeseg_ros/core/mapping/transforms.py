@@ -27,12 +27,15 @@ class TransformError(ValueError):
 
     Attributes
     ----------
+    reason : str
+        What is wrong, the same for all times.
     may_come : bool
         Whether it may be known later: a frame not heard of yet, or a time ahead of the last one.
     """
 
-    def __init__(self, message: str, may_come: bool = False) -> None:
-        super().__init__(message)
+    def __init__(self, reason: str, detail: str = '', may_come: bool = False) -> None:
+        super().__init__(f'{reason}{detail}')
+        self.reason = reason
         self.may_come = may_come
 
 
@@ -234,10 +237,12 @@ class TransformBuffer:
             return samples[after]
         if after == 0:
             behind = (samples[0].stamp - stamp) * 1e-9
-            raise TransformError(f'{frame!r} is not known until {behind:.3f} s after this time')
+            raise TransformError(f'{frame!r} is not known that early', f': {behind:.3f} s before')
         if after == len(samples):
             ahead = (stamp - samples[-1].stamp) * 1e-9
-            raise TransformError(f'{frame!r} is known until {ahead:.3f} s before this time', True)
+            raise TransformError(
+                f'{frame!r} is not known that late', f': {ahead:.3f} s after the last', True
+            )
         first, second = samples[after - 1 : after + 1]
         if first.parent != second.parent:
             return first

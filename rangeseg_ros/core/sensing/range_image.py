@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -42,11 +42,14 @@ class RangeImage:
         Inverse depth (pinhole) or inverse range (cloud), 1/m; 0 where nothing was measured.
     camera : Camera or None
         None for organised clouds.
+    corrected : bool
+        Whether the sensor's fixed distortion has been subtracted.
     """
 
     rays: NDArray[np.float32]
     inverse: NDArray[np.float32]
     camera: Camera | None = None
+    corrected: bool = False
 
     @classmethod
     def from_depth(
@@ -148,7 +151,7 @@ class RangeImage:
         """
         noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
         with np.errstate(divide='ignore'):
-            return RangeImage(self.rays, _reciprocal(1 / self.inverse + noise, 1.0), self.camera)
+            return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
 
     @property
     def shape(self) -> tuple[int, int]:

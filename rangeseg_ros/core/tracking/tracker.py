@@ -29,16 +29,23 @@ from rangeseg_ros.core.tracking.tracks import (
     variances,
 )
 
-# Largest squared distance in standard deviations, of two degrees of freedom, that may match.
+# Largest squared distance in standard deviations that may match: of two degrees of freedom, one
+# of 22000 matches is beyond.
 _GATE = 20.0
-# Overlap that planes in reach of each other count with, beside what they have.
+# Intersection over union that planes in reach of each other count with, beside what they have: a
+# plane that has just come out of hiding overlaps with nothing, and one in sight overlaps more.
 _UNSEEN_OVERLAP = 0.1
-# Frames in which a plane must have been seen to be as good as older ones, and what it counts with
-# until then: what looks like a new plane at first may be a part of one that is about to go.
-_TRIAL, _ON_TRIAL = 10, 0.05
-# Standard deviations of the camera's motion between two frames: radians, metres.
-_TURN, _SHIFT = np.radians(2.0), 0.03
-# Least intersection over union, and largest changes, of planes the motion is estimated from.
+# Seconds in which a plane must have been seen to be as good as older ones, and what it counts
+# with until then: what looks like a new plane at first may be a part of one that is about to go.
+_TRIAL, _ON_TRIAL = 0.32, 0.05
+# Standard deviations of the camera's motion, in radians and metres per second: of a hand as quick
+# as can be while depth is still measured. They count only where planes leave the motion open.
+_TURN, _SHIFT = np.radians(60.0), 0.9
+# Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
+# speed is kept up for: after longer, the camera may be anywhere.
+_NOMINAL, _LONGEST = 1 / 30, 0.5
+# Least intersection over union, and largest changes, of planes the motion is estimated from: the
+# equations are linear in it, and larger changes are rather another plane.
 _SURE_OVERLAP, _SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
 _MOTION_ROUNDS = 3
 
@@ -47,7 +54,7 @@ class Tracker:
     """Gives planes, and the surfaces they are parts of, ids that persist from frame to frame.
 
     A plane keeps its id while the camera moves and while it is out of sight for up to
-    `track_memory` frames. When an occluder splits a plane, the part that overlaps most with the
+    `track_time` seconds. When an occluder splits a plane, the part that overlaps most with the
     plane as it was, so in general the largest, keeps the id and the others get ids of their own.
     When parts merge, the oldest id stays, unless it belonged to a part of less than a quarter of
     the other, and the other part's id waits in the memory for the next split. Of a face seen in
@@ -62,7 +69,7 @@ class Tracker:
     Parameters
     ----------
     config : Config, optional
-        `track_memory`.
+        `track_time`.
 
     Examples
     --------
@@ -75,10 +82,18 @@ class Tracker:
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the planes: none of them is matched. Their ids are not given again."""
         self._tracks = Tracks.of([], np.zeros(0, np.intp))
 
     def track(
-        self, labels: NDArray[np.uint16], planes: Sequence[Plane], stamp: int
+        self,
+        labels: NDArray[np.uint16],
+        planes: Sequence[Plane],
+        stamp: int,
+        motion: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
     ) -> list[Plane]:
         """The planes of the next frame with their ids.
 
@@ -89,21 +104,30 @@ class Tracker:
         planes : sequence of Plane
             As `Segmenter` returns them with `labels`.
         stamp : int
-            Time of the frame, nanoseconds. A frame before the last one, as of a looped
-            recording, and one of another size start anew: nothing known is matched to it.
+            Time of the frame, nanoseconds, not before that of the last one. A frame of another
+            size starts anew: nothing known is matched to it.
+        motion : (3, 3) and (3,) float64, optional
+            Rotation and shift that take points of the last frame to this one, where they are
+            known; the planes tell the rest.
 
         Returns
         -------
         list of Plane
             In the order given, `id` and `surface` set.
         """
-        if stamp < self._stamp or labels.shape != self._shape:
-            self._tracks = Tracks.of([], np.zeros(0, np.intp))
+        if labels.shape != self._shape:
+            self.reset()
+        elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else _NOMINAL
         self._stamp, self._shape = stamp, labels.shape
         samples = samples_of(labels, planes)
-        seen, known = Tracks.of(planes, samples), self._tracks
+        seen, known = Tracks.of(planes, samples, elapsed), self._tracks
         shared = shared_samples(known, samples, len(planes))
-        known = known.moved(*_camera_motion(known, seen, shared))
+        if motion:
+            # Where the frames that tell the motion jump, the planes know better.
+            moved = known.moved(*motion)
+            if _sure_pairs(moved, seen, shared).sum() >= _sure_pairs(known, seen, shared).sum():
+                known = moved
+        known = known.moved(*_camera_motion(known, seen, shared, elapsed))
         distance = distances(known, seen)
         match = _assign(known, seen, shared, distance)
         seen.id[:] = _oldest(known, match, shared, distance)
@@ -114,8 +138,8 @@ class Tracker:
         seen.id[new] = self._next + np.arange(new.sum())
         self._next += int(new.sum())
         seen.surface[:] = self._surfaces(planes, seen, known)
-        lost = ~np.isin(known.id, seen.id) & (known.unseen < self.config.track_memory)
-        self._tracks = seen.joined(known.where(lost).aged())
+        lost = ~np.isin(known.id, seen.id) & (known.unseen + elapsed <= self.config.track_time)
+        self._tracks = seen.joined(known.where(lost).aged(elapsed))
         return [
             replace(plane, id=int(i), surface=int(surface))
             for plane, i, surface in zip(planes, seen.id, seen.surface, strict=True)
@@ -155,9 +179,9 @@ def _groups(planes: Sequence[Plane]) -> list[list[int]]:
 
 
 def _camera_motion(
-    known: Tracks, seen: Tracks, shared: NDArray[np.intp]
+    known: Tracks, seen: Tracks, shared: NDArray[np.intp], elapsed: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation and shift that take points of the last frame to this one.
+    """Rotation and shift that take points of the last frame, `elapsed` seconds ago, to this one.
 
     With a small rotation w and a shift v, a plane's normal n changes by w x n and the centroid c
     of the plane that is seen comes to lie n.c + d + w.(n x c) - n.v off it: linear least squares
@@ -165,17 +189,12 @@ def _camera_motion(
     that fit badly (things that move by themselves) less. Directions in which the planes leave
     the motion open are held by a prior of zero.
     """
-    overlap = overlaps(known, seen, shared) * (known.unseen == 0)[:, None]
-    best = overlap == np.maximum(
-        overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
-    )
-    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < _SURE_SHIFT)
-    sure &= known.normal @ seen.normal.T > np.cos(_SURE_TURN)
-    t, s = np.nonzero(sure)
+    t, s = np.nonzero(_sure_pairs(known, seen, shared))
     angle, offset = (variance[t, s] for variance in variances(known, seen))
     start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
-    prior = np.diag(np.repeat([_TURN**-2, _SHIFT**-2], 3))
+    reach = min(max(elapsed, _NOMINAL), _LONGEST)
+    prior = np.diag(np.repeat([(reach * _TURN) ** -2, (reach * _SHIFT) ** -2], 3))
     for _ in range(_MOTION_ROUNDS):
         n = start @ rotation.T
         turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
@@ -192,6 +211,17 @@ def _camera_motion(
         twist = cv2.Rodrigues(step[:3])[0]
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
     return rotation, shift
+
+
+def _sure_pairs(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(T, N) whether planes overlap most with each other and agree."""
+    overlap = overlaps(known, seen, shared) * (known.unseen == 0)[:, None]
+    best = overlap == np.maximum(
+        overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
+    )
+    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < _SURE_SHIFT)
+    result: NDArray[np.bool_] = sure & (known.normal @ seen.normal.T > np.cos(_SURE_TURN))
+    return result
 
 
 def _assign(

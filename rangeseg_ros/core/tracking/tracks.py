@@ -11,15 +11,17 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 
-# Rows or columns, whichever are fewer, at which overlap is looked at.
+# Rows or columns, whichever are fewer, at which overlap is looked at: a plane of the least size
+# has about eight samples in a 640 x 480 image.
 _SAMPLES = 60
 # What planes of one surface differ by from frame to frame beyond their covariances, because
-# their pixels are not the same: an offset, as share of the range, and an angle, at least and
-# for an offset over the plane's radius.
+# their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
+# distortion of a Kinect is there), and an angle, at least and for an offset over the plane's
+# radius.
 _OFFSET, _ANGLE = 0.007, np.radians(1.0)
 # Larger standard deviations do not count: what is known of such planes fits anything.
 _LARGEST_OFFSET, _LARGEST_ANGLE = 0.03, np.radians(5.0)
-# Area in square metres that a plane counts with at least.
+# Area in square metres that a plane counts with at least, so that its radius is not 0.
 _SMALLEST = 1e-4
 
 
@@ -28,9 +30,9 @@ class Tracks:
     """N planes in the frame of the camera, as arrays.
 
     `footprint` and `owner` list the samples of the label image in which the planes were last
-    seen and whose they were, 0...N-1; `age` counts the frames in which they were seen, `unseen`
-    those since then. `radius` is that of a disc of the plane's area, `reach` that of one around
-    it.
+    seen and whose they were, 0...N-1; `age` is for how many seconds they were seen, `unseen` how
+    many have passed since then. `radius` is that of a disc of the plane's area, `reach` that of
+    one around it.
     """
 
     id: NDArray[np.int64]
@@ -41,14 +43,16 @@ class Tracks:
     centroid: NDArray[np.float64]
     radius: NDArray[np.float64]
     reach: NDArray[np.float64]
-    age: NDArray[np.int64]
-    unseen: NDArray[np.int64]
+    age: NDArray[np.float64]
+    unseen: NDArray[np.float64]
     footprint: NDArray[np.intp]
     owner: NDArray[np.intp]
 
     @classmethod
-    def of(cls, planes: Sequence[Plane], samples: NDArray[np.intp]) -> Tracks:
-        """Planes seen now, without ids (0)."""
+    def of(
+        cls, planes: Sequence[Plane], samples: NDArray[np.intp], elapsed: float = 0.0
+    ) -> Tracks:
+        """Planes seen now, for `elapsed` seconds so far, without ids (0)."""
         footprint = np.flatnonzero(samples)
         return cls(
             np.zeros(len(planes), np.int64),
@@ -59,8 +63,8 @@ class Tracks:
             np.array([p.centroid for p in planes], np.float64).reshape(-1, 3),
             np.sqrt(np.maximum([p.area for p in planes], _SMALLEST) / np.pi),
             np.array([np.hypot(*p.extents) / 2 for p in planes], np.float64),
-            np.ones(len(planes), np.int64),
-            np.zeros(len(planes), np.int64),
+            np.full(len(planes), elapsed),
+            np.zeros(len(planes)),
             footprint,
             samples[footprint] - 1,
         )
@@ -84,9 +88,9 @@ class Tracks:
             centroid=self.centroid @ rotation.T + shift,
         )
 
-    def aged(self) -> Tracks:
-        """The planes one frame later, unseen."""
-        return replace(self, unseen=self.unseen + 1)
+    def aged(self, elapsed: float) -> Tracks:
+        """The planes `elapsed` seconds later, unseen."""
+        return replace(self, unseen=self.unseen + elapsed)
 
     def where(self, chosen: NDArray[np.bool_]) -> Tracks:
         """Some of the planes."""

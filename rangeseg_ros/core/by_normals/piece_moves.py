@@ -1,7 +1,7 @@
-"""Moves of pieces and of regions: each takes the label that costs it least.
+"""Moves of regions of pieces: each takes the label that costs it least.
 
-A region is a connected set of pieces of one label. Regions that took the same label grow together
-and then turn as one.
+A region is a connected set of pieces of one label. Regions that took the same label join and then
+move as one: iterated conditional modes (Besag, JRSS B 1986) whose sites grow.
 """
 
 from __future__ import annotations
@@ -10,42 +10,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.octahedral import UNIT
+from rangeseg_ros.core.by_normals.angles import UNIT
 from rangeseg_ros.core.by_normals.piece_graph import Graph
-from rangeseg_ros.core.graphcut.moves import ROUNDING
+from rangeseg_ros.core.graphcut.cut import ROUNDING
 from rangeseg_ros.core.runtime.threads import strips
-
-
-@njit(cache=True)
-def settle(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> None:
-    """Give every piece in turn the label, its own or a neighbour's, that costs least.
-
-    Parameters
-    ----------
-    labels : (n,) int32
-        In place.
-    costs : (n, K) uint16
-        Of each label at each piece, in `UNIT`.
-    graph : Graph
-    """
-    start, neighbours, links = graph.start, graph.neighbours, graph.links
-    for p in range(len(labels)):
-        own = best = labels[p]
-        least = UNIT * np.float32(costs[p, own])
-        for f in range(start[p], start[p + 1]):
-            if labels[neighbours[f]] != own:
-                least += links[f]
-        for e in range(start[p], start[p + 1]):
-            label = labels[neighbours[e]]
-            if label == own:
-                continue
-            value = UNIT * np.float32(costs[p, label])
-            for f in range(start[p], start[p + 1]):
-                if labels[neighbours[f]] != label:
-                    value += links[f]
-            if value < least:
-                best, least = label, value
-        labels[p] = best
 
 
 @njit(cache=True)
@@ -81,7 +49,7 @@ def _regions(
     return count
 
 
-def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> None:
+def relabel_regions(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> None:
     """Give every region in turn the label that costs least, until that changes nothing.
 
     Parameters
@@ -97,7 +65,7 @@ def turn(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph: Graph) -> 
     regions = _regions(labels, graph, region, order, first)
     total = np.empty((regions, count), np.int32)
     strips(_sum_up, count, costs, region, total)
-    _turn(labels, region, order, first, total, graph)
+    _relabel(labels, region, order, first, total, graph)
 
 
 @njit(cache=True, nogil=True)
@@ -117,7 +85,7 @@ def _sum_up(
 
 
 @njit(cache=True)
-def _turn(
+def _relabel(
     labels: NDArray[np.int32],
     region: NDArray[np.int32],
     order: NDArray[np.int32],

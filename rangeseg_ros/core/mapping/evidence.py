@@ -1,0 +1,83 @@
+"""Where a plane of the map is still there: cells of its outline that rays end at or pass."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Polygon
+
+from rangeseg_ros.core.mapping.map_outlines import areas
+
+# Log-odds of a ray that ends at a cell and of one that passes through it, and the bounds of their
+# sum, so that a cell follows a change within ten looks: Hornung et al., "OctoMap", Autonomous
+# Robots 2013.
+_HIT, _MISS, _MOST, _LEAST = 0.85, -0.4, 3.5, -2.0
+# Cells of a plane at most; the side of a cell is a power of two.
+_CELLS = 64
+
+
+class Evidence:
+    """Log-odds that a plane is there, in square cells of its outline.
+
+    Attributes
+    ----------
+    centres : (K, 2) float64
+        Of the cells, metres along the axes of the plane.
+    """
+
+    def __init__(self) -> None:
+        self.centres = np.zeros((0, 2))
+        self._side = 0.0
+        self._keys = np.zeros(0, np.int64)
+        self._odds = np.zeros(0)
+
+    def follow(self, outline: Polygon | MultiPolygon) -> None:
+        """Have the cells of an outline; what is new has just been seen."""
+        side = 2.0 ** math.ceil(math.log2(math.sqrt(max(outline.area, 1e-4) / _CELLS)))
+        if side != self._side:
+            self._side, self._keys, self._odds = side, np.zeros(0, np.int64), np.zeros(0)
+        # Borders are not as certain as what is within.
+        within = outline.buffer(-side / 2)
+        if within.is_empty:
+            within = outline
+        left, low, right, high = within.bounds if not within.is_empty else (0, 0, -1, -1)
+        column = np.arange(math.floor(left / side), math.floor(right / side) + 1)
+        row = np.arange(math.floor(low / side), math.floor(high / side) + 1)
+        cells = np.stack(np.meshgrid(column, row, indexing='ij'), axis=-1).reshape(-1, 2)
+        cells = cells[shapely.contains_xy(within, *((cells + 0.5) * side).T)]
+        if not len(cells) and not outline.is_empty:
+            # A sliver between the middles of cells.
+            point = outline.representative_point()
+            cells = np.floor([[point.x / side, point.y / side]]).astype(np.int64)
+        keys = cells[:, 0] * 2**32 + cells[:, 1]
+        odds = np.full(len(keys), _HIT)
+        known = np.isin(keys, self._keys)
+        odds[known] = self._odds[np.searchsorted(self._keys, keys[known])]
+        order = np.argsort(keys)
+        self._keys, self._odds = keys[order], odds[order]
+        self.centres = (cells[order] + 0.5) * side
+
+    def see(self, found: NDArray[np.int8]) -> bool:
+        """Take in `sightings` of the cells; whether there are any that rays pass through."""
+        self._odds += np.where(found > 0, _HIT, np.where(found < 0, _MISS, 0))
+        np.clip(self._odds, _LEAST, _MOST, out=self._odds)
+        return bool((self._odds < 0).any())
+
+    def remaining(self, outline: Polygon | MultiPolygon) -> Polygon | MultiPolygon:
+        """What is left of an outline without the cells that rays pass through."""
+        gone = self._odds < 0
+        if gone.all():
+            return Polygon()
+        half = self._side / 2
+        around = []
+        for chosen, reach in ((~gone, 2 * half), (gone, half)):
+            x, y = self.centres[chosen].T
+            around.append(
+                shapely.union_all(shapely.box(x - reach, y - reach, x + reach, y + reach))
+            )
+        kept = areas(outline.intersection(around[0]).difference(around[1]))
+        self.follow(kept)
+        return kept

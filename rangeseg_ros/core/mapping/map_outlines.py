@@ -1,0 +1,136 @@
+"""Outlines of planes that grow with every look: unions of polygons on the plane."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Polygon
+
+# Corners that an outline may have: what is more is rounded off, so that memory is bounded.
+_CORNERS = 400
+
+
+@dataclass(frozen=True, eq=False)
+class MapOutline:
+    """Parts of a plane that were seen, in the fixed frame.
+
+    Attributes
+    ----------
+    parts : list of list of (N, 3) float64
+        For each part, largest first, its border, counter-clockwise seen from where the
+        plane was seen, and the borders of its holes, clockwise.
+    """
+
+    parts: list[list[NDArray[np.float64]]]
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """(N, 3) border of the largest part, metres."""
+        return self.parts[0][0] if self.parts else np.zeros((0, 3))
+
+    @property
+    def holes(self) -> list[NDArray[np.float64]]:
+        """Borders (N, 3) of the holes in the largest part."""
+        return self.parts[0][1:] if self.parts else []
+
+
+def polygon_of(
+    hull: NDArray[np.float64], holes: Iterable[NDArray[np.float64]]
+) -> Polygon | MultiPolygon:
+    """Polygon of rings (N, 2); empty when they enclose nothing."""
+    if len(hull) < 3:
+        return Polygon()
+    return areas(shapely.make_valid(Polygon(hull, [hole for hole in holes if len(hole) > 2])))
+
+
+def areas(shape: shapely.Geometry) -> Polygon | MultiPolygon:
+    """The polygons among what a geometry is made of."""
+    if isinstance(shape, Polygon | MultiPolygon):
+        return shape
+    parts = [part for part in shapely.get_parts(shape) if isinstance(part, Polygon)]
+    return MultiPolygon(parts)
+
+
+def united(
+    outline: Polygon | MultiPolygon, seen: Polygon | MultiPolygon, resolution: float
+) -> Polygon | MultiPolygon:
+    """Union of outlines without details smaller than `resolution` (metres).
+
+    Gaps narrower than that are closed and smaller holes and parts left out, and the
+    border is followed within a quarter of it; where it has many corners still, less closely.
+    """
+    grown = outline.union(seen).buffer(resolution / 2, join_style='mitre')
+    return rounded(grown.buffer(-resolution / 2, join_style='mitre'), resolution)
+
+
+def rounded(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPolygon:
+    """An outline without details smaller than `resolution`, of a bounded number of corners."""
+    least = resolution**2
+    while True:
+        simple = areas(outline.simplify(resolution / 4))
+        parts = [
+            Polygon(part.exterior, [r for r in part.interiors if Polygon(r).area >= least])
+            for part in shapely.get_parts(simple)
+            if part.area >= least
+        ]
+        result = parts[0] if len(parts) == 1 else MultiPolygon(parts)
+        if shapely.get_num_coordinates(result) <= _CORNERS:
+            return result
+        resolution, least = 2 * resolution, 4 * least
+
+
+def rings(outline: Polygon | MultiPolygon) -> list[list[NDArray[np.float64]]]:
+    """Rings (N, 2), not closed, of each part, largest first; borders counter-clockwise."""
+    parts = sorted(shapely.get_parts(outline), key=lambda part: -part.area)
+    result = []
+    for part in parts:
+        turned = shapely.geometry.polygon.orient(part)
+        lines = turned.exterior, *turned.interiors
+        result.append([np.asarray(ring.coords)[:-1] for ring in lines])
+    return result
+
+
+class Shape(NamedTuple):
+    """Size and place of an outline on its plane.
+
+    Attributes
+    ----------
+    area : float
+        Square metres.
+    centroid : (2,) float64
+    axis : (2,) float64
+        Unit vector along the length.
+    limits : (2, 2) float64
+        Least and greatest coordinate along the axis and across it.
+    """
+
+    area: float
+    centroid: NDArray[np.float64]
+    axis: NDArray[np.float64]
+    limits: NDArray[np.float64]
+
+
+def shape_of(parts: Sequence[Sequence[NDArray[np.float64]]]) -> Shape:
+    """Area, centroid and rectangle along the principal axes of the area, of `rings`."""
+    area, first, second = 0.0, np.zeros(2), np.zeros((2, 2))
+    for part in parts:
+        for ring in part:
+            # Green's theorem; holes run the other way round.
+            a, b = ring, np.roll(ring, -1, axis=0)
+            cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+            area += cross.sum() / 2
+            first += (cross[:, None] * (a + b)).sum(axis=0) / 6
+            outer = np.einsum('n,ni,nj->ij', cross, a + b, a + b)
+            outer += np.einsum('n,ni,nj->ij', cross, a, a) + np.einsum('n,ni,nj->ij', cross, b, b)
+            second += outer / 24
+    centroid = first / max(area, 1e-12)
+    _, vectors = np.linalg.eigh(second / max(area, 1e-12) - np.outer(centroid, centroid))
+    axis = vectors[:, 1]
+    frame = np.stack([axis, [-axis[1], axis[0]]])
+    points = np.concatenate([ring for part in parts for ring in part]) @ frame.T
+    return Shape(area, centroid, axis, np.stack([points.min(axis=0), points.max(axis=0)], axis=1))

@@ -1,0 +1,365 @@
+"""The map of planes: what every frame shows of the planes of a fixed frame, fused over time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.evidence import Evidence
+from rangeseg_ros.core.mapping.map_outlines import MapOutline, polygon_of, rings, shape_of, united
+from rangeseg_ros.core.mapping.plane_filter import (
+    Observations,
+    PlaneFilters,
+    PoseNoise,
+    observations,
+)
+from rangeseg_ros.core.mapping.sightings import sightings
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+# Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
+_GATE = 16.27
+# Samples along a side of a cell of the image, see `views`.
+_SAMPLES = 16
+# Observations that make a plane of the map: fewer are what one frame takes for a plane.
+_CONFIRMED = 3
+# Largest angle, and offset as share of the range, of what may be one plane: beyond is no error of
+# the sensor but another plane, however uncertain both are.
+_WIDEST, _FARTHEST = np.radians(15.0), 0.1
+# Nanoseconds between unions of an outline: five a second follow what a hand or a robot shows.
+_UNION_INTERVAL = 200_000_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapPlane(Plane):
+    """A plane of the map; normal . p + distance = 0 in the fixed frame.
+
+    All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
+    seen from. `count` is the number of pixels of all observations, `rms` and
+    `confidence` are means over them, and `role` is what most observations found.
+
+    Attributes
+    ----------
+    observations : int
+        Number of regions that were fused.
+    age : float
+        Seconds between the first and the last sight of it.
+    first_stamp, last_stamp : int
+        Of these, nanoseconds.
+    """
+
+    outline: MapOutline  # type: ignore[assignment]
+    observations: int
+    age: float
+    first_stamp: int
+    last_stamp: int
+
+
+@dataclass(eq=False)
+class _Record:
+    """What is kept of a plane beside its equation."""
+
+    id: int
+    first: int
+    last: int
+    observations: int = 0
+    pixels: int = 0
+    squares: float = 0.0
+    confidence: float = 0.0
+    roles: Counter[str] = field(default_factory=Counter)
+    outline: shapely.Geometry = field(default_factory=shapely.Polygon)
+    united: int | None = None
+    evidence: Evidence = field(default_factory=Evidence)
+
+    def add(self, plane: Plane, stamp: int) -> None:
+        self.last = stamp
+        self.observations += 1
+        self.pixels += plane.count
+        self.squares += plane.count * plane.rms**2
+        self.confidence += plane.count * plane.confidence
+        self.roles[plane.role] += 1
+
+    def absorb(self, other: _Record) -> None:
+        self.id = min(self.id, other.id)
+        self.first, self.last = min(self.first, other.first), max(self.last, other.last)
+        self.observations += other.observations
+        self.pixels += other.pixels
+        self.squares += other.squares
+        self.confidence += other.confidence
+        self.roles += other.roles
+
+
+class PlaneMap:
+    """Planes of a fixed frame, from the planes of frames whose poses are known.
+
+    Examples
+    --------
+    >>> plane_map = PlaneMap(config)
+    >>> plane_map.add(result.labels, result.planes, image, pose, stamp)
+    >>> plane_map.planes
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self._next = 1
+        self.clear()
+
+    def clear(self) -> None:
+        """Begin anew; ids are not given twice."""
+        self._records: list[_Record] = []
+        self._filters: PlaneFilters | None = None
+
+    def __len__(self) -> int:
+        return sum(record.observations >= _CONFIRMED for record in self._records)
+
+    def add(
+        self,
+        labels: NDArray[np.uint16],
+        planes: Sequence[Plane],
+        image: RangeImage,
+        pose: Transform,
+        stamp: int,
+    ) -> None:
+        """Take in a frame.
+
+        Parameters
+        ----------
+        labels : (H, W) uint16
+        planes : sequence of Plane
+            Of these labels, in the frame of the image, tracked and with their roles.
+        image : RangeImage
+            What was measured: its rays tell which planes are gone.
+        pose : Transform
+            Fixed frame from the frame of the image.
+        stamp : int
+            Nanoseconds.
+        """
+        config = self.config
+        noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
+        if planes:
+            seen = observations(
+                planes, views(labels, planes, 2 * config.distortion_length), pose, noise
+            )
+            match = self._associate(planes, seen)
+            self._fuse(planes, seen, match, pose, stamp)
+            self._merge(np.unique(match), pose.shift)
+        self._contradict(image, pose, noise)
+
+    @property
+    def planes(self) -> list[MapPlane]:
+        """The planes that were seen often enough, in the order of their ids."""
+        if self._filters is None:
+            return []
+        covariance = self._filters.plane_covariance()
+        found = [
+            self._described(k, covariance[k])
+            for k, record in enumerate(self._records)
+            if record.observations >= _CONFIRMED and not record.outline.is_empty
+        ]
+        return sorted(found, key=lambda plane: plane.id)
+
+    def _associate(self, planes: Sequence[Plane], seen: Observations) -> NDArray[np.intp]:
+        """(M,) number of the plane of the map that each plane is, -1 for none."""
+        match = np.full(len(planes), -1)
+        filters = self._filters
+        if filters is None:
+            return match
+        gap = filters.normal @ seen.centroid.T + filters.distance[:, None]
+        close = filters.normal @ seen.plane[:, :3].T > np.cos(_WIDEST)
+        close &= np.abs(gap) < _FARTHEST * seen.range
+        index, which = np.nonzero(close)
+        if not len(index):
+            return match
+        value = filters.innovations(index, seen, which)
+        reach = np.array([np.hypot(*plane.extents) / 2 for plane in planes])
+        at = filters.coordinates(index, seen.centroid[which])
+        outlines = np.array([self._records[k].outline for k in index], object)
+        away = shapely.distance(outlines, shapely.points(at))
+        fits = (value < _GATE) & (away <= 2 * reach[which])
+        # The one it lies on, or else the likeliest.
+        order = np.lexsort([value, away > 0])
+        for pair in order[fits[order]]:
+            if match[which[pair]] < 0:
+                match[which[pair]] = index[pair]
+        return match
+
+    def _fuse(
+        self,
+        planes: Sequence[Plane],
+        seen: Observations,
+        match: NDArray[np.intp],
+        pose: Transform,
+        stamp: int,
+    ) -> None:
+        """Take in the planes of a frame: of parts of one plane, the largest decides on it."""
+        count = np.array([plane.count for plane in planes])
+        order = np.lexsort([-count, match])
+        known = order[match[order] >= 0]
+        largest = known[np.unique(match[known], return_index=True)[1]]
+        if self._filters is not None and len(largest):
+            self._filters.update(match[largest], seen, largest)
+        new = order[match[order] < 0]
+        if len(new):
+            match[new] = len(self._records) + np.arange(len(new))
+            first = PlaneFilters.of(Observations(*(part[new] for part in seen)))
+            self._filters = self._filters.joined(first) if self._filters else first
+            for _ in new:
+                self._records.append(_Record(self._next, stamp, stamp))
+                self._next += 1
+        for plane, k in zip(planes, match.tolist(), strict=True):
+            self._records[k].add(plane, stamp)
+        for k in np.unique(match).tolist():
+            record = self._records[k]
+            if record.united is None or abs(stamp - record.united) >= _UNION_INTERVAL:
+                record.united = stamp
+                for part in np.flatnonzero(match == k).tolist():
+                    self._unite(k, planes[part], pose)
+
+    def _unite(self, k: int, plane: Plane, pose: Transform) -> None:
+        """Add what is seen of a plane to its outline."""
+        filters = self._filters
+        assert filters is not None
+
+        def flat(ring: NDArray[np.float64]) -> NDArray[np.float64]:
+            world = ring @ pose.rotation.T + pose.shift
+            return filters.coordinates(np.full(len(ring), k), world)
+
+        self._grow(k, polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes]))
+
+    def _merge(self, changed: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
+        """Unite planes of the map that turn out to be one with those that have just changed."""
+        filters = self._filters
+        assert filters is not None
+        gone: list[int] = []
+        for k in changed.tolist():
+            for m in filters.alike(k, camera, _GATE, _WIDEST, _FARTHEST).tolist():
+                if m in gone or k in gone or not self._touch(k, m):
+                    continue
+                kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
+                filters.absorb(kept, lost)
+                self._records[kept].absorb(self._records[lost])
+                self._grow(kept, self._across(lost, kept))
+                gone.append(lost)
+        if gone:
+            self._keep(np.isin(np.arange(len(self._records)), gone, invert=True))
+
+    def _touch(self, k: int, m: int) -> bool:
+        """Whether outlines are no farther apart than the smaller one is large."""
+        a, b = self._records[k].outline, self._across(m, k)
+        if a.is_empty or b.is_empty:
+            return True
+        reach = min(np.hypot(x - u, y - v) for u, v, x, y in (a.bounds, b.bounds))
+        return bool(a.distance(b) <= reach)
+
+    def _across(self, source: int, target: int) -> shapely.Geometry:
+        """Outline of one plane on another."""
+        filters = self._filters
+        assert filters is not None
+        point, axes = filters.point, filters.axes
+        turn = axes[target] @ axes[source].T
+        shift = axes[target] @ (point[source] - point[target])
+        return shapely.transform(self._records[source].outline, lambda xy: xy @ turn.T + shift)
+
+    def _grow(self, k: int, part: shapely.Geometry) -> None:
+        record = self._records[k]
+        record.outline = united(record.outline, part, self.config.map_resolution)
+        record.evidence.follow(record.outline)
+
+    def _keep(self, chosen: NDArray[np.bool_]) -> None:
+        assert self._filters is not None
+        self._filters = self._filters.where(chosen)
+        self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
+
+    def _contradict(self, image: RangeImage, pose: Transform, noise: PoseNoise) -> None:
+        """Take away what rays pass through."""
+        filters = self._filters
+        if filters is None or not self._records:
+            return
+        centres = [record.evidence.centres for record in self._records]
+        owner = np.repeat(np.arange(len(centres)), [len(part) for part in centres])
+        at = np.concatenate(centres)
+        points, sigma = filters.places(owner, at)
+        points = (points - pose.shift) @ pose.rotation
+        spread = noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
+        found = sightings(
+            points,
+            (filters.normal @ pose.rotation)[owner],
+            np.sqrt(sigma**2 + spread),
+            image,
+            SensorModel.from_config(self.config),
+        )
+        ends = np.cumsum([0, *(len(part) for part in centres)])
+        for k in np.unique(owner[found != 0]).tolist():
+            record = self._records[k]
+            if record.evidence.see(found[ends[k] : ends[k + 1]]):
+                record.outline = record.evidence.remaining(record.outline)
+        self._keep(np.array([not record.outline.is_empty for record in self._records]))
+
+    def _described(self, k: int, covariance: NDArray[np.float64]) -> MapPlane:
+        filters, record = self._filters, self._records[k]
+        assert filters is not None
+        normal, point, axes = filters.normal[k], filters.point[k], filters.axes[k]
+        parts = rings(record.outline)
+        shape = shape_of(parts)
+        frame = np.stack([shape.axis, [-shape.axis[1], shape.axis[0]]]) @ axes
+        middle = shape.limits.mean(axis=1) @ frame
+        turn = Rotation.from_matrix(np.stack([*frame, normal], axis=1)).as_quat()
+        return MapPlane(
+            label=record.id,
+            id=record.id,
+            surface=record.id,
+            normal=normal.copy(),
+            distance=float(filters.distance[k]),
+            covariance=covariance,
+            centroid=point + shape.centroid @ axes,
+            count=record.pixels,
+            rms=float(np.sqrt(record.squares / record.pixels)),
+            confidence=record.confidence / record.pixels,
+            area=shape.area,
+            extents=shape.limits[:, 1] - shape.limits[:, 0],
+            centre=point + middle,
+            orientation=turn if turn[3] >= 0 else -turn,
+            outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
+            role=record.roles.most_common(1)[0][0],
+            observations=record.observations,
+            age=(record.last - record.first) * 1e-9,
+            first_stamp=record.first,
+            last_stamp=record.last,
+        )
+
+
+def views(labels: NDArray[np.uint16], planes: Sequence[Plane], cell: float) -> NDArray[np.float64]:
+    """Where in the image planes are: pixels in each square cell, as unit vectors.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+    planes : sequence of Plane
+    cell : float
+        Side of the cells, pixels.
+
+    Returns
+    -------
+    (M, C) float64
+    """
+    step = max(int(cell // _SAMPLES), 1)
+    coarse = labels[::step, ::step]
+    side = max(int(cell / step), 1)
+    rows, columns = (np.arange(size) // side for size in coarse.shape)
+    number = np.zeros(65536, np.intp)
+    number[[plane.label for plane in planes]] = np.arange(1, len(planes) + 1)
+    count = int(rows[-1] + 1) * int(columns[-1] + 1)
+    place = number[coarse] * count + rows[:, None] * (columns[-1] + 1) + columns
+    pixels = np.bincount(place.ravel(), minlength=count * (len(planes) + 1))
+    found = pixels.reshape(-1, count)[1:].astype(np.float64)
+    length: NDArray[np.float64] = np.linalg.norm(found, axis=1, keepdims=True)
+    return found / np.maximum(length, 1)

@@ -1,0 +1,63 @@
+"""What the rays of an image say of places where something is known to be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+
+THERE, UNSEEN, THROUGH = 1, 0, -1
+
+# Standard deviations beyond which a ray went through: one in 16000 of those that ended there.
+_GATE = 4.0
+# Least cosine of incidence: 3 degrees, where rays run along what they could pass through.
+_GRAZING = 0.05
+
+
+def sightings(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    sigma: NDArray[np.float64],
+    image: RangeImage,
+    sensor: SensorModel,
+) -> NDArray[np.int8]:
+    """Whether rays end at points of planes, pass through them or do not get there.
+
+    Parameters
+    ----------
+    points, normals : (K, 3) float64
+        Places and the normals of their planes, in the frame of the image.
+    sigma : (K,) float64
+        Standard deviation of the places along the normals, metres.
+    image : RangeImage
+        Of a camera: in a cloud, nobody knows which pixel looks where.
+    sensor : SensorModel
+
+    Returns
+    -------
+    (K,) int8
+        `THERE`, `UNSEEN` (not in the image, not measured, or behind something), `THROUGH`.
+    """
+    found = np.zeros(len(points), np.int8)
+    camera = image.camera
+    if camera is None:
+        return found
+    ahead = points[:, 2] > 0
+    depth = np.where(ahead, points[:, 2], 1)
+    column = np.rint(camera.fx * points[:, 0] / depth + camera.cx)
+    row = np.rint(camera.fy * points[:, 1] / depth + camera.cy)
+    slope = np.abs((points * normals).sum(axis=1))
+    inside = ahead & (slope > _GRAZING * np.linalg.norm(points, axis=1))
+    inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    k = np.flatnonzero(inside)
+    measured = image.inverse[row[k].astype(np.intp), column[k].astype(np.intp)].astype(np.float64)
+    expected = 1 / depth[k]
+    variance = random_variance(sensor, expected**2) + systematic_variance(sensor, expected**2)
+    # Along the ray, the inverse depth changes by 1 / z for every n . p.
+    variance += (sigma[k] * expected / slope[k]) ** 2
+    beyond = (expected - measured) / np.sqrt(variance)
+    seen = (measured > 0) & (beyond >= -_GATE)
+    found[k[seen]] = np.where(beyond[seen] > _GATE, THROUGH, THERE)
+    return found

@@ -1,0 +1,125 @@
+"""Distortion maps in files: TIFF with a float32 page for each of offset, deviation and slope.
+
+The description tag of the first page holds, as JSON, the reference of the slope and the camera;
+other programs' maps, of one page and without a description, are read as well.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from dataclasses import asdict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageSequence, TiffImagePlugin
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.io.files import replacing
+
+KIND = 'rangeseg_ros distortion map'
+_DESCRIPTION = 270
+
+
+def corrected(image: RangeImage, config: Config) -> RangeImage:
+    """`image` without the distortion of the map that `config` names; itself without one.
+
+    Raises
+    ------
+    DistortionError
+        The map cannot be read, or is of another size or camera.
+    """
+    if not config.distortion_map:
+        return image
+    path = Path(config.distortion_map)
+    return load(path).corrected(image)
+
+
+def load(path: Path) -> DistortionMap:
+    """Read a map, once as long as the file does not change; as `read_distortion`."""
+    try:
+        state = path.stat()
+    except OSError as error:
+        raise DistortionError(f'{path}: {error.strerror}') from None
+    return _kept(path, state.st_mtime_ns, state.st_size)
+
+
+@lru_cache(maxsize=4)
+def _kept(path: Path, time: int, size: int) -> DistortionMap:
+    return read_distortion(path)
+
+
+def read_distortion(path: Path) -> DistortionMap:
+    """Read a distortion map.
+
+    Raises
+    ------
+    DistortionError
+        A missing or unreadable file; pages that are not float32 of one size, or not finite.
+    """
+    try:
+        # Of damage the reader only warns.
+        with warnings.catch_warnings():
+            warnings.simplefilter('error')
+            with Image.open(path, formats=['TIFF']) as file:
+                description = str(file.tag_v2.get(_DESCRIPTION, ''))  # type: ignore[attr-defined]
+                pages = [_page(page) for page in ImageSequence.Iterator(file)]
+    except DistortionError as error:
+        raise DistortionError(f'{path}: {error}') from None
+    except FileNotFoundError as error:
+        raise DistortionError(f'{path}: {error.strerror}') from None
+    # Damaged files are met with exceptions of every kind.
+    except Exception:
+        raise DistortionError(f'{path}: not a readable TIFF') from None
+    if len(pages) > 3 or any(page.shape != pages[0].shape for page in pages):
+        raise DistortionError(f'{path}: not one to three pages of one size')
+    about = _about(description)
+    try:
+        camera = Camera(**about['camera']) if about.get('camera') else None
+        reference = float(about.get('reference', 0.0))
+    except (TypeError, ValueError):
+        raise DistortionError(f'{path}: damaged description') from None
+    offset, deviation, slope = [*pages, None, None][:3]
+    assert offset is not None
+    return DistortionMap(offset, deviation, slope, reference, camera)
+
+
+def write_distortion(path: Path, distortion: DistortionMap) -> None:
+    """Write a distortion map, whole or not at all."""
+    pages = [distortion.offset]
+    if distortion.deviation is not None:
+        pages.append(distortion.deviation)
+        if distortion.slope is not None:
+            pages.append(distortion.slope)
+    about: dict[str, Any] = {'kind': KIND, 'unit': '1/m', 'reference': distortion.reference}
+    if distortion.camera is not None:
+        about['camera'] = asdict(distortion.camera)
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    tags[_DESCRIPTION] = json.dumps(about)
+    first, *others = (Image.fromarray(np.ascontiguousarray(page, np.float32)) for page in pages)
+    with replacing(path) as partial:
+        first.save(partial, 'TIFF', save_all=True, append_images=others, tiffinfo=tags)
+
+
+def _page(page: Image.Image) -> NDArray[np.float32]:
+    if page.mode != 'F':
+        raise DistortionError(f'a distortion map is float32 of one channel, not {page.mode}')
+    values = np.array(page, np.float32)
+    if not np.isfinite(values).all():
+        raise DistortionError('values that are not finite')
+    values.setflags(write=False)
+    return values
+
+
+def _about(description: str) -> dict[str, Any]:
+    try:
+        about = json.loads(description)
+    except ValueError:
+        return {}
+    return about if isinstance(about, dict) and about.get('kind') == KIND else {}

@@ -1,0 +1,52 @@
+"""Polygons as coloured triangle meshes: PLY files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.description.outlines import triangles
+from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.io.files import replacing
+
+_HEADER = """ply
+format ascii 1.0
+comment planes of a map, metres
+element vertex {}
+property double x
+property double y
+property double z
+property uchar red
+property uchar green
+property uchar blue
+element face {}
+property list uchar int vertex_indices
+end_header
+"""
+
+
+def write_mesh(path: Path, planes: Sequence[MapPlane], colours: NDArray[np.uint8]) -> None:
+    """Write the outlines of planes, all parts with their holes, as triangles.
+
+    Parameters
+    ----------
+    path : Path
+    planes : sequence of MapPlane
+    colours : (N, 3) uint8
+        Of the planes.
+    """
+    vertices: list[str] = []
+    faces: list[str] = []
+    for plane, colour in zip(planes, colours.tolist(), strict=True):
+        for rings in plane.outline.parts:
+            first = len(vertices)
+            rgb = ' '.join(map(str, colour))
+            corners = np.concatenate(rings).tolist()
+            vertices += [f'{x:.6f} {y:.6f} {z:.6f} {rgb}' for x, y, z in corners]
+            faces += ['3 {} {} {}'.format(*t) for t in first + triangles(rings, plane.normal)]
+    text = _HEADER.format(len(vertices), len(faces))
+    with replacing(path) as partial:
+        partial.write_text(text + ''.join(f'{line}\n' for line in [*vertices, *faces]))

@@ -1,0 +1,150 @@
+"""The fixed distortion of a sensor: subtracted as the contract says, read from damaged files."""
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
+from rangeseg_ros.cli.segment import command
+from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.distortion import load, read_distortion, write_distortion
+from rangeseg_ros.io.images import write_image
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+
+
+def smooth_map(scale=0.01):
+    v, u = np.indices(CAMERA.shape)
+    return (scale * np.sin(u / 9) * np.cos(v / 7)).astype(np.float32)
+
+
+def wall():
+    """A slanted wall: true inverse depth."""
+    return (CAMERA.rays.astype(float) @ [0.1, -0.2, 0.5]).astype(np.float32)
+
+
+def test_map_is_subtracted_from_inverse_depth():
+    seen = wall() + smooth_map()
+    seen[5, 6] = 0
+    depth = np.divide(1, seen, out=np.zeros_like(seen), where=seen > 0)
+    image = RangeImage.from_depth(depth, CAMERA)
+    found = DistortionMap(smooth_map(), camera=CAMERA).corrected(image)
+    expected = wall()
+    expected[5, 6] = 0
+    assert found.inverse == pytest.approx(expected, abs=1e-6)
+    assert found.corrected and not image.corrected
+
+
+def test_clouds_are_corrected_along_their_rays():
+    true = CAMERA.rays / wall()[..., None]
+    seen = CAMERA.rays / (wall() + smooth_map())[..., None]
+    seen[3, 4] = np.nan
+    image = DistortionMap(smooth_map()).corrected(RangeImage.from_points(seen))
+    valid = image.valid
+    assert valid.sum() == valid.size - 1
+    assert image.points[valid] == pytest.approx(true[valid], rel=1e-5)
+
+
+def test_slope_acts_around_the_reference():
+    slope = np.full(CAMERA.shape, 0.1, np.float32)
+    image = RangeImage.from_depth((1 / wall()).astype(np.float32), CAMERA)
+    found = DistortionMap(smooth_map(), None, slope, 0.5).corrected(image)
+    error = smooth_map() + 0.1 * (wall() - 0.5)
+    assert found.inverse == pytest.approx(wall() - error, abs=1e-6)
+
+
+def test_what_lies_beyond_infinity_was_not_measured():
+    image = RangeImage.from_depth(np.full(CAMERA.shape, 200, np.float32), CAMERA)
+    found = DistortionMap(np.full(CAMERA.shape, 0.01, np.float32)).corrected(image)
+    assert not found.valid.any()
+
+
+def test_size_and_camera_are_checked():
+    distortion = DistortionMap(smooth_map(), camera=CAMERA)
+    other = Camera(32, 24, 30.0, 30.0, 15.5, 11.5)
+    with pytest.raises(DistortionError, match='64x48, the image 32x24'):
+        distortion.corrected(RangeImage.from_depth(np.ones(other.shape, np.float32), other))
+    other = Camera(64, 48, 70.0, 60.0, 31.5, 23.5)
+    with pytest.raises(DistortionError, match='another camera: fx 60, not 70'):
+        distortion.corrected(RangeImage.from_depth(np.ones(other.shape, np.float32), other))
+
+
+def test_segmenter_does_not_forget_the_map(tmp_path):
+    write_distortion(tmp_path / 'map.tiff', DistortionMap(smooth_map()))
+    config = Config(distortion_map=str(tmp_path / 'map.tiff'), min_pixels=50)
+    image = RangeImage.from_depth((1 / wall()).astype(np.float32), CAMERA)
+    with pytest.raises(RangeImageError, match=r'corrected\(image, config\)'):
+        Segmenter(config).segment(image)
+    assert Segmenter(config).segment(corrected(image, config)) is not None
+
+
+@pytest.mark.parametrize('pages', [1, 2, 3])
+def test_file_holds_the_map(tmp_path, pages):
+    parts = [smooth_map(), abs(smooth_map()), smooth_map(0.1)][:pages]
+    distortion = DistortionMap(*[*parts, None, None][:3], reference=0.6, camera=CAMERA)
+    path = tmp_path / 'map.tiff'
+    write_distortion(path, distortion)
+    read = read_distortion(path)
+    for name in ('offset', 'deviation', 'slope'):
+        before, after = getattr(distortion, name), getattr(read, name)
+        assert (before is None and after is None) or np.array_equal(before, after)
+    assert read.camera == CAMERA and read.reference == 0.6
+    # Readers of one page read the offset.
+    assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), smooth_map())
+    assert [file.name for file in tmp_path.iterdir()] == ['map.tiff']
+
+
+def test_maps_of_other_programs_are_read(tmp_path):
+    path = tmp_path / 'map.tiff'
+    cv2.imwrite(str(path), smooth_map())
+    read = read_distortion(path)
+    assert np.array_equal(read.offset, smooth_map()) and read.camera is None
+
+
+def test_a_changed_file_is_read_again(tmp_path):
+    path = tmp_path / 'map.tiff'
+    write_distortion(path, DistortionMap(smooth_map()))
+    assert load(path) is load(path)
+    write_distortion(path, DistortionMap(smooth_map(0.02)))
+    assert np.array_equal(load(path).offset, smooth_map(0.02))
+
+
+@given(data=st.data())
+def test_damaged_files_are_refused(tmp_path_factory, data):
+    path = tmp_path_factory.mktemp('maps') / 'map.tiff'
+    write_distortion(path, DistortionMap(smooth_map(), abs(smooth_map()), camera=CAMERA))
+    content = bytearray(path.read_bytes())
+    del content[data.draw(st.integers(0, len(content))) :]
+    for _ in range(data.draw(st.integers(0, 3))):
+        if content:
+            place = data.draw(st.integers(0, len(content) - 1))
+            content[place] = data.draw(st.integers(0, 255))
+    path.write_bytes(bytes(content))
+    try:
+        assert np.isfinite(read_distortion(path).offset).all()
+    except DistortionError as error:
+        assert str(path) in str(error) and '\n' not in str(error)
+
+
+@pytest.mark.parametrize('kind', ['missing', 'png', 'nan', 'integers'])
+def test_wrong_files_end_the_command_in_one_line(tmp_path, kind):
+    path = tmp_path / 'map.tiff'
+    if kind == 'png':
+        path.write_bytes(cv2.imencode('.png', np.zeros(CAMERA.shape, np.uint16))[1].tobytes())
+    elif kind == 'nan':
+        cv2.imwrite(str(path), np.full(CAMERA.shape, np.nan, np.float32))
+    elif kind == 'integers':
+        cv2.imwrite(str(path), np.zeros(CAMERA.shape, np.uint16))
+    write_camera(tmp_path / 'camera.yaml', CAMERA)
+    write_image(tmp_path / 'depth.png', np.full(CAMERA.shape, 1000, np.uint16))
+    (tmp_path / 'params.yaml').write_text(f'distortion_map: {path}\n')
+    names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
+    paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
+    result = CliRunner().invoke(command, paths)
+    assert result.exit_code != 0 and str(path) in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert not (tmp_path / 'out').exists()

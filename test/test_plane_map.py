@@ -1,0 +1,185 @@
+"""The map of planes: estimates against truth, growth, what is gone, what is one."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import shapely
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
+from rangeseg_ros.core.mapping import plane_filter
+from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, PoseNoise, observations
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sequence import with_roles
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.solids import box, half_space
+
+CAMERA = kinect_camera(160, 120)
+SENSOR = SensorModel.from_config(Config())
+NOISE = PoseNoise(0.005, np.radians(0.3))
+
+
+def observed(random, pose, truth, root, lasting):
+    """A plane that errs by a pattern (what lasts) and by what is new, as the filter has it."""
+    normal = pose.rotation.T @ truth[:3]
+    distance = truth[3] + truth[:3] @ pose.shift
+    share = plane_filter._LASTING
+    error = np.sqrt(share) * lasting + np.sqrt(1 - share) * random.standard_normal(3)
+    theta = -normal / distance + root @ error
+    distance = 1 / np.linalg.norm(theta)
+    normal = -theta * distance
+    jacobian = plane_jacobians(normal[None], np.array([distance]))[0]
+    centroid = pose.rotation.T @ (np.array([0.3, 0.8, 0]) - pose.shift)
+    return SimpleNamespace(
+        normal=normal,
+        distance=distance,
+        covariance=jacobian @ root @ root.T @ jacobian.T / plane_filter._RESIDUE,
+        centroid=centroid - (normal @ centroid + distance) * normal,
+        confidence=1.0,
+        rms=0.0,
+        area=1.0,
+    )
+
+
+@pytest.mark.parametrize('pattern', ['stays', 'changes'])
+def test_the_filter_knows_how_far_it_is_off(pattern):
+    random = np.random.default_rng(0)
+    truth = np.array([0, 0, 1, 0.0])
+    values, errors = [], []
+    for _ in range(60):
+        root = 0.003 * random.standard_normal((3, 3))
+        root = (root + root.T) / 2
+        lasting, filters = random.standard_normal(3), None
+        for k in range(15):
+            turn = Rotation.from_rotvec(random.normal(0, 0.1, 3))
+            turn *= Rotation.from_euler('x', -120, degrees=True)
+            pose = Transform(turn.as_matrix(), np.array([random.uniform(-1, 1), -1, 1.2]))
+            if pattern == 'changes':
+                lasting = random.standard_normal(3)
+            values_, vectors = np.linalg.eigh(root @ root)
+            plane = observed(random, pose, truth, vectors * np.sqrt(values_) @ vectors.T, lasting)
+            off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
+            told = Transform(off @ pose.rotation, pose.shift + random.normal(0, NOISE.shift, 3))
+            view = np.eye(15)[[k if pattern == 'changes' else 0]]
+            seen = observations([plane], view, told, NOISE)
+            if filters is None:
+                filters = PlaneFilters.of(seen)
+            else:
+                filters.update(np.array([0]), seen, np.array([0]))
+        error = np.append(filters.normal[0], filters.distance[0]) - truth
+        values.append(error @ np.linalg.pinv(filters.plane_covariance()[0], 1e-10) @ error / 3)
+        errors.append(np.linalg.norm(error[:3]))
+    assert 0.7 < np.mean(values) < 1.5
+    assert np.median(errors) < np.radians(0.4)
+
+
+def mapped(scene, frames, config=None, seed=0, start=0):
+    """Map of true regions of a scene, with noise on the poses, and the frames' truths."""
+    plane_map = PlaneMap(config)
+    random = np.random.default_rng(seed)
+    for k in frames:
+        add(plane_map, scene, k, random, start)
+    return plane_map
+
+
+def add(plane_map, scene, k, random, start=0):
+    view = simulate_kinect(scene, CAMERA, frame=k, seed=seed_of(scene))
+    image = RangeImage.from_depth(view.depth, CAMERA)
+    planes = with_roles(fit_planes(view.labels, image, SENSOR), Config(), (0, -1, 0))
+    planes = [plane for plane in planes if plane.count > 100]
+    pose = scene.poses[k]
+    off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
+    told = Transform(off @ pose.rotation, pose.position + random.normal(0, NOISE.shift, 3))
+    plane_map.add(view.labels, planes, image, told, start + 10**9 + k * 10**9 // 30)
+    return view
+
+
+def seed_of(scene):
+    return len(scene.solids)
+
+
+def faces(scene):
+    return np.vstack([solid.planes for solid in scene.solids])
+
+
+def on_face(plane, truth):
+    return truth[:3] @ plane.normal > 0.98 and abs(truth[:3] @ plane.centroid + truth[3]) < 0.05
+
+
+@pytest.mark.parametrize('seed', [3, 8])
+def test_a_walk_maps_every_face_once_and_better_than_single_frames(seed):
+    room = kinect_room(seed)
+    scene = Scene(room.solids, walk(room.poses[0], seed, 150), room.dark)
+    plane_map = mapped(scene, range(0, 150, 5))
+    planes, truth = plane_map.planes, faces(scene)
+    # Floor and walls are there, and nothing else is where they are.
+    for face in truth[:3]:
+        found = [plane for plane in planes if on_face(plane, face)]
+        assert len(found) == 1
+        plane = found[0]
+        assert np.degrees(np.arccos(min(1, plane.normal @ face[:3]))) < 1.5
+        assert abs(face[:3] @ plane.centroid + face[3]) < 0.03
+        assert plane.observations >= 20 and plane.area > 1
+    matched = [sum(on_face(plane, face) for face in truth) for plane in planes]
+    assert min(matched) == 1
+    assert len({plane.id for plane in planes}) == len(planes)
+    assert planes == sorted(planes, key=lambda plane: plane.id)
+    roles = {plane.role for plane in planes}
+    assert {'wall', 'floor'} & roles
+    for plane in planes:
+        assert plane.first_stamp <= plane.last_stamp
+        assert plane.age == pytest.approx((plane.last_stamp - plane.first_stamp) * 1e-9)
+        assert plane.covariance == pytest.approx(plane.covariance.T)
+        for ring in (plane.hull, *plane.holes):
+            np.testing.assert_allclose(ring @ plane.normal + plane.distance, 0, atol=1e-6)
+
+
+def test_what_rays_pass_through_is_gone_within_seconds():
+    pose = Pose.looking((0, 0, 1.2), 0, 20, 0)
+    room = (half_space((0, 0, 1), (0, 0, 0)), half_space((-1, 0, 0), (3.5, 0, 0)))
+    cube = box((0.5, 0.5, 0.8), np.eye(3), (2.0, 0, 0.4))
+    before, after = Scene((*room, cube), (pose,) * 40), Scene(room, (pose,) * 40)
+    random, plane_map = np.random.default_rng(0), PlaneMap()
+    for k in range(12):
+        add(plane_map, before, k, random)
+    front = np.array([-1, 0, 0, 1.75])
+    assert sum(on_face(plane, front) for plane in plane_map.planes) == 1
+    count = len(plane_map)
+    for k in range(12, 32):
+        add(plane_map, after, k, random)
+    assert not any(on_face(plane, front) for plane in plane_map.planes)
+    assert len(plane_map) == count - 2  # front and top
+    # The floor behind it is filled in.
+    floor = next(plane for plane in plane_map.planes if on_face(plane, (0, 0, 1, 0)))
+    assert shapely.Polygon(floor.hull[:, :2]).contains(shapely.Point(2.3, 0))
+
+
+def test_a_map_begun_anew_gives_other_ids():
+    room = kinect_room(0)
+    scene = Scene(room.solids, room.poses * 5)
+    plane_map = mapped(scene, range(4))
+    ids = {plane.id for plane in plane_map.planes}
+    assert ids
+    plane_map.clear()
+    assert plane_map.planes == []
+    for k in range(4):
+        add(plane_map, scene, k, np.random.default_rng(1))
+    assert not ids & {plane.id for plane in plane_map.planes}
+
+
+def test_the_same_frames_give_the_same_map():
+    room = kinect_room(2)
+    scene = Scene(room.solids, walk(room.poses[0], 2, 40), room.dark)
+    one, two = (mapped(scene, range(0, 40, 8)).planes for _ in range(2))
+    assert [plane.id for plane in one] == [plane.id for plane in two]
+    for a, b in zip(one, two, strict=True):
+        assert np.array_equal(a.covariance, b.covariance)
+        assert np.array_equal(a.hull, b.hull)
