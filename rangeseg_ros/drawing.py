@@ -1,4 +1,4 @@
-"""Pictures of segmentations: labels over the depth image, contact sheets."""
+"""Pictures of segmentations: labels over the range image, normals as colours."""
 
 from __future__ import annotations
 
@@ -86,26 +86,6 @@ def normals_picture(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
     colour = 127.5 * (1 + np.nan_to_num(normals) * np.array([1, -1, -1]))
     colour[np.isnan(normals[..., 0])] = 0
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
-
-
-def contact_sheet(
-    pictures: Sequence[NDArray[np.uint8]], titles: Sequence[str] = (), columns: int = 3
-) -> NDArray[np.uint8]:
-    """Tile pictures (H, W, 3), left to right and top to bottom, with titles in the corners.
-
-    Raises
-    ------
-    ValueError
-        No picture, or pictures of different shapes.
-    """
-    if len({picture.shape for picture in pictures}) != 1:
-        raise ValueError('a contact sheet needs pictures of one shape')
-    tiles = [picture.copy() for picture in pictures]
-    for tile, title in zip(tiles, titles, strict=False):
-        _write(tile, title, (0, tile.shape[0]), 0.5)
-    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
-    rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
-    return np.vstack(rows)
 
 
 def _borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.drawing import colours, contact_sheet, grey, overlay
+from rangeseg_ros.drawing import colours, grey, overlay
 
 
 def test_colours_can_be_told_apart():
@@ -55,17 +55,3 @@ def test_any_size_and_no_measurement(shape, value):
     labels = np.ones(shape, np.uint16)
     plane = SimpleNamespace(label=1, id=1)
     assert overlay(inverse, labels, [plane]).shape == (*shape, 3)
-
-
-def test_contact_sheet():
-    pictures = [np.full((4, 6, 3), value, np.uint8) for value in (10, 20, 30)]
-    sheet = contact_sheet(pictures, columns=2)
-    assert sheet.shape == (8, 12, 3)
-    np.testing.assert_array_equal(sheet[:4, 6:], pictures[1])
-    np.testing.assert_array_equal(sheet[4:, :6], pictures[2])
-    assert not sheet[4:, 6:].any()
-    assert (contact_sheet([np.zeros((40, 60, 3), np.uint8)], ['a'], 1) > 0).any()
-    with pytest.raises(ValueError, match='one shape'):
-        contact_sheet([pictures[0], pictures[1][:2]])
-    with pytest.raises(ValueError, match='one shape'):
-        contact_sheet([])

@@ -1,0 +1,164 @@
+"""Draw the figures of the documents: python docs/figures.py [FOLDER], docs/ by default.
+
+docs/planes.png, the picture in the README, and docs/figures/*.png, one picture for each stage of
+method `planes`: on the left a Kinect's frame of a room, on the right a stereo camera's.
+"""
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_planes import method
+from rangeseg_ros.core.by_planes.blocks import (
+    block_links,
+    block_moments,
+    block_size,
+    residual_noise,
+    slopes_and_residuals,
+    weighted,
+)
+from rangeseg_ros.core.by_planes.patches import patches
+from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, surfaces
+from rangeseg_ros.core.regions import plane_regions
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.jump_edges import jump_edges
+from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.drawing import colours, grey, overlay
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.params import read_config
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+
+ROOT = Path(__file__).parents[1]
+WIDTH = 360
+
+
+def main():
+    """Draw everything."""
+    folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
+    frames = [(frame('kinect', 8, 1), Config()), (frame('realsense', 3, 1), settings('realsense'))]
+    kinect, config = frames[0]
+    result = Segmenter(config).segment(kinect)
+    planes = overlay(kinect.inverse, result.labels, result.planes)
+    write_image(folder / 'planes.png', np.hstack([in_grey(kinect), planes]))
+    both = [stages(*each) for each in frames]
+    for name in both[0]:
+        pair = [fitted(pictures[name]) for pictures in both]
+        write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
+
+
+def frame(sensor, scene, seed):
+    """Range image of a room."""
+    seen = simulate(kinect_room(scene, seed), SENSORS[sensor](seed), seed=scene)
+    return RangeImage.from_depth(seen.depth, seen.camera)
+
+
+def settings(name):
+    """Parameters for a sensor, the defaults where it has no file."""
+    path = ROOT / 'params' / f'{name}.yaml'
+    return read_config(path) if path.exists() else Config()
+
+
+def stages(image, config):
+    """Pictures (H, W, 3) of what each stage has found, in their order."""
+    pictures = {'depth': in_grey(image)}
+    jumps = jump_edges(image, config)
+    grid = weights(image, jumps, config.weighting)
+    pictures['edges'] = with_edges(image, jumps)
+
+    size = block_size(image.shape)
+    blocks = block_moments(image.inverse, image.rays, grid, size)
+    slope, residual = slopes_and_residuals(blocks, image.rays, size)
+    stated = SensorModel.from_config(config)
+    noise = residual_noise(blocks, residual, size)
+    sensor = stated.measured(*noise)
+    pictures['noise'] = noise_chart(*noise, stated, sensor)
+    whole = blocks[..., COUNT] > 0
+    pictures['blocks'] = over(image, whole.astype(np.intp), size)
+
+    moments = weighted(blocks, sensor, slope)
+    links = block_links(grid, size)
+    roots = patches(0, len(moments), moments, *links, _PATCH_LARGEST * size**2)
+    patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
+    alone = np.bincount(patch.ravel())[patch] == 1
+    pictures['patches'] = over(image, np.where(alone, 0, patch), size)
+    surface, _ = surfaces(moments, links, size, config.min_pixels // 2)
+    pictures['surfaces'] = over(image, surface, size)
+
+    labelling = method.segment(image, grid, config, lambda stage: None)
+    labels = labelling.labels
+    pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
+    regions = labelling.flat(plane_regions(labels, labels > 0, grid, config))
+    pictures['regions'] = overlay(image.inverse, regions)
+    result = Segmenter(config).segment(image)
+    pictures['planes'] = overlay(image.inverse, result.labels, result.planes)
+    pictures['uncertainty'] = uncertainty(image, result)
+    return pictures
+
+
+def in_grey(image):
+    """Near is bright, nothing measured is black."""
+    return cv2.cvtColor(grey(image.inverse), cv2.COLOR_GRAY2RGB)
+
+
+def with_edges(image, jumps):
+    """Jump edges in red."""
+    picture = in_grey(image)
+    edges = np.zeros(image.shape, bool)
+    edges[:, 1:] |= jumps[0]
+    edges[1:] |= jumps[1]
+    picture[edges] = 255, 60, 30
+    return picture
+
+
+def over(image, numbers, size):
+    """Colour blocks by their numbers (rows, columns), 0 for none."""
+    pixels = numbers.repeat(size, 0).repeat(size, 1)[: image.shape[0], : image.shape[1]]
+    base = in_grey(image)
+    picture = cv2.addWeighted(base, 0.45, colours(pixels), 0.55, 0)
+    return np.where((pixels > 0)[..., None], picture, base)
+
+
+def noise_chart(inverse, residual, stated, sensor):
+    """Standard deviation in blocks against the inverse range, and the two models of it."""
+    figure = Figure(figsize=(6, 4.5), dpi=100, layout='constrained')
+    axes = figure.subplots()
+    axes.plot(inverse, 1000 * np.sqrt(residual), '.', markersize=1, color='0.7', rasterized=True)
+    x = np.linspace(0, inverse.max(), 100)
+    for model, style, label in ((stated, '--', 'stated'), (sensor, '-', 'measured')):
+        axes.plot(x, 1000 * np.sqrt(random_variance(model, x**2)), style, label=label)
+    axes.set(xlabel='inverse depth, 1/m', ylabel='residuals of blocks, 0.001/m', xlim=(0, None))
+    axes.set_ylim(0, 4000 * np.sqrt(np.median(residual)))
+    axes.legend(loc='upper left')
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def uncertainty(image, result):
+    """Standard deviation of each plane where it is seen, dark for 0 to yellow for 20 mm."""
+    deviation = np.zeros(image.shape)
+    for plane in result.planes:
+        here = result.labels == plane.label
+        points = np.append(image.points[here], np.ones((here.sum(), 1)), axis=1)
+        deviation[here] = np.sqrt(np.einsum('ni,ij,nj->n', points, plane.covariance, points))
+    shown = colormaps['inferno'](np.clip(deviation / 0.02, 0, 1))[..., :3]
+    return np.where((result.labels > 0)[..., None], 255 * shown, in_grey(image)).astype(np.uint8)
+
+
+def fitted(picture):
+    """The picture at the width, and 3/4 of that high, that all have."""
+    size = WIDTH, WIDTH * 3 // 4
+    return cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_AREA)
+
+
+if __name__ == '__main__':
+    main()
