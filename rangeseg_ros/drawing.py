@@ -124,3 +124,56 @@ def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale
     rows, columns = part.shape[:2]
     part[:] = part * (1 - outline[:rows, :columns, None] / 255)
     np.maximum(part, letters[:rows, :columns, None], out=part)
+
+
+def plan(
+    planes: Sequence[Plane], towards: NDArray[np.float64], size: int = 800
+) -> NDArray[np.uint8]:
+    """Picture of planes as they look from far away, with a grid of metres.
+
+    Parameters
+    ----------
+    planes : sequence of Plane
+        In any frame.
+    towards : (3,) float64
+        Unit vector to where they are looked at from.
+    size : int
+        Longer side, pixels.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+        RGB; what is nearer covers the rest, and planes that face away are darker.
+    """
+    # z is up in the picture, but seen along it, y is.
+    right = np.cross([0, 1, 0] if abs(towards[2]) > 0.7 else [0, 0, 1], towards)
+    right /= np.linalg.norm(right)
+    frame = np.stack([right, np.cross(towards, right)])
+    rings = [
+        [(ring @ frame.T) for part in plane.outline.parts for ring in part] for plane in planes
+    ]
+    corners = np.concatenate([ring for plane in rings for ring in plane] or [np.zeros((1, 2))])
+    low, high = corners.min(axis=0) - 0.3, corners.max(axis=0) + 0.3
+    scale = size / (high - low).max()
+    shape = np.ceil(scale * (high - low)).astype(int)
+    picture = np.full((shape[1], shape[0], 3), 255, np.uint8)
+    for axis in (0, 1):
+        for metre in range(int(np.ceil(low[axis])), int(np.floor(high[axis])) + 1):
+            at = round(scale * (metre - low[axis]))
+            if axis == 0:
+                picture[:, min(at, shape[0] - 1)] = 225
+            else:
+                picture[max(shape[1] - 1 - at, 0)] = 225
+    depth = [plane.centroid @ towards for plane in planes]
+    for k in np.argsort(depth, kind='stable').tolist():
+        shade = 0.45 + 0.55 * max(float(planes[k].normal @ towards), 0)
+        colour = shade * colours([planes[k].id])[0].astype(float)
+        flat = [
+            np.round(
+                np.column_stack([ring[:, 0] - low[0], high[1] - ring[:, 1]]) * scale * 16
+            ).astype(np.int32)
+            for ring in rings[k]
+        ]
+        cv2.fillPoly(picture, flat, colour.tolist(), cv2.LINE_AA, 4)
+        cv2.polylines(picture, flat, True, (0.6 * colour).tolist(), 1, cv2.LINE_AA, 4)
+    return picture

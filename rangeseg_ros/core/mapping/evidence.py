@@ -40,7 +40,7 @@ class Evidence:
         if side != self._side:
             self._side, self._keys, self._odds = side, np.zeros(0, np.int64), np.zeros(0)
         # Borders are not as certain as what is within.
-        within = outline.buffer(-side / 2)
+        within = outline.buffer(-side / 2, join_style='mitre')
         if within.is_empty:
             within = outline
         left, low, right, high = within.bounds if not within.is_empty else (0, 0, -1, -1)

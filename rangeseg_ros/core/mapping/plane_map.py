@@ -21,7 +21,7 @@ from rangeseg_ros.core.mapping.plane_filter import (
     PoseNoise,
     observations,
 )
-from rangeseg_ros.core.mapping.sightings import sightings
+from rangeseg_ros.core.mapping.sightings import THERE, sightings
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -30,13 +30,17 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 _GATE = 16.27
 # Samples along a side of a cell of the image, see `views`.
 _SAMPLES = 16
-# Observations that make a plane of the map: fewer are what one frame takes for a plane.
-_CONFIRMED = 3
+# Observations that make a plane of the map, and their least share of the frames in which rays
+# ended where it is: what is found less often is what clutter looks like now and then.
+_CONFIRMED, _REGULAR = 3, 0.25
+# Nanoseconds after which what is not confirmed and not seen again is forgotten.
+_PROBATION = 3 * 10**9
 # Largest angle, and offset as share of the range, of what may be one plane: beyond is no error of
 # the sensor but another plane, however uncertain both are.
 _WIDEST, _FARTHEST = np.radians(15.0), 0.1
-# Nanoseconds between unions of an outline: five a second follow what a hand or a robot shows.
-_UNION_INTERVAL = 200_000_000
+# Nanoseconds between unions of an outline, and unions in a frame: twice a second follows what a
+# hand or a robot shows, and the work does not grow with the number of planes in sight.
+_UNION_INTERVAL, _UNIONS = 500_000_000, 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,10 +81,18 @@ class _Record:
     confidence: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
-    united: int | None = None
+    united: int = -_UNION_INTERVAL
+    frames: int = 0
+    looks: int = 0
     evidence: Evidence = field(default_factory=Evidence)
 
+    @property
+    def confirmed(self) -> bool:
+        """Whether it was seen often enough to be part of the map."""
+        return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
+
     def add(self, plane: Plane, stamp: int) -> None:
+        self.frames += self.last != stamp or self.frames == 0
         self.last = stamp
         self.observations += 1
         self.pixels += plane.count
@@ -92,6 +104,7 @@ class _Record:
         self.id = min(self.id, other.id)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
         self.observations += other.observations
+        self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
         self.pixels += other.pixels
         self.squares += other.squares
         self.confidence += other.confidence
@@ -119,7 +132,7 @@ class PlaneMap:
         self._filters: PlaneFilters | None = None
 
     def __len__(self) -> int:
-        return sum(record.observations >= _CONFIRMED for record in self._records)
+        return sum(record.confirmed for record in self._records)
 
     def add(
         self,
@@ -151,8 +164,8 @@ class PlaneMap:
             )
             match = self._associate(planes, seen)
             self._fuse(planes, seen, match, pose, stamp)
-            self._merge(np.unique(match), pose.shift)
-        self._contradict(image, pose, noise)
+            self._merge(stamp, pose.shift)
+        self._contradict(image, pose, noise, stamp)
 
     @property
     def planes(self) -> list[MapPlane]:
@@ -163,7 +176,7 @@ class PlaneMap:
         found = [
             self._described(k, covariance[k])
             for k, record in enumerate(self._records)
-            if record.observations >= _CONFIRMED and not record.outline.is_empty
+            if record.confirmed and not record.outline.is_empty
         ]
         return sorted(found, key=lambda plane: plane.id)
 
@@ -217,12 +230,16 @@ class PlaneMap:
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp)
-        for k in np.unique(match).tolist():
-            record = self._records[k]
-            if record.united is None or abs(stamp - record.united) >= _UNION_INTERVAL:
-                record.united = stamp
-                for part in np.flatnonzero(match == k).tolist():
-                    self._unite(k, planes[part], pose)
+        due = [
+            k
+            for k in np.unique(match).tolist()
+            if abs(stamp - self._records[k].united) >= _UNION_INTERVAL
+        ]
+        due.sort(key=lambda k: self._records[k].united)
+        for k in due[: max(_UNIONS, len(new))]:
+            self._records[k].united = stamp
+            for part in np.flatnonzero(match == k).tolist():
+                self._unite(k, planes[part], pose)
 
     def _unite(self, k: int, plane: Plane, pose: Transform) -> None:
         """Add what is seen of a plane to its outline."""
@@ -235,12 +252,13 @@ class PlaneMap:
 
         self._grow(k, polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes]))
 
-    def _merge(self, changed: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
-        """Unite planes of the map that turn out to be one with those that have just changed."""
+    def _merge(self, stamp: int, camera: NDArray[np.float64]) -> None:
+        """Unite planes of the map that turn out to be one with those that have just grown."""
         filters = self._filters
         assert filters is not None
         gone: list[int] = []
-        for k in changed.tolist():
+        grown = [k for k, record in enumerate(self._records) if record.united == stamp]
+        for k in grown:
             for m in filters.alike(k, camera, _GATE, _WIDEST, _FARTHEST).tolist():
                 if m in gone or k in gone or not self._touch(k, m):
                     continue
@@ -279,7 +297,9 @@ class PlaneMap:
         self._filters = self._filters.where(chosen)
         self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
 
-    def _contradict(self, image: RangeImage, pose: Transform, noise: PoseNoise) -> None:
+    def _contradict(
+        self, image: RangeImage, pose: Transform, noise: PoseNoise, stamp: int
+    ) -> None:
         """Take away what rays pass through."""
         filters = self._filters
         if filters is None or not self._records:
@@ -300,9 +320,16 @@ class PlaneMap:
         ends = np.cumsum([0, *(len(part) for part in centres)])
         for k in np.unique(owner[found != 0]).tolist():
             record = self._records[k]
-            if record.evidence.see(found[ends[k] : ends[k + 1]]):
+            own = found[ends[k] : ends[k + 1]]
+            record.looks += 2 * int((own == THERE).sum()) > len(own)
+            if record.evidence.see(own):
                 record.outline = record.evidence.remaining(record.outline)
-        self._keep(np.array([not record.outline.is_empty for record in self._records]))
+        kept = [
+            not r.outline.is_empty and (r.confirmed or stamp - r.last < _PROBATION)
+            for r in self._records
+        ]
+        if not all(kept):
+            self._keep(np.array(kept))
 
     def _described(self, k: int, covariance: NDArray[np.float64]) -> MapPlane:
         filters, record = self._filters, self._records[k]
