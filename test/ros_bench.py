@@ -27,8 +27,12 @@ TYPES = {
     'overlay': Image,
     'normals': Image,
     'edges': Image,
+    'terrain': Image,
     'ground': PointCloud2,
     'obstacles': PointCloud2,
+    'drops': PointCloud2,
+    'unseen': PointCloud2,
+    'outline': MarkerArray,
 }
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -13,8 +13,9 @@ from ros_bench import DEPTH, FRAME, INFO, Bench
 from rosbags import rosbag2
 from sensor_msgs.msg import Imu
 
-from rangeseg_ros import Camera, Config, RangeImage, planes_from_message
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter, planes_from_message
 from rangeseg_ros.batch.replay import Replay
+from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.messages.clouds import points_from_message
 from rangeseg_ros.messages.outputs import OUTPUTS
@@ -125,22 +126,27 @@ def test_ground_and_obstacles_share_out_the_points(bench):
     depth = room(bench.camera)
     depth[:, :3] = 0
     with bench.listening('ground', 'obstacles'):
-        planes, image = planes_of(bench, depth)
+        _, message = planes_of(bench, depth)
         ground, obstacles = (
-            bench.until(lambda name=name: bench.find(name, image))
+            bench.until(lambda name=name: bench.find(name, message))
             for name in ('ground', 'obstacles')
         )
-    points = RangeImage.from_depth(depth, bench.camera).points
-    on_floor = bench.labels_of(image) == planes['floor']['label']
-    for cloud, where in ((ground, on_floor), (obstacles, (depth > 0) & ~on_floor)):
-        assert cloud.header == image.header
-        assert (cloud.height, cloud.point_step, cloud.is_dense) == (1, 12, True)
-        assert [field.name for field in cloud.fields] == ['x', 'y', 'z']
+    image = RangeImage.from_depth(depth, bench.camera)
+    terrain = Segmenter(Config()).segment(image).terrain
+    for cloud, class_, fields in ((ground, GROUND, 'xyz'), (obstacles, OBSTACLE, 'xyz ')):
+        assert cloud.header == message.header
+        step = 4 * len(fields)
+        assert (cloud.height, cloud.point_step, cloud.is_dense) == (1, step, True)
+        assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'height'][: len(fields)]
         # One row is not organised; as a column it can be read like one that is.
-        cloud.height, cloud.width, cloud.row_step = cloud.width, 1, 12
-        np.testing.assert_array_equal(points_from_message(cloud)[:, 0], points[where])
-    assert np.percentile(abs(points[on_floor][:, 1] - HEIGHT), 99) < 0.01
-    assert 1000 < on_floor.sum() < (depth > 0).sum() - 1000
+        cloud.height, cloud.width, cloud.row_step = cloud.width, 1, step
+        np.testing.assert_array_equal(
+            points_from_message(cloud)[:, 0], image.points[terrain == class_]
+        )
+    down = bench.camera.rays[..., 1]
+    on_floor = (depth > 0) & (down > 0) & (HEIGHT / np.where(down > 0, down, 1) < WALL)
+    assert (terrain == GROUND)[on_floor].mean() > 0.98
+    assert (terrain == OBSTACLE)[(depth > 0) & ~on_floor].mean() > 0.98
 
 
 def test_without_a_floor_all_are_obstacles(bench):

@@ -42,6 +42,14 @@ def _normals(path: Path, image: RangeImage, result: Segmentation) -> None:
     write_image(path, result.normals)
 
 
+def _terrain(path: Path, image: RangeImage, result: Segmentation) -> None:
+    write_image(path, result.terrain)
+
+
+def _height(path: Path, image: RangeImage, result: Segmentation) -> None:
+    write_image(path, result.height)
+
+
 def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
     with replacing(path) as partial, PlaneTable(partial) as table:
         table.write(result.planes)
@@ -51,6 +59,8 @@ FRAME_FILES = {
     'labels': FrameFile('_labels.png', _labels),
     'overlay': FrameFile('_overlay.png', _overlay),
     'normals': FrameFile('_normals.tiff', _normals),
+    'terrain': FrameFile('_terrain.png', _terrain),
+    'height': FrameFile('_height.tiff', _height),
     'planes': FrameFile('_planes.csv', _planes),
 }
 

@@ -11,6 +11,7 @@ from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
+from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.report.evaluation import write_evaluation
 from rangeseg_ros.tasks import run_all
@@ -29,6 +30,11 @@ from rangeseg_ros.tasks import run_all
 @click.option(
     '--split', type=click.Choice(['train', 'test']), help='Only this part of a segcomp set.'
 )
+@click.option(
+    '--unknown-height',
+    is_flag=True,
+    help='Terrains: the height of the sensor is not told.',
+)
 @measures.jobs
 @click.option(
     '--output',
@@ -45,6 +51,7 @@ def command(
     tolerances: tuple[float, ...],
     min_pixels: int | None,
     split: str | None,
+    unknown_height: bool,
     jobs: int | None,
     output: Path | None,
     json_file: Path | None,
@@ -57,11 +64,21 @@ def command(
       depth/*.png, truth/*.png, camera.yaml, as `simulate kinect` writes
       folders of depth.png, truth.png and camera.txt (fx fy cx cy)
       labelled laser scans *.pcd (x forward, z up, intensity >= 10)
+      terrain.csv, as `simulate terrain` writes: how terrain is told
 
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
     with errors of angles and planes where the truth knows them, and each image in `per_image`.
     """
     config = read_config(params_file, **({'method': method} if method else {}))
+    if (folder / 'terrain.csv').exists():
+        terrains = terrain_tasks(folder, config, not unknown_height, output)
+        told = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
+        figures = terrain_figures(told)
+        click.echo(f'{folder}: {len(told)} images')
+        click.echo(terrain_table(figures))
+        if json_file:
+            measures.write_json(json_file, figures)
+        return
     cases = [
         case
         for case in find_cases(folder, min_pixels)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -11,6 +12,7 @@ from tqdm import tqdm
 
 from rangeseg_ros.cli import interrupts
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
@@ -64,3 +66,13 @@ def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
 def read_parameters(params_file: Path | None, exact: bool) -> Config:
     """Config of the options `params` and `exact`; the latter wins over the file."""
     return read_config(params_file, **({'exact': True} if exact else {}))
+
+
+@contextmanager
+def new_folder(path: Path) -> Iterator[Path]:
+    """Make a folder that appears under its name once it is complete."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise click.ClickException(f'{path}: exists already, not overwritten')
+    with replacing(path) as partial:
+        partial.mkdir()
+        yield partial

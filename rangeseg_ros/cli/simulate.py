@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import click
 import numpy as np
 
-from rangeseg_ros.cli import options
+from rangeseg_ros.cli import options, simulate_terrain
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.segcomp.files import (
     write_angles,
@@ -212,7 +210,7 @@ def _write_rooms(
                 yield name, see(scene, frame, seed)
 
     count = len(seeds) * frames
-    with _new_folder(output) as folder:
+    with options.new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
         with (
             _TruthTable(folder / 'planes.csv') as table,
@@ -288,7 +286,7 @@ def _write_segcomp_set(
     """Write images by `write(path, split, number, scene's seed)`, and their ground truth."""
     training = min(scenes // 4, 10)
     regions = 0
-    with _new_folder(output) as folder, _TruthTable(folder / 'planes.csv') as table:
+    with options.new_folder(output) as folder, _TruthTable(folder / 'planes.csv') as table:
         for index in options.progress(range(scenes), scenes, 'image'):
             split, number = ('train', index) if index < training else ('test', index - training)
             path = folder / f'{sensor}.{split}.{number}'
@@ -326,11 +324,4 @@ class _TruthTable:
             self._rows.writerow([image, plane.label, plane.face, *equation, plane.count])
 
 
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder that appears under its name once it is complete."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise click.ClickException(f'{path}: exists already, not overwritten')
-    with replacing(path) as partial:
-        partial.mkdir()
-        yield partial
+command.add_command(simulate_terrain.command)

@@ -257,6 +257,25 @@ class Config:
         low=0.001,
         high=10.0,
     )
+    # The ground.
+    sensor_height: float = option(
+        0.0,
+        'height of the sensor above the ground below it, along up, metres; 0 = unknown',
+        low=0.0,
+        high=100.0,
+    )
+    ground_slope: float = option(
+        12.0,
+        'steepest ground, against the ground under the robot, degrees',
+        low=0.0,
+        high=45.0,
+    )
+    obstacle_height: float = option(
+        0.05, 'what stands so high above the ground is an obstacle, metres', low=0.005, high=10.0
+    )
+    drop_height: float = option(
+        0.05, 'what lies so deep below the ground is a drop, metres', low=0.005, high=10.0
+    )
     seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
     def __post_init__(self) -> None:

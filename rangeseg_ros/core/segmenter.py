@@ -15,6 +15,8 @@ from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, described
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.camera import Camera
@@ -66,6 +68,8 @@ class Segmentation:
         What the regions were made from.
     jumps : (horizontal, vertical) of bool or None
         Edges of the grid that cross a jump; None where none were looked for.
+    survey : Survey or Terrain
+        How the ground is found, or what was found.
     """
 
     labels: NDArray[np.uint16]
@@ -74,6 +78,7 @@ class Segmentation:
     reason: str
     labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
+    survey: Survey | Terrain | None = field(default=None, repr=False)
 
     @cached_property
     def normals(self) -> NDArray[np.float32]:
@@ -99,13 +104,32 @@ class Segmentation:
         return pixels_beside(self.jumps)
 
     @cached_property
+    def ground(self) -> Terrain | None:
+        """The ground and what interrupts it, worked out when read; None where none was asked."""
+        return self.survey.terrain() if isinstance(self.survey, Survey) else self.survey
+
+    @property
+    def terrain(self) -> NDArray[np.uint8]:
+        """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
+        if self.ground is None:
+            return np.zeros(self.labels.shape, np.uint8)
+        return self.ground.classes
+
+    @property
+    def height(self) -> NDArray[np.float32]:
+        """(H, W) metres along up above the ground; NaN where that is not known."""
+        if self.ground is None:
+            return np.full(self.labels.shape, np.nan, np.float32)
+        return self.ground.height
+
+    @cached_property
     def energy(self) -> float:
         """Value of eq. 5.3 for the labelling the regions were made from, worked out when read."""
         return self.labelling.energy()
 
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
-        return {**self.__dict__, 'labelling': kept}
+        return {**self.__dict__, 'labelling': kept, 'survey': self.ground}
 
 
 class Segmenter:
@@ -148,7 +172,8 @@ class Segmenter:
         planes = described(regions, image, fits)
         watch.lap('planes')
         reason = _reason(image, planes)
-        return Segmentation(regions, planes, watch.laps, reason, labelling, jumps)
+        survey = Survey.of(image, SensorModel.from_config(config), config)
+        return Segmentation(regions, planes, watch.laps, reason, labelling, jumps, survey)
 
     def _by_planes(
         self, image: RangeImage, grid: Grid, watch: Stopwatch

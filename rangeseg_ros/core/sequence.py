@@ -11,7 +11,8 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.meaning.roles import roles
+from rangeseg_ros.core.meaning.roles import roles, unit
+from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
@@ -81,7 +82,10 @@ class SequenceSegmenter:
         planes = with_roles(planes, self.config, up)
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
-        return replace(result, planes=planes)
+        survey = result.survey
+        if up is not None and isinstance(survey, Survey):
+            survey = replace(survey, up=unit(up))
+        return replace(result, planes=planes, survey=survey)
 
 
 def with_roles(

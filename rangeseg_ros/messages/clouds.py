@@ -45,6 +45,7 @@ PLANE_TYPE = np.dtype(
 )
 
 _POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
+_HEIGHT_TYPE = np.dtype([*_POINT_TYPE.descr, ('height', '<f4')])
 
 # sensor_msgs/PointField: datatype -> numpy.
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -164,9 +165,17 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     return _cloud(make, header, rows)
 
 
-def points_message(make: Make, header: Any, points: NDArray[np.floating]) -> Any:
-    """sensor_msgs/PointCloud2 of points (N, 3), metres."""
-    rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
+def points_message(
+    make: Make,
+    header: Any,
+    points: NDArray[np.floating],
+    height: NDArray[np.floating] | None = None,
+) -> Any:
+    """sensor_msgs/PointCloud2 of points (N, 3), metres, and of their `height` (N,) if given."""
+    if height is None:
+        rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
+    else:
+        rows = np.column_stack([points, height]).astype('<f4').view(_HEIGHT_TYPE)[:, 0]
     return _cloud(make, header, rows)
 
 

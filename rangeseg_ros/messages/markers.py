@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
@@ -14,7 +14,7 @@ from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.make import Make
 
 # visualization_msgs/Marker: type and action.
-ARROW, TEXT_VIEW_FACING, TRIANGLE_LIST = 0, 9, 11
+ARROW, LINE_STRIP, TEXT_VIEW_FACING, TRIANGLE_LIST = 0, 4, 9, 11
 ADD, DELETEALL = 0, 3
 
 ARROW_LENGTH = 0.2
@@ -66,6 +66,29 @@ def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 colour=(1.0, 1.0, 1.0, 1.0),
                 position=_points(make, (tip,))[0],
                 text=f'{plane.id} {plane.role}'.strip(),
+            )
+        )
+    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def outline_message(make: Make, header: Any, lines: Sequence[NDArray[np.floating]]) -> Any:
+    """visualization_msgs/MarkerArray: the closed `lines` (N, 3) around the ground, no older ones.
+
+    Namespace `ground`, of type LINE_STRIP.
+    """
+    markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
+    for number, line in enumerate(lines):
+        closed = np.concatenate([line, line[:1]])
+        markers.append(
+            _marker(
+                make,
+                header,
+                'ground',
+                number,
+                LINE_STRIP,
+                scale=(0.02, 0.0, 0.0),
+                colour=(0.1, 0.9, 0.1, 1.0),
+                points=_points(make, closed),
             )
         )
     return make('visualization_msgs/msg/MarkerArray', markers=markers)

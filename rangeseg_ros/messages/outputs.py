@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
+from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import planes_message, points_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
-from rangeseg_ros.messages.markers import markers_message
+from rangeseg_ros.messages.markers import markers_message, outline_message
 
 
 @dataclass(frozen=True)
@@ -59,24 +62,47 @@ def _edges(make: Make, header: Any, image: RangeImage, result: Segmentation) -> 
     return image_message(make, header, 255 * result.edges.astype(np.uint8), 'mono8')
 
 
+def _terrain(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return image_message(make, header, result.terrain, 'mono8')
+
+
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return _points(make, header, image, _on_floor(result))
+    return points_message(make, header, _points(image, result.terrain == GROUND))
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return _points(make, header, image, image.valid & ~_on_floor(result))
+    where = result.terrain == OBSTACLE
+    return points_message(make, header, _points(image, where), result.height[where])
 
 
-def _points(make: Make, header: Any, image: RangeImage, where: NDArray[np.bool_]) -> Any:
+def _drops(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return _crossings(make, header, image, result, drops)
+
+
+def _unseen(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return _crossings(make, header, image, result, unseen)
+
+
+def _crossings(
+    make: Make,
+    header: Any,
+    image: RangeImage,
+    result: Segmentation,
+    find: Callable[[RangeImage, Terrain], NDArray[np.float32]],
+) -> Any:
+    found = np.zeros((0, 4), np.float32) if result.ground is None else find(image, result.ground)
+    return points_message(make, header, found[:, :3], found[:, 3])
+
+
+def _points(image: RangeImage, where: NDArray[np.bool_]) -> NDArray[np.float32]:
     # Of these pixels only, which is faster than RangeImage.points.
-    return points_message(make, header, image.rays[where] / image.inverse[where, None])
+    points: NDArray[np.float32] = image.rays[where] / image.inverse[where, None]
+    return points
 
 
-def _on_floor(result: Segmentation) -> NDArray[np.bool_]:
-    """(H, W) True where a plane is the floor, or a part of it."""
-    return np.isin(
-        result.labels, [plane.label for plane in result.planes if plane.role == 'floor']
-    )
+def _outline(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    lines = [] if result.ground is None else outlines(image, result.ground)
+    return outline_message(make, header, lines)
 
 
 OUTPUTS = {
@@ -86,6 +112,10 @@ OUTPUTS = {
     'overlay': Output('sensor_msgs/msg/Image', _overlay),
     'normals': Output('sensor_msgs/msg/Image', _normals),
     'edges': Output('sensor_msgs/msg/Image', _edges),
+    'terrain': Output('sensor_msgs/msg/Image', _terrain),
     'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
     'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
+    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
+    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
+    'outline': Output('visualization_msgs/msg/MarkerArray', _outline),
 }

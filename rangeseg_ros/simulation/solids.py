@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-# Rays cast at a time: so few that what is computed of them stays in the processor's cache.
-_BLOCK = 8192
+from rangeseg_ros.core.runtime.threads import strips
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,61 +42,6 @@ class Solid:
         planes[: len(self.offsets)] = np.column_stack([self.normals, self.offsets])
         return planes
 
-    def intersect(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Where rays enter the solid.
-
-        Parameters
-        ----------
-        origins : (3,) or (N, 3) float64
-            One origin for all rays, or one for each.
-        directions : (N, 3) float64
-            Directions, of any length.
-
-        Returns
-        -------
-        distance : (N,) float64
-            Ray parameter of the entry, in lengths of the direction; inf where the ray misses
-            the solid or starts inside it.
-        face : (N,) intp
-            Face entered.
-        """
-        height = self.normals @ np.atleast_2d(origins).T + self.offsets[:, None]
-        rate = self.normals @ directions.T
-        with np.errstate(divide='ignore', invalid='ignore'):
-            crossing = -height / rate
-        entries = np.where(rate < 0, crossing, -np.inf)
-        exits = np.where(rate > 0, crossing, np.inf)
-        exits[(rate == 0) & (height > 0)] = -np.inf
-        if self.quadric is not None:
-            entry, exit_ = _quadric_interval(self.quadric, np.atleast_2d(origins), directions)
-            entries, exits = np.vstack([entries, entry]), np.vstack([exits, exit_])
-        face = entries.argmax(axis=0)
-        entry = entries.max(axis=0)
-        hit = (entry > 0) & (entry < exits.min(axis=0))
-        return np.where(hit, entry, np.inf), face
-
-
-def _quadric_interval(
-    quadric: NDArray[np.float64], origins: NDArray[np.float64], directions: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ray parameters between which p'Qp <= 0; (inf, -inf) where that is nowhere."""
-    matrix, vector, scalar = quadric[:3, :3], quadric[:3, 3], quadric[3, 3]
-    gradient = origins @ matrix + vector
-    a = np.einsum('ni,ij,nj->n', directions, matrix, directions)
-    b = np.einsum('ni,ni->n', directions, np.broadcast_to(gradient, directions.shape))
-    c = np.einsum('ni,ni->n', gradient + vector, origins) + scalar
-    with np.errstate(divide='ignore', invalid='ignore'):
-        root = np.sqrt(b * b - a * c)
-        entry, exit_ = (-b - root) / a, (-b + root) / a
-    # A ray along a cylinder's axis never crosses the surface: it is inside or it is not.
-    along, inside = a < 1e-15, np.broadcast_to(c <= 0, a.shape)
-    entry = np.where(along, np.where(inside, -np.inf, np.inf), entry)
-    exit_ = np.where(along, np.where(inside, np.inf, -np.inf), exit_)
-    miss = np.isnan(entry)
-    return np.where(miss, np.inf, entry), np.where(miss, -np.inf, exit_)
-
 
 def cast(
     solids: Sequence[Solid], origins: ArrayLike, directions: ArrayLike
@@ -121,21 +66,95 @@ def cast(
     """
     directions = np.asarray(directions, np.float64)
     shape = directions.shape[:-1]
-    directions = directions.reshape(-1, 3)
-    origins = np.asarray(origins, np.float64).reshape(-1, 3)
+    directions = np.ascontiguousarray(directions.reshape(-1, 3))
+    origins = np.ascontiguousarray(np.asarray(origins, np.float64).reshape(-1, 3))
     distance = np.full(len(directions), np.inf)
     face = np.full(len(directions), -1, np.int32)
-    for start in range(0, len(directions), _BLOCK):
-        block = slice(start, start + _BLOCK)
-        sources = origins if len(origins) == 1 else origins[block]
-        first = 0
-        for solid in solids:
-            entry, local = solid.intersect(sources, directions[block])
-            closer = entry < distance[block]
-            distance[block][closer] = entry[closer]
-            face[block][closer] = first + local[closer]
-            first += solid.face_count
+    first = 0
+    for solid in solids:
+        quadric = _NONE if solid.quadric is None else solid.quadric
+        strips(
+            _enter,
+            len(directions),
+            origins,
+            directions,
+            solid.normals,
+            solid.offsets,
+            quadric,
+            first,
+            distance,
+            face,
+        )
+        first += solid.face_count
     return distance.reshape(shape), face.reshape(shape)
+
+
+_NONE = np.zeros((0, 0))
+
+
+@njit(cache=True, nogil=True)
+def _enter(
+    start: int,
+    after: int,
+    origins: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    offsets: NDArray[np.float64],
+    quadric: NDArray[np.float64],
+    first: int,
+    distance: NDArray[np.float64],
+    face: NDArray[np.int32],
+) -> None:
+    """Where rays start...after enter a solid, if that is nearer than `distance`, which is set.
+
+    A ray is inside between its last entry into a half space (or the quadric) and its first exit.
+    """
+    for i in range(start, after):
+        x, y, z = origins[i if len(origins) > 1 else 0]
+        u, v, w = directions[i]
+        entry, exit_, entered = -np.inf, distance[i], -1
+        for k in range(len(offsets)):
+            rate = normals[k, 0] * u + normals[k, 1] * v + normals[k, 2] * w
+            height = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z + offsets[k]
+            if rate < 0:
+                if -height / rate > entry:
+                    entry, entered = -height / rate, k
+            elif rate > 0:
+                exit_ = min(exit_, -height / rate)
+            elif height > 0:
+                exit_ = -np.inf
+            if entry >= exit_:
+                break
+        if len(quadric) and entry < exit_:
+            inside, outside = _quadric_interval(quadric, x, y, z, u, v, w)
+            if inside > entry:
+                entry, entered = inside, len(offsets)
+            exit_ = min(exit_, outside)
+        if 0 < entry < exit_:
+            distance[i] = entry
+            face[i] = first + entered
+
+
+@njit(cache=True)
+def _quadric_interval(
+    quadric: NDArray[np.float64], x: float, y: float, z: float, u: float, v: float, w: float
+) -> tuple[float, float]:
+    """Ray parameters between which p'Qp <= 0; (inf, -inf) where that is nowhere."""
+    a = b = 0.0
+    c = quadric[3, 3]
+    for i in range(3):
+        origin, direction = (x, y, z)[i], (u, v, w)[i]
+        gradient = quadric[i, 0] * x + quadric[i, 1] * y + quadric[i, 2] * z + quadric[i, 3]
+        bend = quadric[i, 0] * u + quadric[i, 1] * v + quadric[i, 2] * w
+        a += direction * bend
+        b += direction * gradient
+        c += origin * (gradient + quadric[i, 3])
+    if a < 1e-15:  # along a cylinder's axis: inside or not, but never across
+        return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
+    if b * b < a * c:
+        return np.inf, -np.inf
+    root = np.sqrt(b * b - a * c)
+    return (-b - root) / a, (-b + root) / a
 
 
 def lit(

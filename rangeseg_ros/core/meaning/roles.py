@@ -53,7 +53,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     """
     if not planes:
         return []
-    up = _unit((config.up_x, config.up_y, config.up_z) if up is None else up)
+    up = unit((config.up_x, config.up_y, config.up_z) if up is None else up)
     normal = np.array([plane.normal for plane in planes])
     rise = np.degrees(np.arcsin(np.clip(normal @ up, -1, 1)))
     upward, downward = (s * rise >= 90 - config.role_tolerance for s in (1, -1))
@@ -71,7 +71,8 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     return [str(role) for role in found]
 
 
-def _unit(direction: ArrayLike) -> NDArray[np.float64]:
+def unit(direction: ArrayLike) -> NDArray[np.float64]:
+    """`direction` (3,) as a unit vector; RolesError where it points nowhere."""
     vector = np.asarray(direction, np.float64)
     length = np.linalg.norm(vector)
     if vector.shape != (3,) or not np.isfinite(length) or length == 0:

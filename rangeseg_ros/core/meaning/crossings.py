@@ -1,0 +1,98 @@
+"""Where the ground ends: rays that cross it without being stopped, and its outline."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.meaning.classes import DROP, GROUND
+from rangeseg_ros.core.meaning.ground import Terrain, interpolated
+from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# Pixels that an outline may differ from the border of the ground.
+_TOLERANCE = 2.0
+# Shorter outlines are holes of single pixels.
+_SHORTEST = 24
+
+
+def crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> NDArray:
+    """Points where rays cross the ground continued.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    terrain : Terrain
+    where : (H, W) bool
+        Which rays; those that do not cross the ground in front of the sensor are left out.
+
+    Returns
+    -------
+    (N, 4) float32
+        x, y, z in the frame of the image, metres, and the height of what was measured along the
+        ray, NaN where nothing was.
+    """
+    inverse = np.zeros(image.shape, np.float32)
+    strips(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
+    chosen = where & (inverse > 0)
+    points = image.rays[chosen] / inverse[chosen, None]
+    return np.column_stack([points, terrain.height[chosen]]).astype(np.float32)
+
+
+def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+    """Crossings (N, 4) of the rays that end in a drop, as `crossings`."""
+    return crossings(image, terrain, terrain.classes == DROP)
+
+
+def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+    """Crossings (N, 4) of rays without a measurement, as `crossings`.
+
+    As far as ground is seen and not nearer: no sensor sees below its own nearest or farthest
+    range. Single pixels do not count: sensors miss some everywhere. None for clouds, which do not
+    tell the rays of what they have not measured.
+    """
+    seen = terrain.classes == GROUND
+    missing = cv2.morphologyEx(
+        (~image.valid).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
+    )
+    if image.camera is None or not seen.any():
+        return np.zeros((0, 4), np.float32)
+    found = crossings(image, terrain, missing > 0)
+    nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
+    depth = found[:, 2]
+    return found[(depth >= nearest) & (depth <= farthest)]
+
+
+def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
+    """Closed lines (N, 3) around the ground, metres, in the frame of the image."""
+    ground = (terrain.classes == GROUND).astype(np.uint8)
+    rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    inverse = np.zeros(image.shape, np.float32)
+    strips(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
+    lines = []
+    for ring in rings:
+        if len(ring) >= _SHORTEST:
+            columns, rows = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0].T
+            values = inverse[rows, columns]
+            ahead = values > 0
+            lines.append(image.rays[rows, columns][ahead] / values[ahead, None])
+    return lines
+
+
+@njit(cache=True, nogil=True)
+def _ground_inverse(
+    first: int,
+    after: int,
+    rays: NDArray[np.float32],
+    field: NDArray[np.float64],
+    inverse: NDArray[np.float32],
+) -> None:
+    """Inverse range at which rays cross the ground; not positive where they do not."""
+    for i in range(first, after):
+        for j in range(rays.shape[1]):
+            theta = interpolated(field, i, j)
+            ray = rays[i, j]
+            inverse[i, j] = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]

@@ -1,0 +1,156 @@
+"""The ground grown outwards from under the robot.
+
+Tile by tile, in the order of their distance, a plane through the ground accepted around a tile
+tells where its ground must be. A plane of many cells does not leak through a gap in a step, as
+links between neighbours do; and it bends into a ramp, but never more than the steepest one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+ROWS, COLUMNS = 4, 2
+"""Cells of a tile, along columns and rows."""
+# Tiles of a block: the window of a prediction is three blocks high and wide.
+_HIGH = 4
+# Cells that make a prediction: as many as two tiles have.
+_ENOUGH = 16
+# Spread of the ground's slope that a prediction starts from: that of undulation.
+_SLOPE = 0.05
+
+
+@njit(cache=True, nogil=True)
+def grown(
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    candidate: NDArray[np.bool_],
+    seed: NDArray[np.bool_],
+    slope: float,
+    tolerance: NDArray[np.float32],
+) -> NDArray[np.bool_]:
+    """Cells of the ground.
+
+    Parameters
+    ----------
+    height : (rows, columns) float32
+        Above the plane under the robot, metres.
+    place : (rows, columns, 3) float32
+        Horizontal position in the last two entries, metres.
+    variance : (rows, columns) float32
+        Of the height.
+    candidate : (rows, columns) bool
+        Cells that no step crosses.
+    seed : (rows, columns) bool
+        Cells that are ground.
+    slope : float
+        Tangent of the steepest ground.
+    tolerance : (rows, columns) float32
+        By which ground may differ from its prediction, metres.
+
+    Returns
+    -------
+    (rows, columns) bool
+    """
+    rows, columns = height.shape
+    high, wide = -(-rows // ROWS), -(-columns // COLUMNS)
+    sums = np.zeros((-(-high // _HIGH), wide, 10))
+    ground = np.zeros((rows, columns), np.bool_)
+    distance = np.full(high * wide, np.inf)
+    for i in range(rows):
+        for c in range(columns):
+            if seed[i, c]:
+                _add(sums, ground, height, place, variance, i, c)
+            if candidate[i, c]:
+                tile = (i // ROWS) * wide + c // COLUMNS
+                reach = np.hypot(place[i, c, 1], place[i, c, 2])
+                distance[tile] = min(distance[tile], reach)
+    order = np.argsort(distance, kind='mergesort')
+    for turn in range(2):  # outwards, and back behind what stands in the way
+        for k in range(len(order)):
+            tile = order[k] if turn == 0 else order[len(order) - 1 - k]
+            if distance[tile] < np.inf:
+                _grow_tile(
+                    tile // wide,
+                    tile % wide,
+                    height,
+                    place,
+                    variance,
+                    candidate,
+                    slope,
+                    tolerance,
+                    sums,
+                    ground,
+                )
+    return ground
+
+
+@njit(cache=True, nogil=True)
+def _grow_tile(
+    m: int,
+    n: int,
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    candidate: NDArray[np.bool_],
+    slope: float,
+    tolerance: NDArray[np.float32],
+    sums: NDArray[np.float64],
+    ground: NDArray[np.bool_],
+) -> None:
+    """Accept the cells of tile (m, n) that agree with the ground around it."""
+    total = np.zeros(10)
+    b = m // _HIGH
+    for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
+        for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
+            total += sums[i, j]
+    if total[9] < _ENOUGH:
+        return
+    w = total[0]
+    x, y, h = total[1] / w, total[2] / w, total[6] / w
+    prior = 1 / _SLOPE**2
+    xx, xy, yy = (
+        total[3] - w * x * x + prior,
+        total[4] - w * x * y,
+        total[5] - w * y * y + prior,
+    )
+    xh, yh = total[7] - w * x * h, total[8] - w * y * h
+    determinant = xx * yy - xy * xy
+    p, q = (yy * xh - xy * yh) / determinant, (xx * yh - xy * xh) / determinant
+    steepness = np.hypot(p, q)
+    if steepness > slope:
+        p, q = p * slope / steepness, q * slope / steepness
+    for i in range(m * ROWS, min((m + 1) * ROWS, height.shape[0])):
+        for c in range(n * COLUMNS, min((n + 1) * COLUMNS, height.shape[1])):
+            if candidate[i, c] and not ground[i, c]:
+                expected = h + p * (place[i, c, 1] - x) + q * (place[i, c, 2] - y)
+                if abs(height[i, c] - expected) <= tolerance[i, c]:
+                    _add(sums, ground, height, place, variance, i, c)
+
+
+@njit(cache=True, inline='always')
+def _add(
+    sums: NDArray[np.float64],
+    ground: NDArray[np.bool_],
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    i: int,
+    c: int,
+) -> None:
+    ground[i, c] = True
+    total = sums[i // (ROWS * _HIGH), c // COLUMNS]
+    w = 1 / max(variance[i, c], 1e-9)
+    x, y, h = place[i, c, 1], place[i, c, 2], height[i, c]
+    total[0] += w
+    total[1] += w * x
+    total[2] += w * y
+    total[3] += w * x * x
+    total[4] += w * x * y
+    total[5] += w * y * y
+    total[6] += w * h
+    total[7] += w * x * h
+    total[8] += w * y * h
+    total[9] += 1

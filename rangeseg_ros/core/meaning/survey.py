@@ -1,0 +1,51 @@
+"""The ground of an image, looked for when somebody asks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
+from rangeseg_ros.core.meaning.roles import unit
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """What finding the ground takes.
+
+    Attributes
+    ----------
+    image : RangeImage
+    sensor : SensorModel
+    up : (3,) float64
+        Unit vector in the frame of the image.
+    sensor_height : float
+        Above the ground below the sensor, metres; 0 = unknown.
+    limits : Limits
+    """
+
+    image: RangeImage
+    sensor: SensorModel
+    up: NDArray[np.float64]
+    sensor_height: float
+    limits: Limits
+
+    @classmethod
+    def of(
+        cls, image: RangeImage, sensor: SensorModel, config: Config, up: ArrayLike | None = None
+    ) -> Survey:
+        """With the parameters of `config`, and its direction `up` when none is given."""
+        limits = Limits(
+            float(np.radians(config.ground_slope)), config.obstacle_height, config.drop_height
+        )
+        direction = unit((config.up_x, config.up_y, config.up_z) if up is None else up)
+        return cls(image, sensor, direction, config.sensor_height, limits)
+
+    def terrain(self) -> Terrain:
+        """Find it."""
+        return terrain_of(self.image, self.sensor, self.up, self.sensor_height, self.limits)

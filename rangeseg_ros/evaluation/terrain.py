@@ -1,0 +1,238 @@
+"""Terrain measured against the truth of simulated scenes: files, shares, tables."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.evaluation.label_files import EvaluationError, read_label_image
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.images import read_depth, write_image
+
+REACH = {'realsense': 2.5}
+"""Metres up to which a sensor's ground and obstacles count; 3.5 for all others."""
+MARGIN = 3
+"""Pixels beside borders of classes that do not count."""
+SIZES = (0.05, 0.075, 0.11, 0.2, 0.4)
+"""Heights of obstacles that the table tells apart, metres."""
+_COLUMNS = ('name', 'kind', 'sensor', 'up_x', 'up_y', 'up_z', 'sensor_height')
+_STAIRS = ('direction', 'count', 'rise', 'run')
+
+
+class TerrainTable:
+    """CSV of what is known of each image."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def __enter__(self) -> TerrainTable:
+        self._file = self._path.open('w', newline='')
+        self._rows = csv.writer(self._file, lineterminator='\n')
+        self._rows.writerow([*_COLUMNS, *_STAIRS])
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._file.close()
+
+    def write(
+        self,
+        name: str,
+        kind: str,
+        sensor: str,
+        up: NDArray[np.float64],
+        height: float,
+        stairs: Mapping[str, Any],
+    ) -> None:
+        """Append an image: `up` and `height` as the robot knows them."""
+        known = [f'{value:.6f}' for value in (*up, height)]
+        self._rows.writerow([name, kind, sensor, *known, *(stairs.get(x, '') for x in _STAIRS)])
+
+
+class Shares(NamedTuple):
+    """What became of the pixels of one image.
+
+    Attributes
+    ----------
+    name, kind : str
+        Of the image.
+    pixels : (4, 4) int64
+        By true and found class.
+    found : dict
+        (height of the obstacle: index in `SIZES`, distance in whole metres) to pixels of
+        obstacles, and how many of them were found.
+    """
+
+    name: str
+    kind: str
+    pixels: NDArray[np.int64]
+    found: dict[tuple[int, int], tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class TerrainTask:
+    """An image with its truth, and the parameters to find the terrain with.
+
+    Attributes
+    ----------
+    folder : Path
+    row : dict
+        Of the table.
+    config : Config
+    output : Path or None
+        Folder for pictures: truth, what was found, and where they differ.
+    """
+
+    folder: Path
+    row: dict[str, str]
+    config: Config
+    output: Path | None = None
+
+    def run(self) -> Shares:
+        """Segment the image and count its pixels."""
+        name, reach = self.row['name'], REACH.get(self.row['sensor'], 3.5)
+        depth = read_depth(self.folder / 'depth' / f'{name}.png')
+        truth = read_label_image(self.folder / 'truth' / f'{name}.png').astype(np.uint8)
+        size, crossing = (
+            read_depth(self.folder / part / f'{name}.tiff') for part in ('size', 'crossing')
+        )
+        image = RangeImage.from_depth(depth, read_camera(self.folder / 'camera.yaml'))
+        found = Segmenter(self.config).segment(image).terrain
+        metres = np.where(truth == DROP, crossing, depth / 1000)
+        judged = (truth > UNKNOWN) & (metres <= reach) & ~_near_borders(truth)
+        pixels = np.zeros((4, 4), np.int64)
+        np.add.at(pixels, (truth[judged], found[judged]), 1)
+        table: dict[tuple[int, int], tuple[int, int]] = {}
+        obstacle = judged & (truth == OBSTACLE)
+        sizes = np.searchsorted(SIZES, size[obstacle] + 1e-6) - 1
+        at = metres[obstacle].astype(int)
+        for key in {(int(a), int(b)) for a, b in zip(sizes, at, strict=True)}:
+            here = (sizes == key[0]) & (at == key[1])
+            table[key] = int(here.sum()), int((found[obstacle][here] == OBSTACLE).sum())
+        if self.output:
+            wrong = judged & (found != truth)
+            picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
+            write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
+        return Shares(name, self.row['kind'], pixels, table)
+
+
+_COLOURS = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [0, 0, 240]], np.uint8)
+
+
+def _near_borders(truth: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """(H, W) whether another judged class is within `MARGIN` pixels."""
+    kernel = np.ones((2 * MARGIN + 1, 2 * MARGIN + 1), np.uint8)
+    highest = cv2.dilate(truth, kernel)
+    lowest = cv2.erode(np.where(truth == UNKNOWN, 255, truth).astype(np.uint8), kernel)
+    result: NDArray[np.bool_] = highest != lowest
+    return result
+
+
+def terrain_tasks(
+    folder: Path, config: Config, know_height: bool, output: Path | None
+) -> list[TerrainTask]:
+    """A task for each image of `rangeseg simulate terrain`.
+
+    Parameters
+    ----------
+    folder : Path
+    config : Config
+        Its `up_x`, `up_y`, `up_z` and `sensor_height` are replaced by those of the images.
+    know_height : bool
+        Whether the height of the sensor is told.
+    output : Path or None
+        See `TerrainTask`.
+
+    Raises
+    ------
+    EvaluationError
+        A malformed table.
+    """
+    path = folder / 'terrain.csv'
+    tasks = []
+    with path.open(newline='') as file:
+        try:
+            for row in csv.DictReader(file):
+                known: dict[str, Any] = {name: float(row[name]) for name in _COLUMNS[3:]}
+                if not know_height:
+                    known['sensor_height'] = 0.0
+                tasks.append(TerrainTask(folder, dict(row), replace(config, **known), output))
+        except (KeyError, TypeError, ValueError, csv.Error):
+            raise EvaluationError(f'{path}: malformed table of terrains') from None
+    return tasks
+
+
+def shares(pixels: NDArray[np.int64]) -> dict[str, float]:
+    """Of the true ground, obstacles and drops, what they were called; NaN where there are none."""
+    with np.errstate(invalid='ignore'):
+        share = pixels / pixels.sum(axis=1, keepdims=True)
+    return {
+        'ground_kept': float(share[GROUND, GROUND]),
+        'ground_called_obstacle': float(share[GROUND, OBSTACLE]),
+        'ground_called_drop': float(share[GROUND, DROP]),
+        'obstacle_found': float(share[OBSTACLE, OBSTACLE]),
+        'obstacle_called_ground': float(share[OBSTACLE, GROUND]),
+        'drop_found': float(share[DROP, DROP]),
+        'drop_called_ground': float(share[DROP, GROUND]),
+    }
+
+
+def terrain_figures(images: Sequence[Shares]) -> dict[str, Any]:
+    """Shares over all pixels of all images, of each kind of scene, and of each image."""
+    kinds = sorted({image.kind for image in images})
+    return {
+        'images': len(images),
+        'pooled': shares(_pooled(images)),
+        'by_kind': {kind: shares(_pooled(i for i in images if i.kind == kind)) for kind in kinds},
+        'by_size': _by_size(images),
+        'per_image': {i.name: {'kind': i.kind, **shares(i.pixels)} for i in images},
+        'drop_scenes_above_0.01': [
+            i.name for i in images if shares(i.pixels)['drop_called_ground'] > 0.01
+        ],
+    }
+
+
+def _pooled(images: Iterable[Shares]) -> NDArray[np.int64]:
+    return sum((image.pixels for image in images), np.zeros((4, 4), np.int64))
+
+
+def _by_size(images: Sequence[Shares]) -> dict[str, dict[str, float]]:
+    """Share of the pixels of obstacles that were found, by height and distance."""
+    result: dict[str, dict[str, float]] = {}
+    for k, least in enumerate(SIZES):
+        row = {}
+        for metre in range(4):
+            counts = np.array([image.found.get((k, metre), (0, 0)) for image in images]).sum(0)
+            row[f'{metre}'] = float(counts[1] / counts[0]) if counts[0] else float('nan')
+        result[f'{least:g}'] = row
+    return result
+
+
+def terrain_table(figures: Mapping[str, Any]) -> str:
+    """Text of `terrain_figures`: shares of the kinds of scenes and of all, obstacles by height."""
+    heads = ('kept', 'obstacle', 'drop', 'found', 'ground', 'found', 'ground')
+    lines = [
+        ' ' * 18 + '|         ground            |     obstacle     |       drop',
+        f'{"called":<18}' + ''.join(f'{head:>9}' for head in heads),
+    ]
+    for kind, row in {**figures['by_kind'], 'all': figures['pooled']}.items():
+        lines.append(f'{kind:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))
+    lines.append(f'drop called ground above 0.01: {len(figures["drop_scenes_above_0.01"])} scenes')
+    lines.append('obstacles found, from this height (m) on, at 0, 1, 2, 3 m:')
+    for least, row in figures['by_size'].items():
+        lines.append(f'{least:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))
+    return '\n'.join(lines)
+
+
+def _share(value: float) -> str:
+    return '-' if np.isnan(value) else f'{value:.4f}'
