@@ -1,0 +1,51 @@
+"""What the documents say of the code is so."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / 'rangeseg_ros'
+PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
+# Pages that docs/hooks.py makes.
+GENERATED = ('parameters.md',)
+# Where the documents count paths from.
+FOLDERS = [ROOT, PACKAGE, PACKAGE / 'core', ROOT / 'docs', ROOT / 'test']
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_links_and_names_of_files_lead_somewhere(page):
+    text = page.read_text()
+    for link in re.findall(r'\]\(([^)#:]+)(?:#[^)]*)?\)', text):
+        assert (page.parent / link).exists() or link in GENERATED, link
+    for name in re.findall(r'`((?:[\w.]+/)*\w+\.(?:py|md|toml|cff|rst))`', text):
+        nested = [folder / name for folder in FOLDERS]
+        assert any(path.exists() for path in nested) or any(PACKAGE.rglob(name)), name
+
+
+def test_every_room_is_on_the_page_of_the_architecture():
+    text = (ROOT / 'docs/architecture.md').read_text()
+    for folder in (PACKAGE, PACKAGE / 'core'):
+        for path in folder.iterdir():
+            if path.is_dir() and (path / '__init__.py').exists() and path.name != 'core':
+                assert f'`{path.name}/`' in text, path.name
+            elif path.suffix == '.py' and path.name != '__init__.py':
+                assert f'`{path.name}`' in text, path.name
+
+
+def test_functions_that_the_architecture_names_are_where_it_says():
+    text = (ROOT / 'docs/architecture.md').read_text()
+    pairs = re.findall(r'`(\w+)`(?:\(\))? (?:\(|in |of )`([\w/]+\.py)`', text)
+    assert len(pairs) > 5
+    for name, file in pairs:
+        paths = [folder / file for folder in FOLDERS if (folder / file).exists()]
+        paths = paths or list(PACKAGE.rglob(file))
+        pattern = rf'^(def|class|   ) {name}\b|^{name}\b.* = '
+        assert re.search(pattern, paths[0].read_text(), re.M), (name, file)
+
+
+def test_every_page_is_in_the_site():
+    order = (ROOT / 'mkdocs.yml').read_text()
+    for path in (ROOT / 'docs').glob('*.md'):
+        assert f'{path.name}\n' in order, path.name
