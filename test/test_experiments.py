@@ -162,7 +162,7 @@ def test_comparison(folder, tmp_path, monkeypatch):
 
 def test_published_rows_are_named_and_drawn(tmp_path):
     ours = {'series': 'planes', 'source': 'simulated set x', 'tolerance': 0.8}
-    table = [ours | {'regions': 14.0, 'correct': 12.0}, *experiments.published_rows()]
+    table = [ours | {'regions': 14.0, 'correct': 12.0}, *experiments.published_rows('perc')]
     assert {r['source'] for r in table[1:]} == {'real Perceptron test set, published'}
     assert len(table) == 1 + 6 * len(experiments.PUBLISHED)
     plots.plot_tolerances(tmp_path / 'x.png', table, 'x')
@@ -220,3 +220,18 @@ def test_parameter_files_hold_the_published_settings(sensor):
     # Whatever the defaults become.
     given = set(read_params(path))
     assert {'method', 'smoothness', 'jump_edges', 'normal_baseline', 'min_pixels'} <= given
+
+
+def test_each_image_is_left_out_of_its_own_training():
+    """Two images disagree on the best lambda: each gets that of the other."""
+    results = {20.0: [measurement(9), measurement(5)], 50.0: [measurement(5), measurement(9)]}
+    chosen = experiments.left_out(results)
+    assert chosen == [results[50.0][0], results[20.0][1]]
+
+
+def test_weights(folder, tmp_path, monkeypatch):
+    args = ('weights', folder, '--output', tmp_path, '--step', '130', '--images', '1')
+    assert run(monkeypatch, *args) == 0
+    table = rows(tmp_path / 'weights.csv')
+    assert {row['series'] for row in table} == set(experiments.WEIGHTS)
+    picture(tmp_path / 'weights.png')

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
+from rangeseg_ros.core.by_normals.normals import (
+    cross_product,
+    observed_normals,
+    orthogonal_fit,
+    plane_fit,
+)
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
@@ -26,6 +31,8 @@ METHODS = [
     lambda image: cross_product(image, 3),
     lambda image: plane_fit(image, 1),
     lambda image: plane_fit(image, 3),
+    lambda image: orthogonal_fit(image, 1),
+    lambda image: orthogonal_fit(image, 3),
 ]
 
 
@@ -53,7 +60,7 @@ def test_clouds_of_another_frame_point_to_the_sensor_too(method):
     np.testing.assert_allclose(found[15, 20], [-1, 0, 0], atol=2e-3)
 
 
-@pytest.mark.parametrize(('method', 'reach'), list(zip(METHODS, [1, 3, 1, 3], strict=True)))
+@pytest.mark.parametrize(('method', 'reach'), list(zip(METHODS, [1, 3, 1, 3, 1, 3], strict=True)))
 def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reach):
     depth = plane_image((0, 0, -1), 1.0).points[..., 2].copy()
     depth[15, 20] = np.nan
@@ -95,3 +102,15 @@ def test_images_too_small_have_no_normals_or_right_ones(shape, method):
     assert found.shape == (*shape, 3)
     defined = found[np.isfinite(found[..., 0])]
     np.testing.assert_allclose(defined, np.tile([0, 0, -1], (len(defined), 1)), atol=1e-3)
+
+
+def test_orthogonal_fit_is_the_plane_of_least_distances():
+    depth = np.random.default_rng(3).uniform(1.9, 2.1, CAMERA.shape)
+    image = RangeImage.from_depth(depth, CAMERA)
+    found = orthogonal_fit(image, 2)
+    for y, x in ((2, 2), (11, 17), (20, 30)):
+        points = image.points[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3).astype(float)
+        expected = np.linalg.svd(points - points.mean(axis=0))[2][2]
+        expected *= -np.sign(expected @ image.rays[y, x])
+        np.testing.assert_allclose(found[y, x], expected, atol=1e-5)
+    assert np.isnan(found[1, 5]).all()

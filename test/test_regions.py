@@ -61,6 +61,15 @@ def test_merge_erodes_towards_the_majority():
     assert (merged == expected).all()
 
 
+def test_merge_waits_for_a_majority():
+    """The middle, between two regions of two neighbours each, joins that of the pixel below."""
+    regions = np.array([[1, 1, 3, 3], [2, 2, 2, 2], [4, 1, 3, 3], [4, 4, 4, 4]], np.int32)
+    noise = np.array([False, False, True, False, False])
+    merged = merge(regions, noise)
+    # Left: 1 of region 1 below right, 2 above, 1 of 4; the pixels between are ties at first.
+    assert merged[1].tolist() == [1, 1, 3, 3]
+
+
 def test_merge_keeps_noise_that_touches_nothing():
     regions = np.zeros((5, 5), np.int32)
     regions[2, 2] = 1

@@ -26,11 +26,16 @@ class Setting:
 
     cases: list[Case]
     base: Config
+    params: Config | None
     names_method: bool
     bench: experiments.Bench
     output: Path
     images: int | None
     source: str
+
+    def has(self, name: str) -> bool:
+        """Whether the set has images that are said to be of that split."""
+        return any(getattr(case, 'split', '') == name for case in self.cases)
 
     def split(self, name: str) -> list[Case]:
         """Images of a split, or all of a set without splits; at most --images of them."""
@@ -72,10 +77,10 @@ def experiment(function: Callable[..., None]) -> Callable[..., None]:
         jobs: int | None,
         **rest: Any,
     ) -> None:
-        base, given = experiments.THESIS, {'method': 'normals'}
+        base, given, params = experiments.THESIS, {'method': 'normals'}, None
         if params_file:
             given = read_params(params_file)
-            base = Config.from_mapping({'method': 'normals', **given})
+            base = params = Config.from_mapping({'method': 'normals', **given})
         bench = experiments.Bench(
             output / 'cache',
             jobs,
@@ -83,7 +88,9 @@ def experiment(function: Callable[..., None]) -> Callable[..., None]:
         )
         source = f'{"real" if real else "simulated"} set {folder.resolve().name}'
         function(
-            Setting(find_cases(folder), base, 'method' in given, bench, output, images, source),
+            Setting(
+                find_cases(folder), base, params, 'method' in given, bench, output, images, source
+            ),
             **rest,
         )
 
@@ -163,22 +170,33 @@ def postprocessing(setting: Setting, step: int) -> None:
 @command.command()
 @experiment
 @step
+def weights(setting: Setting, step: int) -> None:
+    """Neighbourhood weights of section 5.5, each at its best lambda (figure 5.5)."""
+    cases = setting.split('train' if setting.has('train') else 'test')
+    rows = experiments.weights(setting.bench, cases, setting.base, _lambdas(step))
+    setting.save('weights', rows, plots.plot_tolerances)
+
+
+@command.command()
+@experiment
+@step
 def comparison(setting: Setting, step: int) -> None:
     """Ours on the test images (figure 6.5, table B.1).
 
-    On a Perceptron set, beside the published results.
+    Beside the published results of a Perceptron or ABW set. Lambda is trained on the training
+    images; without any, for each image on all others. --params adds rows with these parameters.
     """
     test = setting.split('test')
     sensor = getattr(test[0], 'sensor', '')
     rows = experiments.comparison(
         setting.bench,
-        setting.split('train'),
+        setting.split('train') if setting.has('train') else [],
         test,
-        experiments.variants(sensor),
+        experiments.variants(sensor, setting.params),
         setting.source,
         _lambdas(step),
-        published=sensor == 'perc',
     )
+    rows += experiments.published_rows(sensor)
     setting.save('comparison', rows, plots.plot_tolerances)
 
 

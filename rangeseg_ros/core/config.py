@@ -47,9 +47,10 @@ class Config:
     )
     normals: str = option(
         'cross_product',
-        'observed normals by cross product of the tangents (cross_product) or least-squares '
-        'plane through a window (plane_fit)',
-        choices=('cross_product', 'plane_fit'),
+        'observed normals by cross product of the tangents (cross_product), by the plane through '
+        'a window of least squares in inverse range (plane_fit) or of orthogonal least squares '
+        '(orthogonal_fit)',
+        choices=('cross_product', 'plane_fit', 'orthogonal_fit'),
     )
     normal_baseline: int = option(
         3,
@@ -59,7 +60,10 @@ class Config:
         high=50,
     )
     normal_radius: int = option(
-        2, 'the window of plane_fit has 2 r + 1 rows and columns', low=1, high=50
+        2,
+        'the window of plane_fit and orthogonal_fit has 2 r + 1 rows and columns',
+        low=1,
+        high=50,
     )
     directions: str = option(
         'platonic',

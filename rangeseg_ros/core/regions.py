@@ -178,9 +178,11 @@ def _counts(
 
 
 def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Erode noise regions: their pixels join the region most of their neighbours belong to.
+    """Erode noise regions into those around them (thesis 6.1.4).
 
-    Repeated from the rims inwards until nothing changes (thesis 6.1.4). A noise region that
+    From the rims inwards, a pixel joins the region that the majority of its eight neighbours
+    belong to, of those that have a region already and are no noise. Where no pixel has a majority
+    any more, that of most neighbours is taken, as noise is to disappear. A noise region that
     touches no other region stays.
 
     Parameters
@@ -203,7 +205,10 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
         votes = (neighbours[:, :, None] == neighbours[:, None, :]).sum(axis=2)
         votes = np.where(neighbours > 0, votes, 0)
         best = np.where(votes == votes.max(axis=1, keepdims=True), neighbours, len(noise))
-        joined = votes.max(axis=1) > 0
+        most = votes.max(axis=1)
+        joined = 2 * most > np.count_nonzero(votes, axis=1)
+        if not joined.any():
+            joined = most > 0
         if not joined.any():
             break
         framed[pixels[joined]] = best.min(axis=1)[joined]

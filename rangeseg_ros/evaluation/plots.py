@@ -11,6 +11,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 
 from rangeseg_ros.evaluation.experiments import Row
 from rangeseg_ros.io.files import replacing
@@ -42,13 +43,17 @@ def plot_tolerances(path: Path, rows: Sequence[Row], title: str) -> None:
     """Correct regions against the tolerance, a line for each series; published ones dotted."""
     figure = Figure(figsize=(9.5, 5.5), layout='constrained')
     axes = figure.subplots()
-    colours = iter(colormaps['tab20b'](range(20)))
+    colours = iter(colormaps['tab20'](range(0, 20)))
     for name, part in _series(rows).items():
         label = name
         style: dict[str, Any] = {'marker': 'o'}
         if _published(part[0]):
             label += ', published'
-            style = {'linestyle': ':', 'marker': '', 'color': next(colours)}
+            style = {'linestyle': ':', 'marker': '', 'color': next(colours), 'linewidth': 1.2}
+            if name.startswith('thesis'):
+                style |= {'color': 'black', 'linestyle': '--', 'marker': 's', 'markersize': 4}
+            if len(part) == 1:
+                style['marker'] = 'x'
         elif part[0].get('lambda'):
             label += f' (λ = {part[0]["lambda"]:g})'
         x = [100 * row['tolerance'] for row in part]
@@ -58,7 +63,9 @@ def plot_tolerances(path: Path, rows: Sequence[Row], title: str) -> None:
     _finish(axes, 'tolerance T, %', 'correct regions per image')
     figure.legend(fontsize=8, loc='outside right upper')
     if any(_published(row) for row in rows):
-        title += '; published: real Perceptron set'
+        title += (
+            '; published: ' + next(r['source'] for r in rows if _published(r)).partition(',')[0]
+        )
     axes.set_title(title, fontsize=10)
     _save(path, figure)
 
@@ -96,6 +103,12 @@ def plot_timing(path: Path, rows: Sequence[Row], title: str) -> None:
     axes.plot(*zip(*published, strict=True), 'k:s', label='expansion, thesis (2012)')
     axes.set_xscale('log')
     axes.set_yscale('log')
+    counts = sorted({row['labels'] for row in rows})
+    # Numbers of Platonic and of regular sets that are close would print over each other.
+    shown = [n for k, n in enumerate(counts) if k == 0 or n > 1.15 * counts[k - 1]]
+    axes.set_xticks(shown, [str(n) for n in shown])
+    axes.minorticks_off()
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda seconds, _: f'{seconds:g}'))
     _finish(axes, 'labels', 'seconds per image for the labelling')
     axes.legend()
     figure.suptitle(title)

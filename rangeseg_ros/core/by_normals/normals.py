@@ -35,6 +35,8 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[n
     """
     if config.normals == 'plane_fit':
         return plane_fit(image, config.normal_radius)
+    if config.normals == 'orthogonal_fit':
+        return orthogonal_fit(image, config.normal_radius)
     normals = cross_product(image, config.normal_baseline)
     if config.jump_edges == 'plane':
         reach = config.normal_baseline
@@ -99,10 +101,11 @@ def _cross_product(
 
 
 def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
-    """Least-squares plane through a window of pixels (thesis 5.7.2).
+    """Plane through a window of least squares in inverse range (thesis 5.7.2).
 
-    The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse, so that the sums
-    of the normal equations are box filters over the image.
+    That is where the noise of structured light and stereo is constant; `orthogonal_fit` is of
+    distances in space. The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse,
+    so that the sums of the normal equations are box filters over the image.
 
     Parameters
     ----------
@@ -116,16 +119,13 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     (H, W, 3) float32
         NaN where the window holds a pixel that was not measured or lies outside the image.
     """
-    window = 2 * radius + 1
-
-    def mean(product: NDArray[np.float64]) -> NDArray:
-        return cv2.boxFilter(product, cv2.CV_64F, (window, window), borderType=cv2.BORDER_CONSTANT)
-
     valid = image.valid
     a, b, c = (np.where(valid, ray, 0) for ray in cv2.split(image.rays.astype(np.float64)))
     w = image.inverse.astype(np.float64)
-    aa, ab, ac, bb, bc, cc = (mean(p) for p in (a * a, a * b, a * c, b * b, b * c, c * c))
-    aw, bw, cw = (mean(p) for p in (a * w, b * w, c * w))
+    aa, ab, ac, bb, bc, cc = (
+        _means(p, radius) for p in (a * a, a * b, a * c, b * b, b * c, c * c)
+    )
+    aw, bw, cw = (_means(p, radius) for p in (a * w, b * w, c * w))
     # Cramer's rule, without the determinant: the result is normalised anyhow.
     normal = np.stack(
         [
@@ -135,12 +135,46 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
         ],
         axis=-1,
     )
-    kernel = np.ones((window, window), np.uint8)
-    complete = cv2.erode(
+    normal[~_complete(valid, radius)] = np.nan
+    return _towards_sensor(normal, image)
+
+
+def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
+    """Plane through a window of least orthogonal distances to its points (thesis 5.7.2).
+
+    The eigenvector of the smallest eigenvalue of the points' covariance. Parameters and result as
+    for `plane_fit`.
+    """
+    valid = image.valid
+    # About their mean, so that the products of coordinates keep their digits.
+    points = image.points.astype(np.float64)
+    points = np.where(valid[..., None], points - points[valid].mean(axis=0), 0)
+    mean = np.stack([_means(points[..., k], radius) for k in range(3)], axis=-1)
+    covariance = np.empty((*valid.shape, 3, 3))
+    for a in range(3):
+        for b in range(a + 1):
+            product = _means(points[..., a] * points[..., b], radius)
+            covariance[..., a, b] = product - mean[..., a] * mean[..., b]
+    complete = _complete(valid, radius)
+    normal = np.full(points.shape, np.nan)
+    # Eigenvalues ascend; only the lower triangle is read.
+    normal[complete] = np.linalg.eigh(covariance[complete])[1][..., 0]
+    return _towards_sensor(normal, image)
+
+
+def _means(values: NDArray[np.float64], radius: int) -> NDArray:
+    """Means over windows, as if 0 outside the image."""
+    size = 2 * radius + 1, 2 * radius + 1
+    return cv2.boxFilter(values, cv2.CV_64F, size, borderType=cv2.BORDER_CONSTANT)
+
+
+def _complete(valid: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+    """Pixels whose window lies in the image and was measured throughout."""
+    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    inside = cv2.erode(
         valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
     )
-    normal[complete == 0] = np.nan
-    return _towards_sensor(normal, image)
+    return inside > 0
 
 
 def _towards_sensor(normals: NDArray, image: RangeImage) -> NDArray[np.float32]:
