@@ -1,7 +1,25 @@
 """Settings of every test."""
 
+import sys
+
+import pytest
 from hypothesis import settings
+
+from rangeseg_ros.cli.main import main
 
 # The same examples on every run, and no timed tests: machines are busy.
 settings.register_profile('rangeseg', deadline=None, derandomize=True)
 settings.load_profile('rangeseg')
+
+
+@pytest.fixture
+def run(monkeypatch, capsys):
+    """Run the command: the exit code, standard output and error."""
+
+    def run_command(*arguments):
+        monkeypatch.setattr(sys, 'argv', ['rangeseg', *map(str, arguments)])
+        with pytest.raises(SystemExit) as done:
+            main()
+        return done.value.code or 0, *capsys.readouterr()
+
+    return run_command

@@ -13,7 +13,6 @@ import yaml
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros import Camera
-from rangeseg_ros.cli.main import main
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
@@ -29,19 +28,6 @@ def folder(tmp_path, monkeypatch):
     write_image(tmp_path / 'depth' / '2.png', np.full((48, 64), 1500, np.uint16))
     write_image(tmp_path / 'depth' / '10.png', np.zeros((48, 64), np.uint16))
     return tmp_path
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    """Run the command: the exit code, standard output and error."""
-
-    def run_command(*arguments):
-        monkeypatch.setattr(sys, 'argv', ['rangeseg', *map(str, arguments)])
-        with pytest.raises(SystemExit) as done:
-            main()
-        return done.value.code or 0, *capsys.readouterr()
-
-    return run_command
 
 
 def files(folder):

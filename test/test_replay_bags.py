@@ -84,7 +84,7 @@ def test_messages_are_those_of_the_node(done):
     written = [data for *_, data in read(done / 'plain/bag')]
     published = []
     with DepthBag(done / 'recording') as source:
-        for frame, image, result in segmented(source, SequenceSegmenter(Config())):
+        for _, frame, image, result in segmented(source, SequenceSegmenter(Config())):
             sec, nanosec = divmod(frame.stamp, 10**9)
             stamp = make_rclpy('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
             header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id='optical')

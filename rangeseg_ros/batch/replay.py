@@ -50,7 +50,7 @@ class Outcome:
     figures : dict
         See `ReplayReport.figures`.
     damage : str
-        Why the recording was not read to its end; empty when it was.
+        What of the recording could not be read; empty when all of it was.
     found_done : bool
         The results were there already.
     mapped : int
@@ -134,21 +134,16 @@ class Replay:
             report = ReplayReport(str(self.recording.name), self.config)
             sequence = SequenceSegmenter(self.config)
             located = stack.enter_context(Locator(self.recording, self.config))
-            damage: list[str] = []
-            frames = progress(source, len(source)) if progress else source
 
             def results() -> Iterator[Timed]:
-                try:
-                    timed = segmented(frames, sequence, located.pose)
-                    for index, (frame, image, result) in enumerate(timed):
-                        stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
-                        stem = f'{index:06d}_{stamp}'
-                        files = write_frame(self.folder, stem, image, result, PICTURES)
-                        table.write(result.planes, index, stamp)
-                        report.add(frame.stamp, result, files['overlay'])
-                        yield from bag.messages(frame, image, result)
-                except DamagedBagError as error:
-                    damage.append(str(error))
+                found = segmented(source, sequence, located.pose, progress)
+                for index, frame, image, result in found:
+                    stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
+                    stem = f'{index:06d}_{stamp}'
+                    files = write_frame(self.folder, stem, image, result, PICTURES)
+                    table.write(result.planes, index, stamp)
+                    report.add(frame.stamp, result, files['overlay'])
+                    yield from bag.messages(frame, image, result)
 
             streams = [results()]
             if self.copy:
@@ -160,11 +155,15 @@ class Replay:
                 write_map(self.folder / 'map.csv', planes)
                 shades = colours([plane.id for plane in planes])
                 write_mesh(self.folder / 'map.ply', planes, shades)
+            damage = [source.damage, source.loss()]
+            if bag.lost:
+                reason, count = bag.lost.most_common(1)[0]
+                damage.append(f'{bag.lost.total()} messages not copied, {count} of {reason}')
             outcome = Outcome(
                 report.frames,
                 dict(report.reasons),
                 report.figures(),
-                ''.join(damage),
+                '; '.join(filter(None, damage)),
                 mapped=len(planes),
                 unlocated=dict(located.problems),
             )
@@ -204,13 +203,30 @@ class Replay:
 
 
 def segmented(
-    frames: Iterable[DepthFrame],
+def segmented(
+    source: DepthBag,
     sequence: SequenceSegmenter,
     pose: Callable[[DepthFrame], Transform | None] = lambda frame: None,
-) -> Iterator[tuple[DepthFrame, RangeImage, Segmentation]]:
-    """Segment the frames of a recording, with persistent ids and roles; `pose` locates them."""
+    progress: Progress | None = None,
+) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
+    """Segment the frames of a recording, with persistent ids and roles; `pose` locates them.
+
+    Yields their numbers among the frames of the recording, of which those that cannot be read are
+    left out and counted by `source.lost`.
+    """
     # Or the times of the first frame would be those of the compiler.
     prepare(sequence.config, ('image',), report=lambda progress: None)
-    for frame in frames:
-        image = corrected(frame.range_image(), sequence.config)
-        yield frame, image, sequence.segment(image, frame.stamp, pose=pose(frame))
+    done = 0
+    try:
+        for frame in progress(source, len(source)) if progress else source:
+            try:
+                image = frame.range_image()
+            except ValueError as error:
+                source.lose(str(error))
+                continue
+            image = corrected(image, sequence.config)
+            result = sequence.segment(image, frame.stamp, pose=pose(frame))
+            yield done + source.lost.total(), frame, image, result
+            done += 1
+    except DamagedBagError as error:
+        source.damage = str(error)

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import heapq
 import json
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 import yaml
-from rosbags import rosbag2
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.typesys import Stores
 
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.io.bag_writer import BagWriter
 from rangeseg_ros.io.bags import BagError
-from rangeseg_ros.io.recordings import make_rosbags, message_types
+from rangeseg_ros.io.chunks import Lost
+from rangeseg_ros.io.recordings import Recording, make_rosbags, message_types
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.outputs import OUTPUTS
 
@@ -39,16 +41,19 @@ class ResultBag:
         Directory to make.
     topics : iterable of str
         Which of `OUTPUTS`, by name.
+
+    Attributes
+    ----------
+    lost : Counter of str
+        Topic and reason of messages that could not be copied -> how many.
     """
 
     def __init__(self, path: Path, topics: Iterable[str]) -> None:
         self._store = message_types(Stores.ROS2_JAZZY)
-        self._writer = rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
         # Labels shrink to a hundredth.
-        self._writer.set_compression(
-            rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD
-        )
+        self._writer = BagWriter(path, compressed=True)
         self._names = tuple(topics)
+        self.lost: Counter[str] = Counter()
         self._topics: dict[str, Connection] = {}
 
     def __enter__(self) -> ResultBag:
@@ -83,17 +88,22 @@ class ResultBag:
             data = self._store.serialize_cdr(message, connection.msgtype)
             yield frame.time, connection, bytes(data)
 
-    def copies(self, source: rosbag2.Reader) -> Iterator[Timed]:
-        """All messages of `source`, as they are, but those on the topics of results."""
+    def copies(self, source: Recording) -> Iterator[Timed]:
+        """All messages of `source`, as they are, but those on the topics of results.
+
+        What is damaged is left out; `lost` counts it.
+        """
         own = {connection.topic for connection in self._topics.values()}
         here = {
-            connection.id: self._like(connection)
+            (connection.topic, connection.msgtype): self._like(connection)
             for connection in source.connections
             if connection.topic not in own
         }
-        chosen = [connection for connection in source.connections if connection.id in here]
-        for connection, time, data in source.messages(chosen):
-            yield time, here[connection.id], bytes(data)
+        for record in source.records({topic for topic, _ in here}):
+            if isinstance(record, Lost):
+                self.lost[f'{record.topic}: {record.reason}'] += record.messages
+            elif (record.topic, record.type) in here:
+                yield record.time, here[record.topic, record.type], record.data
 
     def write(self, *streams: Iterable[Timed]) -> None:
         """Write messages of several sources, each ordered by time, in the order of all times."""
@@ -124,15 +134,15 @@ class ResultBag:
         )
 
 
-def open_source(path: Path) -> rosbag2.Reader:
+def open_source(path: Path) -> Recording:
     """Open a recording to copy from; BagError unless it is a whole rosbag2."""
     try:
-        reader = rosbag2.Reader(path)
-        reader.open()
+        if path.suffix == '.bag':
+            raise BagError('ROS 1')
+        return Recording(path)
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:
         raise BagError(f'{path}: not a whole rosbag2 to copy from: {error}') from None
-    return reader
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,9 @@ ARROW_LENGTH = 0.2
 @options.raw
 @options.params
 @options.exact
+@click.pass_context
 def command(
+    ctx: click.Context,
     bag: Path,
     output: Path,
     depth_topic: str | None,
@@ -47,24 +50,32 @@ def command(
     """Segment a recording and log what is found, to look at in 3D.
 
     Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image. Needs
-    the extra view (rerun-sdk), whose telemetry is off.
+    the extra view (rerun-sdk), whose telemetry is off. What is damaged is left out, and the exit
+    code is then 1.
     """
     config = options.read_parameters(params_file, exact)
     rerun = _rerun()
-    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as partial:
+    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as file:
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)
-        log.save(partial)
+        log.save(file)
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)
-        frames = options.progress(source, len(source), 'frame')
         count = 0
-        for frame, image, result in segmented(frames, SequenceSegmenter(config)):
-            log.set_time('frame', sequence=count)
+        show = partial(options.progress, unit='frame')
+        for index, frame, image, result in segmented(
+            source, SequenceSegmenter(config), progress=show
+        ):
+            log.set_time('frame', sequence=index)
             log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
             _log_frame(rerun, log, image, result)
             count += 1
         log.flush()
         log.disconnect()
+        problems = list(filter(None, (source.damage, source.loss())))
     click.echo(f'{output}: {count} frames')
+    for problem in problems:
+        click.echo(f'rangeseg: {problem}', err=True)
+    if problems:
+        ctx.exit(1)
 
 
 def _rerun() -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -11,13 +12,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags import rosbag2
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.io.bag_writer import BagWriter
+from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.recordings import (
     RecordingError,
@@ -60,12 +62,16 @@ class DepthBag:
     ----------
     depth_topic, camera_topic : str
         The topics in use.
+    lost : Counter of str
+        Why frames were left out while iterating -> how many.
+    damage : str
+        For those who iterate to note what ended it.
 
     Raises
     ------
     BagError
         Not a recording, or one without depth images or camera_info: the message lists its
-        topics. Also an image of unknown encoding, and intrinsics that do not fit it.
+        topics. Also one without any image of a known encoding that its camera_info fits.
     DamagedBagError
         While iterating, after the last frame before the damage.
     """
@@ -79,6 +85,8 @@ class DepthBag:
     ) -> None:
         self.path = path
         self._raw = raw
+        self.lost: Counter[str] = Counter()
+        self.damage = ''
         try:
             self._recording = open_recording(path)
         except OSError as error:
@@ -90,10 +98,8 @@ class DepthBag:
             self._require(self.depth_topic, 'depth image', (IMAGE, COMPRESSED_IMAGE))
             self.camera_topic = camera_topic or self._find_camera_topic()
             self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
-            self._first_camera = self._read_camera(self._first_message(self.camera_topic))
-            self._check(
-                DepthFrame(self._first_message(self.depth_topic), self._first_camera, time=0)
-            )
+            self._first_camera = self._find_camera()
+            self._find_frame()
         except BaseException:
             self.close()
             raise
@@ -113,17 +119,26 @@ class DepthBag:
         return self._recording.counts[self.depth_topic]
 
     def __iter__(self) -> Iterator[DepthFrame]:
-        camera = self._first_camera
+        self.lost.clear()
+        camera: Camera | None = self._first_camera
         count = 0
+        reason = ''
         try:
             topics = (self.depth_topic, self.camera_topic)
             for topic, time, message in self._recording.messages(topics):
                 if topic == self.camera_topic:
-                    camera = self._read_camera(message)
+                    if isinstance(message, Lost):
+                        continue  # the last one may still be right
+                    try:
+                        camera = self._camera(message)
+                    except CameraError as error:
+                        camera, reason = None, f'{self.camera_topic}: {error}'
+                elif isinstance(message, Lost):
+                    self.lose(message.reason, message.messages)
+                elif camera is None:
+                    self.lose(reason)
                 else:
-                    frame = DepthFrame(message, camera, time)
-                    self._check(frame)
-                    yield frame
+                    yield DepthFrame(message, camera, time)
                     count += 1
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
@@ -132,34 +147,61 @@ class DepthBag:
                 f'{self.path}: damaged after {count} frames: {reason}'
             ) from error
 
-    def _read_camera(self, message: Any) -> Camera:
-        raw = True if self._raw else raw_by_name(self.depth_topic)
-        try:
-            return camera_from_message(message, raw)
-        except CameraError as error:
-            raise BagError(f'{self.path}: {self.camera_topic}: {error}') from None
+    def lose(self, reason: str, count: int = 1) -> None:
+        """Count frames that cannot be read, or not be segmented."""
+        self.lost[reason] += count
 
-    def _check(self, frame: DepthFrame) -> None:
-        where, message, camera = f'{self.path}: {self.depth_topic}', frame.message, frame.camera
-        size = getattr(message, 'height', None), getattr(message, 'width', None)
-        if camera and size[0] is not None and size != camera.shape:
-            raise BagError(
-                f'{where} is {size[1]}x{size[0]}, but {self.camera_topic} '
-                f'{camera.width}x{camera.height}'
-            )
+    def loss(self) -> str:
+        """What was lost while iterating, in words; empty when nothing was."""
+        if not self.lost:
+            return ''
+        total, kinds = self.lost.total(), len(self.lost)
+        more = f', and {kinds - 1} other reasons' if kinds > 1 else ''
+        reason = self.lost.most_common(1)[0][0]
+        return f'{self.path}: {total} of {len(self)} frames left out: {reason}{more}'
+
+    def _camera(self, message: Any) -> Camera:
+        return camera_from_message(message, True if self._raw else raw_by_name(self.depth_topic))
+
+    def _find_camera(self) -> Camera:
+        """The first camera that can be used."""
+        reason = f'no message on {self.camera_topic}'
         try:
-            frame.range_image()
-        except ValueError as error:
-            raise BagError(f'{where}: {error}') from None
+            for _, _, message in self._recording.messages((self.camera_topic,)):
+                if isinstance(message, Lost):
+                    reason = f'no readable message on {self.camera_topic}: {message.reason}'
+                    continue
+                try:
+                    return self._camera(message)
+                except CameraError as error:
+                    reason = f'{self.camera_topic}: {error}'
+        except Exception as error:
+            reason = f'no readable message on {self.camera_topic}: {error}'
+        raise BagError(f'{self.path}: {reason}')
+
+    def _find_frame(self) -> None:
+        """Make sure that there is a frame that can be read."""
+        reason = f'no message on {self.depth_topic}'
+        try:
+            for frame in self:
+                try:
+                    frame.range_image()
+                    return
+                except ValueError as error:
+                    reason = f'{self.depth_topic}: {error}'
+        except DamagedBagError as error:
+            reason = f'no readable message on {self.depth_topic}: {error}'
+        if self.lost:
+            reason = f'no readable message on {self.depth_topic}: {next(iter(self.lost))}'
+        raise BagError(f'{self.path}: {reason}')
 
     def _first_message(self, topic: str) -> Any:
+        """The first message that can be read; None when there is none."""
         try:
-            for _, _, message in self._recording.messages((topic,)):
-                return message
-            reason = 'no message'
-        except Exception as error:
-            reason = f'no readable message: {error}'
-        raise BagError(f'{self.path}: {reason} on {topic}')
+            messages = self._recording.messages((topic,))
+            return next((m for _, _, m in messages if not isinstance(m, Lost)), None)
+        except Exception:
+            return None
 
     def _find_depth_topic(self) -> str:
         types = self._recording.types
@@ -182,6 +224,8 @@ class DepthBag:
         if self._recording.counts[topic] == 0:
             return False
         message = self._first_message(topic)
+        if message is None:
+            return 'depth' in topic.lower()
         if hasattr(message, 'format'):
             return 'compressedDepth' in message.format
         return message.encoding in PIXEL_TYPES
@@ -257,9 +301,7 @@ class DepthBagWriter:
             raise BagError(f'{self.path}: exists already, not overwritten')
         with ExitStack() as stack:
             partial = stack.enter_context(replacing(self.path))
-            self._writer = stack.enter_context(
-                rosbag2.Writer(partial, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
-            )
+            self._writer = stack.enter_context(BagWriter(partial))
             self._files = stack.pop_all()
         self._image = self._writer.add_connection(self.depth_topic, IMAGE, typestore=self._store)
         self._info = self._writer.add_connection(

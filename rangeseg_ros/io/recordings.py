@@ -1,30 +1,40 @@
 """Messages of recordings, whole or damaged: rosbag2 (mcap, sqlite3) and ROS 1 bags.
 
-`rosbags` reads whole recordings. It needs the index at the end of the file, which is missing
-after a crash of the recorder, on a full disk or after a broken download; of such a file the
-records are read one after the other up to the damage.
+`rosbags` reads the indices of whole recordings, and what is not in chunks. The index at the end of
+a file is missing after a crash of the recorder, on a full disk or after a broken download; of such
+a file the records are read one after the other up to the damage.
 """
 
 from __future__ import annotations
 
-import bz2
-import io
 import sqlite3
 import struct
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
-import lz4.frame
-from mcap.exceptions import EndOfFile
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+import zstandard
 from rosbags import rosbag1, rosbag2
+from rosbags.rosbag2.reader import DirectoryReader
+from rosbags.rosbag2.storage_mcap import McapReader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from rangeseg_ros.io.chunks import (
+    Chunk,
+    Connections,
+    Lost,
+    McapChannels,
+    Record,
+    mcap_chunk,
+    merged,
+    rosbag1_chunk,
+    rosbag1_fields,
+    rosbag1_message,
+)
 from rangeseg_ros.io.files import natural_order
 
 
@@ -41,6 +51,8 @@ class Recording:
         Message type of each topic, in the ROS 2 form.
     counts : dict of int
         Messages of each topic.
+    connections : list of rosbags.interfaces.Connection
+        The topics with all that is recorded of them.
     damage : str
         Empty.
     """
@@ -48,22 +60,35 @@ class Recording:
     def __init__(self, path: Path) -> None:
         self.path = path
         kind = rosbag1.Reader if path.suffix == '.bag' else rosbag2.Reader
-        self._reader: rosbag1.Reader | rosbag2.Reader = kind(path)
+        self._reader: Any = kind(path)
         self._reader.open()
         self.types: dict[str, str] = {}
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
         self.damage = ''
-        for connection in self._reader.connections:
-            name = connection.topic
-            self.types[name] = connection.msgtype
-            self.counts[name] = self.counts.get(name, 0) + connection.msgcount
+        self.connections = list(self._reader.connections)
+        for connection in self.connections:
+            self.types[connection.topic] = connection.msgtype
+            self.counts[connection.topic] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time and content of the messages on `topics`, in the order of their times."""
-        wanted = [c for c in self._reader.connections if c.topic in topics]
-        deserialize = _deserializer(self.path)
-        for connection, time, data in self._reader.messages(wanted):
-            yield connection.topic, time, deserialize(data, connection.msgtype)
+        """Topic, time and content of the messages on `topics`, in the order of their times.
+
+        `Lost` is the content of what cannot be read.
+        """
+        return _deserialized(self.path, self.records(topics), topics)
+
+    def records(self, topics: Collection[str]) -> Iterator[Record | Lost]:
+        """Messages on `topics` as they are stored, in the order of their times."""
+        if self.path.suffix == '.bag':
+            yield from merged(list(_rosbag1_chunks(self._reader, topics)))
+            return
+        storage = self._reader.storage
+        packed = False
+        if isinstance(storage, DirectoryReader):
+            packed = storage.metadata.compression_mode == 'message'
+        for part in storage.storages if isinstance(storage, DirectoryReader) else [storage]:
+            records = _storage_records(part, topics)
+            yield from map(_unpacked, records) if packed else records
 
     def close(self) -> None:
         """Close the files."""
@@ -84,22 +109,19 @@ class DamagedRecording:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.types: dict[str, str] = {}
-        self.counts: dict[str, int] = {}
+        self.counts: Counter[str] = Counter()
         self.damage = ''
         try:
-            for record in _records(path):
+            for record in _scanned(path):
                 self.types[record.topic] = record.type
-                self.counts[record.topic] = self.counts.get(record.topic, 0) + 1
+                self.counts[record.topic] += 1
         # Whatever is raised is the damage looked for.
         except Exception as error:
             self.damage = str(error) or type(error).__name__
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time and content of the messages on `topics`; raises where the damage is."""
-        deserialize = _deserializer(self.path)
-        for record in _records(self.path):
-            if record.topic in topics:
-                yield record.topic, record.time, deserialize(record.data, record.type)
+        return _deserialized(self.path, _scanned(self.path), topics)
 
     def close(self) -> None:
         """Do nothing; no file stays open."""
@@ -124,18 +146,9 @@ def open_recording(path: Path) -> Recording | DamagedRecording:
     except Exception as error:
         damaged = DamagedRecording(path)
         if not damaged.types:
-            raise RecordingError(f'not a readable bag: {error}') from None
+            reason = damaged.damage or str(error)
+            raise RecordingError(f'not a readable bag: {reason}') from None
         return damaged
-
-
-def _deserializer(path: Path) -> Callable[[bytes, str], Any]:
-    """Decoder of messages of the standard packages.
-
-    A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
-    """
-    if path.suffix == '.bag':
-        return message_types(Stores.ROS1_NOETIC).deserialize_ros1
-    return message_types(Stores.ROS2_JAZZY).deserialize_cdr
 
 
 @cache
@@ -149,47 +162,136 @@ def make_rosbags(kind: str, **fields: Any) -> Any:
     return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
 
 
-class _Record(NamedTuple):
-    topic: str
-    type: str
-    time: int
-    data: bytes
+def _deserialized(
+    path: Path, records: Iterator[Record | Lost], topics: Collection[str]
+) -> Iterator[tuple[str, int, Any]]:
+    """Messages on `topics`.
+
+    A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
+    """
+    deserialize: Callable[[bytes, str], Any] = message_types(Stores.ROS2_JAZZY).deserialize_cdr
+    if path.suffix == '.bag':
+        deserialize = message_types(Stores.ROS1_NOETIC).deserialize_ros1
+    for record in records:
+        if record.topic not in topics:
+            continue
+        message: Any = record
+        if isinstance(record, Record):
+            try:
+                message = deserialize(record.data, record.type)
+            except Exception as error:
+                message = Lost(record.topic, record.time, 1, f'damaged message: {error!r}')
+        yield record.topic, record.time, message
 
 
-def _records(path: Path) -> Iterator[_Record]:
+def _unpacked(record: Record | Lost) -> Record | Lost:
+    """Record of a bag whose messages are compressed one by one."""
+    if isinstance(record, Lost):
+        return record
+    try:
+        data = zstandard.ZstdDecompressor().decompress(record.data)
+    except zstandard.ZstdError as error:
+        return Lost(record.topic, record.time, 1, f'damaged message: {error}')
+    return record._replace(data=data)
+
+
+def _storage_records(storage: Any, topics: Collection[str]) -> Iterator[Record | Lost]:
+    """Records of one file of a whole rosbag2."""
+    if isinstance(storage, McapReader) and storage.chunks:
+        yield from merged(list(_mcap_chunks(storage, topics)))
+        return
+    wanted = [connection for connection in storage.connections if connection.topic in topics]
+    for connection, time, data in storage.messages(wanted) if wanted else ():
+        yield Record(connection.topic, connection.msgtype, time, data)
+
+
+def _mcap_chunks(storage: McapReader, topics: Collection[str]) -> Iterator[Chunk]:
+    """Chunks of a whole file that hold any of the topics."""
+    channels = McapChannels()
+    channels.channels = {key: (c.topic, c.schema) for key, c in storage.channels.items()}
+
+    def read(offset: int, length: int) -> list[Record]:
+        with storage.path.open('rb') as file:
+            file.seek(offset + 9)
+            records = mcap_chunk(file.read(length - 9), channels)
+            return [record for record in records if record.topic in topics]
+
+    for info in storage.chunks:
+        counts: Counter[str] = Counter()
+        for key, count in info.channel_count.items():
+            if key in storage.channels and storage.channels[key].topic in topics:
+                counts[storage.channels[key].topic] += count
+        if counts:
+            start, size = info.chunk_start_offset, info.chunk_length
+            yield Chunk(info.message_start_time, counts, partial(read, start, size))
+
+
+def _rosbag1_chunks(reader: rosbag1.Reader, topics: Collection[str]) -> Iterator[Chunk]:
+    """Chunks of a whole ROS 1 bag that hold any of the topics."""
+    names = {connection.id: connection.topic for connection in reader.connections}
+    connections = {struct.pack('<I', c.id): (c.topic, c.msgtype) for c in reader.connections}
+
+    def read(position: int) -> list[Record]:
+        with reader.path.open('rb') as file:
+            file.seek(position)
+            header, data = _sized(file), _sized(file)
+            records = rosbag1_chunk(rosbag1_fields(header), data, connections)
+            return [record for record in records if record.topic in topics]
+
+    for info in reader.chunk_infos:
+        counts: Counter[str] = Counter()
+        for key, count in info.connection_counts.items():
+            if names.get(key) in topics:
+                counts[names[key]] += count
+        if counts:
+            yield Chunk(info.start_time, counts, partial(read, info.pos))
+
+
+def _scanned(path: Path) -> Iterator[Record]:
+    """Records of a damaged recording from its front; raises where the damage is."""
     if path.is_dir():
         for part in sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=natural_order):
-            yield from _records(part)
+            yield from _scanned(part)
     elif path.suffix == '.mcap':
-        yield from _mcap_records(path)
+        yield from _scanned_mcap(path)
     elif path.suffix == '.db3':
-        yield from _sqlite_records(path)
+        yield from _scanned_sqlite(path)
     elif path.suffix == '.bag':
-        with path.open('rb') as file:
-            file.readline()  # '#ROSBAG V2.0'
-            yield from _rosbag1_records(file, {})
-        raise EOFError('file ends without an index')
+        yield from _scanned_rosbag1(path)
 
 
-def _mcap_records(path: Path) -> Iterator[_Record]:
-    schemas: dict[int, str] = {}
-    channels: dict[int, Channel] = {}
+def _scanned_mcap(path: Path) -> Iterator[Record]:
+    channels = McapChannels()
+    damage = ''
     with path.open('rb') as file:
-        try:
-            for record in StreamReader(file, record_size_limit=path.stat().st_size).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record.name
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels[record.channel_id]
-                    kind = schemas[channel.schema_id]
-                    yield _Record(channel.topic, kind, record.log_time, record.data)
-        except EndOfFile:
-            raise EOFError('file ends within a record') from None
+        if file.read(8) != b'\x89MCAP0\r\n':
+            raise RecordingError('not an mcap file')
+        while head := file.read(9):
+            opcode, size = struct.unpack('<BQ', _whole(head, 9))
+            if opcode in (2, 15):  # the messages end before
+                break
+            body = file.read(min(size, path.stat().st_size))
+            cut = len(body) < size
+            if opcode == 6:
+                # A bad chunk costs itself, one that is cut through its end.
+                records = mcap_chunk(body, channels)
+                try:
+                    yield from records if cut else list(records)
+                except Exception as error:
+                    damage = damage or f'damaged chunk: {error}'
+            elif opcode == 5 and not cut:
+                yield channels.message(body)
+            elif not cut:
+                channels.define(opcode, body)
+            if cut:
+                raise EOFError('file ends within a record')
+        else:
+            raise EOFError(damage or 'file ends without an index')
+    if damage:
+        raise RecordingError(damage)
 
 
-def _sqlite_records(path: Path) -> Iterator[_Record]:
+def _scanned_sqlite(path: Path) -> Iterator[Record]:
     uri = f'{path.absolute().as_uri()}?immutable=1'
     with closing(sqlite3.connect(uri, uri=True)) as database:
         # Without this, sqlite refuses any file shorter than its header says.
@@ -199,41 +301,39 @@ def _sqlite_records(path: Path) -> Iterator[_Record]:
         rows = database.execute('SELECT topic_id, timestamp, data FROM messages ORDER BY id')
         for topic, time, data in rows:
             name, kind = topics[topic]
-            yield _Record(name, kind, time, data)
+            yield Record(name, kind, time, data)
 
 
-def _rosbag1_records(
-    file: BinaryIO, connections: dict[bytes, tuple[str, str]]
-) -> Iterator[_Record]:
-    """Records of the ROS 1 bag format 2.0 (wiki.ros.org/Bags/Format/2.0) or of one chunk of it."""
-    while size := file.read(4):
-        fields = dict(_rosbag1_fields(_exactly(file, struct.unpack('<I', size)[0])))
-        data = _exactly(file, struct.unpack('<I', _exactly(file, 4))[0])
-        match fields[b'op']:
-            case b'\x05':
-                unpack = {b'none': bytes, b'bz2': bz2.decompress, b'lz4': lz4.frame.decompress}
-                chunk = unpack[fields[b'compression']](data)
-                yield from _rosbag1_records(io.BytesIO(chunk), connections)
-            case b'\x07':
-                package, _, name = dict(_rosbag1_fields(data))[b'type'].decode().partition('/')
-                connections[fields[b'conn']] = (fields[b'topic'].decode(), f'{package}/msg/{name}')
-            case b'\x02':
-                seconds, nanoseconds = struct.unpack('<II', fields[b'time'])
-                time = seconds * 10**9 + nanoseconds
-                yield _Record(*connections[fields[b'conn']], time, data)
+def _scanned_rosbag1(path: Path) -> Iterator[Record]:
+    connections: Connections = {}
+    damage = ''
+    with path.open('rb') as file:
+        file.readline()  # '#ROSBAG V2.0'
+        while head := file.read(4):
+            fields = rosbag1_fields(_whole(file.read(size := _size(head)), size))
+            data = file.read(size := _size(file.read(4)))
+            if fields[b'op'] == b'\x05':
+                records = rosbag1_chunk(fields, data, connections)
+                try:
+                    yield from records if len(data) < size else list(records)
+                except Exception as error:
+                    damage = damage or f'damaged chunk: {error}'
+            else:
+                yield from rosbag1_message(fields, _whole(data, size), connections)
+            _whole(data, size)
+    raise EOFError(damage or 'file ends without an index')
 
 
-def _rosbag1_fields(header: bytes) -> Iterator[tuple[bytes, bytes]]:
-    position = 0
-    while position < len(header):
-        (size,) = struct.unpack_from('<I', header, position)
-        name, _, value = header[position + 4 : position + 4 + size].partition(b'=')
-        yield name, value
-        position += 4 + size
+def _sized(file: BinaryIO) -> bytes:
+    size = _size(file.read(4))
+    return _whole(file.read(size), size)
 
 
-def _exactly(file: BinaryIO, size: int) -> bytes:
-    data = file.read(size)
+def _size(data: bytes) -> int:
+    return int(struct.unpack('<I', _whole(data, 4))[0])
+
+
+def _whole(data: bytes, size: int) -> bytes:
     if len(data) < size:
         raise EOFError('file ends within a record')
     return data

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
+from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.recordings import open_recording
 from rangeseg_ros.messages.transforms import insert_transforms
 
@@ -68,5 +69,7 @@ class RecordedTransforms:
             return
 
     def _messages_on(self, topic: str) -> Iterator[tuple[str, int, Any]]:
-        there = self._recording.types.get(topic) in TYPES
-        return self._recording.messages([topic]) if there else iter(())
+        if self._recording.types.get(topic) in TYPES:
+            for name, time, message in self._recording.messages([topic]):
+                if not isinstance(message, Lost):
+                    yield name, time, message
