@@ -32,9 +32,23 @@ def run(body):
 
 
 @pytest.mark.parametrize('body', [LOST, WRAPPED], ids=['lost', 'wrapped'])
-def test_an_interrupt_ends_the_command(body):
-    done = run(body)
-    assert (done.returncode, done.stdout, done.stderr.strip()) == (130, '0\n', '')
+@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143), ('SIGHUP', 129)])
+def test_a_signal_ends_the_command(body, name, code):
+    done = run(body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException'))
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
+
+
+def test_who_ignores_interrupts_still_does():
+    body = 'os.kill(os.getpid(), signal.SIGINT)'
+    script = dedent(PRELUDE.replace('BODY', body)).strip()
+    done = subprocess.run(
+        ['sh', '-c', 'trap "" INT; exec "$0" -c "$1"', sys.executable, script],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (0, '0\n1\n2\n')
 
 
 def test_other_system_errors_are_shown():

@@ -226,3 +226,16 @@ def test_processes_give_the_same_results(tmp_path, monkeypatch):
         main()
     assert not end.value.code
     assert results(tmp_path / 'out') == results(tmp_path / 'local')
+
+
+def test_a_recording_that_fails_costs_no_other(tmp_path, monkeypatch, run):
+    monkeypatch.chdir(tmp_path)
+    for name in 'abc':
+        record_walls(tmp_path / name, 2)
+    (tmp_path / 'out').mkdir()
+    (tmp_path / 'out/b').touch()
+    code, output, error = run('replay', *'abc', '--output', 'out', '--jobs', 1)
+    assert code == 2 and error.startswith('rangeseg: b: ') and error.count('\n') == 1
+    assert 'out/a: 2 frames' in output and 'out/c: 2 frames' in output
+    page = (tmp_path / 'out/index.html').read_text()
+    assert 'a/report.html' in page and 'b/report.html' not in page and 'c/report.html' in page

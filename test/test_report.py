@@ -133,7 +133,7 @@ def test_replay_of_a_damaged_recording_says_so(tmp_path):
     outcome = replay(tmp_path / 'bag', tmp_path / 'out')
     page = Page(tmp_path / 'out/report.html')
     assert outcome.damage
-    assert f'Not read to its end: {outcome.damage}' in page.text
+    assert f'Damage: {outcome.damage}' in page.text
     assert f'{outcome.frames} frames in' in page.text
 
 

@@ -203,7 +203,6 @@ class Replay:
 
 
 def segmented(
-def segmented(
     source: DepthBag,
     sequence: SequenceSegmenter,
     pose: Callable[[DepthFrame], Transform | None] = lambda frame: None,

@@ -1,31 +1,38 @@
-"""Ctrl-C that gets through: compiled code may lose the exception that it raises, or wrap it."""
+"""Ctrl-C and other ends that get through: compiled code may lose the exception, or wrap it."""
 
 from __future__ import annotations
 
 import signal
 from types import FrameType
 
-_received = False
+_received = 0
 
 
 def watch() -> None:
-    """Remember interrupts; they raise KeyboardInterrupt as ever. Who ignores them still does."""
-    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
-        signal.signal(signal.SIGINT, _on_interrupt)
+    """Remember interrupts, which raise KeyboardInterrupt as ever, and SIGTERM and SIGHUP.
+
+    These end the command as errors do: what was begun is put away. Who ignores any of them still
+    does.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _on_signal)
 
 
-def received() -> bool:
-    """Whether there was an interrupt."""
-    return _received
+def exit_code() -> int:
+    """Of the signal that there was; 0 when there was none."""
+    return 128 + _received if _received else 0
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt after an interrupt whose exception was lost."""
-    if _received:
+    """Raise again what was raised for a signal and was lost."""
+    if _received == signal.SIGINT:
         raise KeyboardInterrupt
+    if _received:
+        raise SystemExit(exit_code())
 
 
-def _on_interrupt(number: int, stack: FrameType | None) -> None:
+def _on_signal(number: int, stack: FrameType | None) -> None:
     global _received
-    _received = True
-    raise KeyboardInterrupt
+    _received = number
+    check()

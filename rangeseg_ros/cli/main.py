@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from rangeseg_ros.cli import interrupts
+from rangeseg_ros.cli.errors import in_words
 
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
@@ -50,7 +51,8 @@ def rangeseg() -> None:
 
 
 def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
-    print(f'rangeseg: warning: {message}', file=sys.stderr)
+    text = in_words(message) if isinstance(message, Warning) else message
+    print(f'rangeseg: warning: {text}', file=sys.stderr)
 
 
 def main() -> None:
@@ -63,10 +65,10 @@ def main() -> None:
     except click.ClickException as error:
         print(f'rangeseg: {error.format_message()}', file=sys.stderr)
         sys.exit(2)
-    except (ValueError, OSError) as error:
-        print(f'rangeseg: {error}', file=sys.stderr)
+    except (ValueError, OSError, MemoryError, RecursionError) as error:
+        print(f'rangeseg: {in_words(error)}', file=sys.stderr)
         sys.exit(2)
     except (KeyboardInterrupt, SystemError, click.Abort) as error:
-        if isinstance(error, SystemError) and not interrupts.received():
+        if isinstance(error, SystemError) and not interrupts.exit_code():
             raise
-        sys.exit(130)
+        sys.exit(interrupts.exit_code() or 130)

@@ -14,9 +14,10 @@ import click
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli import tolerances as measures
+from rangeseg_ros.cli.errors import in_words
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.replay import write_overview
-from rangeseg_ros.tasks import run_all, run_on_cluster
+from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
 
 
 @click.command()
@@ -83,14 +84,18 @@ def command(
       report.html                   pictures, planes over time, times
 
     Several recordings have index.html beside their folders, which leads to their reports.
-    A recording that is done is not done again, one that was interrupted starts anew. A damaged
-    one is read up to the damage, and the exit code is 1.
+    A recording that is done is not done again, one that was interrupted starts anew. What of a
+    recording is damaged is left out, and the exit code is 1; a recording that fails costs no
+    other, and the exit code is 2.
     """
     config = options.read_parameters(params_file, exact)
     if fixed_frame is not None:
         config = replace(config, fixed_frame=fixed_frame)
     folders = _folders(bags, output)
     if scheduler:
+        check_scheduler(scheduler)
+        if find_spec('distributed') is None:
+            raise click.ClickException('--scheduler needs distributed: install the extra dask')
         # The workers have working directories of their own.
         bags = tuple(bag.absolute() for bag in bags)
         folders = [folder.absolute() for folder in folders]
@@ -101,15 +106,15 @@ def command(
     ]
     # All are opened, and so checked, before anything is written.
     found = [task.check() for task in tasks]
-    outcomes = []
+    rows, codes = [], []
     for task, read, outcome in zip(tasks, found, _outcomes(tasks, jobs, scheduler), strict=True):
         click.echo(f'{task.recording}: {read}')
-        _report(task, outcome)
-        outcomes.append(outcome)
+        codes.append(_report(task, outcome))
+        rows.append(_row(task, outcome))
     if len(tasks) > 1:
-        write_overview(output / 'index.html', output.name, list(map(_row, tasks, outcomes)))
-    if any(outcome.damage for outcome in outcomes):
-        ctx.exit(1)
+        write_overview(output / 'index.html', output.name, rows)
+    if any(codes):
+        ctx.exit(max(codes))
 
 
 def _folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
@@ -123,23 +128,32 @@ def _folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
     return [output / name for name in names]
 
 
-def _outcomes(tasks: list[Replay], jobs: int | None, scheduler: str | None) -> Iterable[Outcome]:
+def _outcomes(
+    tasks: list[Replay], jobs: int | None, scheduler: str | None
+) -> Iterable[Outcome | Failure]:
     if scheduler:
-        if find_spec('distributed') is None:
-            raise click.ClickException('--scheduler needs distributed: install the extra dask')
-        return options.progress(run_on_cluster(tasks, scheduler), len(tasks), 'bag')
+        return options.progress(attempt_on_cluster(tasks, scheduler), len(tasks), 'bag')
     if len(tasks) == 1:
         return [tasks[0].run(lambda frames, total: options.progress(frames, total, 'frame'))]
-    return options.progress(run_all(tasks, jobs), len(tasks), 'bag')
+    return options.progress(attempt_all(tasks, jobs), len(tasks), 'bag')
 
 
-def _row(task: Replay, outcome: Outcome) -> dict[str, Any]:
+def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
     """What the overview tells of a recording."""
+    name = task.folder.name
+    if isinstance(outcome, Failure):
+        nothing = dict.fromkeys(('frames', 'empty', 'duration', 'planes_per_frame', 'ids'), 0)
+        return {'name': name, 'failed': True, 'damage': in_words(outcome.error), **nothing}
     empty = sum(outcome.reasons.values())
-    return {'name': task.folder.name, 'empty': empty, **asdict(outcome), **outcome.figures}
+    row = {'name': name, 'failed': False, 'empty': empty}
+    return {**row, **asdict(outcome), **outcome.figures}
 
 
-def _report(task: Replay, outcome: Outcome) -> None:
+def _report(task: Replay, outcome: Outcome | Failure) -> int:
+    """Say what became of a recording; the exit code."""
+    if isinstance(outcome, Failure):
+        click.echo(f'rangeseg: {task.recording}: {in_words(outcome.error)}', err=True)
+        return 2
     for reason, count in outcome.reasons.items():
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():
@@ -149,3 +163,4 @@ def _report(task: Replay, outcome: Outcome) -> None:
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')
     if outcome.damage:
         click.echo(f'rangeseg: {outcome.damage}', err=True)
+    return 1 if outcome.damage else 0

@@ -37,6 +37,9 @@ from rangeseg_ros.io.chunks import (
 )
 from rangeseg_ros.io.files import natural_order
 
+# At both ends of mcap files.
+_MCAP = b'\x89MCAP0\r\n'
+
 
 class RecordingError(ValueError):
     """A file that is no recording, or of which nothing can be read."""
@@ -250,8 +253,14 @@ def _rosbag1_chunks(reader: rosbag1.Reader, topics: Collection[str]) -> Iterator
 def _scanned(path: Path) -> Iterator[Record]:
     """Records of a damaged recording from its front; raises where the damage is."""
     if path.is_dir():
+        damage: Exception | None = None
         for part in sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=natural_order):
-            yield from _scanned(part)
+            try:
+                yield from _scanned(part)
+            except Exception as error:
+                damage = damage or error
+        if damage:
+            raise damage
     elif path.suffix == '.mcap':
         yield from _scanned_mcap(path)
     elif path.suffix == '.db3':
@@ -264,11 +273,14 @@ def _scanned_mcap(path: Path) -> Iterator[Record]:
     channels = McapChannels()
     damage = ''
     with path.open('rb') as file:
-        if file.read(8) != b'\x89MCAP0\r\n':
+        if file.read(8) != _MCAP:
             raise RecordingError('not an mcap file')
         while head := file.read(9):
             opcode, size = struct.unpack('<BQ', _whole(head, 9))
             if opcode in (2, 15):  # the messages end before
+                file.seek(-8, 2)
+                if file.read() != _MCAP:
+                    damage = damage or 'file ends within its index'
                 break
             body = file.read(min(size, path.stat().st_size))
             cut = len(body) < size

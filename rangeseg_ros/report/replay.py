@@ -77,7 +77,7 @@ class ReplayReport:
         }
 
     def write(self, path: Path, damage: str = '') -> None:
-        """Write the page; `damage` says why the recording was not read to its end."""
+        """Write the page; `damage` says what of the recording could not be read."""
         sightings = np.concatenate(self._sightings)
         times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
         frames = np.arange(self.frames, dtype=float)
@@ -105,6 +105,6 @@ def write_overview(path: Path, name: str, recordings: Sequence[Mapping[str, Any]
     """Write the page that leads to the reports of several recordings, in folders beside it.
 
     Each has the `name` of its folder, the number of its `frames` and of those that are `empty`,
-    its `damage`, and what `ReplayReport.figures` returns.
+    its `damage`, whether it `failed`, and what `ReplayReport.figures` returns.
     """
     write_page(path, 'overview.html', name=name, recordings=recordings)

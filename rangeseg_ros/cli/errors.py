@@ -1,0 +1,16 @@
+"""Errors in one line."""
+
+from __future__ import annotations
+
+
+def in_words(error: BaseException) -> str:
+    """What an error says, in one line of printable characters."""
+    text = str(error)
+    if isinstance(error, MemoryError):
+        text = f'not enough memory{": " if text else ""}{text}'
+    elif isinstance(error, RecursionError):
+        text = 'nested too deeply'
+    elif isinstance(error, OSError) and error.filename is not None and error.strerror:
+        text = f'{error.filename}: {error.strerror}'
+    # Names of files and topics may hold anything.
+    return ''.join(c if c.isprintable() else repr(c)[1:-1] for c in text)

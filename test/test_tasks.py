@@ -1,0 +1,136 @@
+"""Tasks in many processes: results, failures, workers and parents that die."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
+
+
+@dataclass(frozen=True)
+class Square:
+    number: int
+    folder: Path | None = None
+
+    def run(self):
+        if self.folder:
+            # Its worker dies the first time.
+            mark = self.folder / f'{self.number}'
+            if not mark.exists():
+                mark.touch()
+                os.kill(os.getpid(), signal.SIGKILL)
+        return self.number**2
+
+
+@dataclass(frozen=True)
+class Raises:
+    error: Exception
+
+    def run(self):
+        raise self.error
+
+
+class Deadly:
+    def run(self):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Sleeps:
+    def run(self):
+        time.sleep(600)
+
+
+def test_results_come_in_order_whatever_workers_die(tmp_path):
+    tasks = [Square(number, tmp_path if number in (1, 4) else None) for number in range(6)]
+    assert list(run_all(tasks, 2)) == [0, 1, 4, 9, 16, 25]
+
+
+@pytest.mark.parametrize('jobs', [1, 2])
+def test_a_failure_costs_its_task_and_no_other(jobs):
+    tasks = [Square(2), Raises(ValueError('bad')), Raises(MemoryError()), Square(3)]
+    results = list(attempt_all(tasks, jobs))
+    assert results[0] == 4 and results[3] == 9
+    assert [type(result.error) for result in results[1:3]] == [ValueError, MemoryError]
+    with pytest.raises(ValueError, match='bad'):
+        list(run_all(tasks, jobs))
+
+
+def test_a_task_that_kills_every_worker_is_given_up():
+    results = list(attempt_all([Square(2), Deadly(), Square(3)], 2))
+    assert (results[0], results[2]) == (4, 9)
+    assert isinstance(results[1], Failure) and 'signal 9' in str(results[1].error)
+
+
+def test_faults_of_the_program_are_raised_as_they_are():
+    with pytest.raises(KeyError, match='fault'):
+        list(attempt_all([Raises(KeyError('fault')), Square(1)], 2))
+
+
+PARENT = """
+import sys
+sys.path.insert(0, {folder!r})
+from test_tasks import Sleeps
+from rangeseg_ros.tasks import run_all
+if __name__ == '__main__':
+    list(run_all([Sleeps(), Sleeps()], 2))
+"""
+
+
+@pytest.mark.parametrize('name', ['SIGTERM', 'SIGHUP', 'SIGKILL', 'SIGINT'])
+def test_workers_end_with_their_parent(tmp_path, name):
+    program = tmp_path / 'parent.py'
+    program.write_text(PARENT.format(folder=str(Path(__file__).parent)))
+    parent = subprocess.Popen([sys.executable, program], stderr=subprocess.DEVNULL)
+    try:
+        workers = wait_for(lambda: len(found := descendants(parent.pid)) >= 2 and found)
+        time.sleep(2)
+        parent.send_signal(getattr(signal, name))
+        parent.wait(20)
+        wait_for(lambda: not any(map(alive, workers)))
+    finally:
+        parent.kill()
+
+
+def wait_for(condition):
+    end = time.monotonic() + 60
+    while not (found := condition()):
+        assert time.monotonic() < end
+        time.sleep(0.1)
+    return found
+
+
+def descendants(parent):
+    """Processes whose parent this is."""
+    found = []
+    for stat in Path('/proc').glob('[0-9]*/stat'):
+        try:
+            fields = stat.read_text().rpartition(')')[2].split()
+        except OSError:
+            continue
+        if int(fields[1]) == parent:
+            found.append(int(stat.parent.name))
+    return found
+
+
+def alive(process):
+    try:
+        return Path(f'/proc/{process}/stat').read_text().rpartition(')')[2].split()[0] != 'Z'
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize('address', ['tcp://host:8786', 'host:1', 'tls://[::1]:8786'])
+def test_addresses_of_schedulers(address):
+    check_scheduler(address)
+
+
+@pytest.mark.parametrize('address', ['foo', 'xyz://h:1', 'tcp://h', 'tcp://h:0', 'h:99999', ''])
+def test_what_is_no_address_is_refused(address):
+    with pytest.raises(SchedulerError, match='no address'):
+        check_scheduler(address)
