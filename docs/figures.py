@@ -1,7 +1,8 @@
 """Draw the figures of the documents: python docs/figures.py [FOLDER], docs/ by default.
 
-docs/planes.png, the picture in the README, and docs/figures/*.png, one picture for each stage of
-method `planes`: on the left a Kinect's frame of a room, on the right a stereo camera's.
+docs/terrain.png, the picture in the README: depth, planes, and what they are to a robot.
+docs/figures/*.png, one picture for each stage of method `planes`: of a Kinect's frame of a room
+and, on the right, of a stereo camera's.
 """
 
 import sys
@@ -36,6 +37,7 @@ from rangeseg_ros.io.params import read_config
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.terrain import simulate_terrain, stated, terrain_scene
 
 ROOT = Path(__file__).parents[1]
 WIDTH = 360
@@ -44,15 +46,29 @@ WIDTH = 360
 def main():
     """Draw everything."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
+    robots = [terrain('hole', 2), terrain('stairs up', 2)]
+    write_image(folder / 'terrain.png', np.vstack(robots))
     frames = [(frame('kinect', 8, 1), Config()), (frame('realsense', 3, 1), settings('realsense'))]
-    kinect, config = frames[0]
-    result = Segmenter(config).segment(kinect)
-    planes = overlay(kinect.inverse, result.labels, result.planes)
-    write_image(folder / 'planes.png', np.hstack([in_grey(kinect), planes]))
     both = [stages(*each) for each in frames]
     for name in both[0]:
         pair = [fitted(pictures[name]) for pictures in both]
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
+
+
+def terrain(kind, seed):
+    """A Kinect on a robot: depth, planes, and ground green, obstacles red, drops blue."""
+    scene, sensor = terrain_scene(kind, seed), SENSORS['kinect'](seed)
+    up, height = stated(scene, seed)
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=height)
+    seen = simulate_terrain(scene, sensor, seed=seed)
+    image = RangeImage.from_depth(seen.depth, sensor.camera)
+    result = Segmenter(config).segment(image)
+    colour = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [40, 80, 255]], np.uint8)
+    base = in_grey(image)
+    tinted = cv2.addWeighted(base, 0.45, colour[result.terrain], 0.55, 0)
+    classes = np.where((result.terrain > 0)[..., None], tinted, base)
+    planes = overlay(image.inverse, result.labels, result.planes)
+    return np.hstack([fitted(picture) for picture in (base, planes, classes)])
 
 
 def frame(sensor, scene, seed):

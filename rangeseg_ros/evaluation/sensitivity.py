@@ -79,7 +79,7 @@ def _assigned(tree: ast.Module) -> list[tuple[str, ast.expr]]:
 
 
 def _is_numeric(value: Any) -> bool:
-    if isinstance(value, tuple):
+    if type(value) is tuple:
         return len(value) > 0 and all(_is_numeric(entry) for entry in value)
     return isinstance(value, int | float) and not isinstance(value, bool)
 
