@@ -66,8 +66,8 @@ def flooded(image, config):
 @pytest.mark.parametrize('shadow', [0, 1, 4, 40])
 @pytest.mark.parametrize(
     ('detector', 'steps'),
-    # A step of the inverse range that nothing hides: five times edge_step.
-    [('sobel', (1.0, 0.2, 0.05, 0.03)), ('plane', (1.0, 0.2))],
+    # The smallest ones are 4 and 2 times `edge_step` in inverse range.
+    [('sobel', (1.0, 0.2, 0.05, 0.03)), ('plane', (1.0, 0.1, 0.05))],
 )
 def test_no_link_joins_a_board_and_the_wall_behind_it(detector, steps, shadow, side):
     config = Config(jump_edges=detector, edge_step=EDGE_STEP)

@@ -168,6 +168,7 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
         inverse,
         strong,
         *wide.result(),
+        step,
         _CLEAR * step,
         horizontal,
         vertical,
@@ -258,13 +259,16 @@ def _find_crossings(
     strong: NDArray[np.bool_],
     total: NDArray[np.float32],
     count: NDArray[np.float32],
+    step: float,
     clear: float,
     horizontal: NDArray[np.bool_],
     vertical: NDArray[np.bool_],
 ) -> None:
     """Edges between strong pixels on unlike sides of the local mean, and all of a clear step.
 
-    The latter because where three surfaces meet, two may lie on the same side of the mean.
+    The latter because where three surfaces meet, two may lie on the same side of the mean. At
+    corners, where the windows hold little of one surface, contours would have gaps: beside strong
+    pixels, the pixels by themselves are looked at as the windows are.
     """
     height, width = inverse.shape
     for i in range(first, after):
@@ -275,15 +279,35 @@ def _find_crossings(
             above = here * count[i, j] > total[i, j]
             if j + 1 < width and inverse[i, j + 1] > 0:
                 there = inverse[i, j + 1]
-                horizontal[i, j] = abs(here - there) > clear or (
-                    strong[i, j]
-                    and strong[i, j + 1]
-                    and above != (there * count[i, j + 1] > total[i, j + 1])
+                left = inverse[i, j - 1] if j > 0 else np.float32(0)
+                right = inverse[i, j + 2] if j + 2 < width else np.float32(0)
+                either, both = strong[i, j] | strong[i, j + 1], strong[i, j] & strong[i, j + 1]
+                horizontal[i, j] = (
+                    abs(here - there) > clear
+                    or (both and above != (there * count[i, j + 1] > total[i, j + 1]))
+                    or (either and _stands_out(left, here, there, right, step))
                 )
             if i + 1 < height and inverse[i + 1, j] > 0:
                 there = inverse[i + 1, j]
-                vertical[i, j] = abs(here - there) > clear or (
-                    strong[i, j]
-                    and strong[i + 1, j]
-                    and above != (there * count[i + 1, j] > total[i + 1, j])
+                upper = inverse[i - 1, j] if i > 0 else np.float32(0)
+                lower = inverse[i + 2, j] if i + 2 < height else np.float32(0)
+                either, both = strong[i, j] | strong[i + 1, j], strong[i, j] & strong[i + 1, j]
+                vertical[i, j] = (
+                    abs(here - there) > clear
+                    or (both and above != (there * count[i + 1, j] > total[i + 1, j]))
+                    or (either and _stands_out(upper, here, there, lower, step))
                 )
+
+
+@njit(cache=True, nogil=True)
+def _stands_out(a: np.float32, b: np.float32, c: np.float32, d: np.float32, step: float) -> bool:
+    """Whether the step from b to c leaves those from a to b and c to d by more than `step`.
+
+    On the same side of both; one that was not measured (0) is left out.
+    """
+    here = c - b
+    if a == 0 and d == 0:
+        return False
+    before = here - (b - a) if a > 0 else here - (d - c)
+    after = here - (d - c) if d > 0 else before
+    return bool(min(before, after) > step or max(before, after) < -step)
