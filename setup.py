@@ -61,7 +61,6 @@ setup(
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',
-        'PyMaxflow>=1.3',
         'PyYAML>=5.4',
         'rosbags>=0.11',
         'scipy>=1.11',
@@ -70,7 +69,8 @@ setup(
         'zstandard>=0.15',
     ],
     extras_require={
-        'test': ['hypothesis>=6.90', 'mcap>=1.2.1', 'pytest>=7.4'],
+        # PyMaxflow is what the minimum cuts are compared with, mcap what the bags are read by.
+        'test': ['PyMaxflow>=1.3', 'hypothesis>=6.90', 'mcap>=1.2.1', 'pytest>=7.4'],
         'dask': ['distributed>=2023.1'],
         'view': ['rerun-sdk>=0.23'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],

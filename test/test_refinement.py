@@ -92,10 +92,11 @@ def expand(alpha, labels, cost, problem, models, reach=12):
     """Expand a label from everywhere; in place."""
     labels, cost = labels.ravel(), cost.ravel()
     start, sites = expansion.fronts(labels, problem.links, problem.width, len(models.theta))
-    front, position = sites[start[alpha] : start[alpha + 1]], np.full(len(labels), -1, np.int32)
-    move = refinement._move(alpha, front, reach, labels, cost, problem, models, position)
-    assert (position == -1).all()
-    return move.make(alpha, labels, cost, 1e-6)
+    front = sites[start[alpha] : start[alpha + 1]]
+    labelling = expansion.GridLabelling.of(labels, cost, problem.links, problem.width)
+    helped = refinement._expand(alpha, front, reach, labelling, problem, models)
+    assert (labelling.position == -1).all()
+    return helped
 
 
 def linked(problem, label, labels):
@@ -249,7 +250,7 @@ def test_each_stage_lowers_the_energy(monkeypatch):
         monkeypatch.setattr(refinement, name, run)
 
     watched('_descended', lambda arguments, result: (result[0], arguments[2]))
-    watched('_expand_each', lambda arguments, result: (arguments[1], arguments[4]))
+    watched('_expand_each', lambda arguments, result: (arguments[2].labels, arguments[4]))
     labels, models = refine(problem, surface, moments, sensor)
     assert len(values) == 3
     assert (np.diff(values) <= 1e-3).all()
@@ -270,9 +271,8 @@ def test_no_expansion_helps_after_the_exact_minimisation():
         pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
         front = np.flatnonzero(pixels & measured).astype(np.int32)
         changed, cost = labels.copy(), costs(labels, problem, models)
-        position = np.full(labels.size, -1, np.int32)
-        move = refinement._move(alpha, front, 1, changed, cost, problem, models, position)
-        move.make(alpha, changed, cost, 1e-6)
+        labelling = expansion.GridLabelling.of(changed, cost, problem.links, problem.width)
+        refinement._expand(alpha, front, 1, labelling, problem, models)
         assert energy(changed, problem, models) > value - 1e-2
 
 

@@ -16,7 +16,7 @@ from rangeseg_ros.core.by_normals.piece_moves import relabel_regions
 from rangeseg_ros.core.by_normals.pieces import Pieces, pieces
 from rangeseg_ros.core.graphcut.cut import ROUNDING
 from rangeseg_ros.core.graphcut.energy import link_costs
-from rangeseg_ros.core.graphcut.expansion import Choice, band, choice, fronts
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Shares of the smoothness under which regions grow, one after the other: under all of it at once,
@@ -101,51 +101,43 @@ def _expand(
     sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3)
     vectors = directions.astype(np.float32)
     links = link_costs(grid, smoothness)
-    data = chosen_angles(labels, sites, vectors)
-    position = np.full(len(labels), -1, np.int32)
-    start, beside = fronts(labels, links, width, len(vectors))
-    for alpha in np.flatnonzero(np.diff(start)).tolist():
-        front = beside[start[alpha] : start[alpha + 1]]
-        move = _move(alpha, front, sites, vectors[alpha], labels, data, links, width, position)
-        move.make(alpha, labels, data, ROUNDING)
+    labelling = GridLabelling.of(labels, chosen_angles(labels, sites, vectors), links, width)
+    _expand_each(sites, vectors, labelling, fronts(labels, links, width, len(vectors)))
 
 
-@njit(cache=True)
-def _move(
-    alpha: int,
-    front: NDArray[np.int32],
+@njit(cache=True, nogil=True)
+def _expand_each(
     normals: NDArray[np.float32],
-    direction: NDArray[np.float32],
-    labels: NDArray[np.int32],
-    data: NDArray[np.float32],
-    links: NDArray[np.float32],
-    width: int,
-    position: NDArray[np.int32],
-) -> Choice:
-    """Expansion of a label by the pixels about its front."""
-    front = _onward(alpha, front, normals, direction, labels, data, links, width, position)
-    near = band(alpha, front, _BAND_PIXELS, labels, links, width, position)
-    new = angles(near, normals, direction)
-    return choice(alpha, near, new, labels, data, links, width, position)
+    vectors: NDArray[np.float32],
+    labelling: GridLabelling,
+    near: Sites,
+) -> None:
+    """Expand each label once, to the pixels about its front; in place."""
+    start, beside = near
+    for alpha in range(len(vectors)):
+        front = beside[start[alpha] : start[alpha + 1]]
+        if len(front):
+            front = _onward(alpha, front, normals, vectors[alpha], labelling)
+            sites = band(alpha, front, _BAND_PIXELS, labelling)
+            new = angles(sites, normals, vectors[alpha])
+            expand(alpha, sites, new, labelling, ROUNDING)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _onward(
     alpha: int,
     front: NDArray[np.int32],
     normals: NDArray[np.float32],
     direction: NDArray[np.float32],
-    labels: NDArray[np.int32],
-    data: NDArray[np.float32],
-    links: NDArray[np.float32],
-    width: int,
-    position: NDArray[np.int32],
+    labelling: GridLabelling,
 ) -> NDArray[np.int32]:
     """Sites of a front, and on from there those that gain much by the label.
 
-    `position` is -1 and becomes so again.
+    `labelling.position` is -1 and becomes so again.
     """
-    offsets = np.array([1, width, -1, -width])
+    labels, data = labelling.labels, labelling.data
+    links, position = labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
     sites = np.empty(2 * len(front) + 64, np.int32)
     count = 0
     for p in front:

@@ -21,7 +21,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     energy,
     region_moments,
 )
-from rangeseg_ros.core.graphcut.expansion import Choice, Sites, band, choice, fronts
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
 from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -93,14 +93,16 @@ def _minimise(
     domains: Sites | None,
 ) -> None:
     """Expand the labels near their boundaries, or in their domains until none helps; in place."""
+    count = len(models.theta)
     if domains is None:
-        near = fronts(labels, problem.links, problem.width, len(models.theta))
-        # No plane is not expanded: every pixel has had that choice, and it gains next to nothing.
-        _expand_each(range(1, len(models.theta)), labels, cost, problem, models, near, _BAND)
+        near = fronts(labels, problem.links, problem.width, count)
+        labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
+        # Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
+        _expand_each(1, count, labelling, problem, models, near, _BAND)
         return
     cost = costs(labels, problem, models)
-    every = range(len(models.theta))
-    while _expand_each(every, labels, cost, problem, models, domains, 1):
+    labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
+    while _expand_each(0, count, labelling, problem, models, domains, 1):
         pass
 
 
@@ -244,44 +246,40 @@ def _descend(
                 waiting += 1
 
 
+@njit(cache=True, nogil=True)
 def _expand_each(
-    alphas: range,
-    labels: NDArray[np.int32],
-    cost: NDArray[np.float32],
+    first: int,
+    after: int,
+    labelling: GridLabelling,
     problem: Problem,
     models: Models,
     near: Sites,
     reach: int,
 ) -> bool:
-    """Expand each label once, to the pixels `near` it and by `reach` - 1 beyond; in place.
+    """Expand labels `first` to before `after` once, to the pixels `near` and `reach` - 1 beyond.
 
-    Whether that helped.
+    In place. Whether that helped.
     """
-    position = np.full(len(labels), -1, np.int32)
     start, sites = near
     helped = False
-    for alpha in alphas:
+    for alpha in range(first, after):
         front = sites[start[alpha] : start[alpha + 1]]
-        move = _move(alpha, front, reach, labels, cost, problem, models, position)
-        helped |= move.make(alpha, labels, cost, _STEP)
+        helped |= _expand(alpha, front, reach, labelling, problem, models)
     return helped
 
 
-@njit(cache=True)
-def _move(
+@njit(cache=True, nogil=True)
+def _expand(
     alpha: int,
     front: NDArray[np.int32],
     reach: int,
-    labels: NDArray[np.int32],
-    cost: NDArray[np.float32],
+    labelling: GridLabelling,
     problem: Problem,
     models: Models,
-    position: NDArray[np.int32],
-) -> Choice:
-    """Expansion of one label from its front."""
-    links, width = problem.links, problem.width
-    sites = band(alpha, front, reach, labels, links, width, position)
+) -> bool:
+    """Expand one label from its front."""
+    sites = band(alpha, front, reach, labelling)
     new = np.empty(len(sites), np.float32)
     for s in range(len(sites)):
         new[s] = data_cost(alpha, int(sites[s]), problem, models)
-    return choice(alpha, sites, new, labels, cost, links, width, position)
+    return expand(alpha, sites, new, labelling, _STEP)

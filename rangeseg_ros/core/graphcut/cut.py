@@ -10,38 +10,267 @@ so that it becomes an n-link of w/2 and a cost w/2 of staying at each end: no au
 (thesis 4.7.2) is needed. An edge between like labels is an n-link of w. With a neighbour q that
 is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the n-link becomes a
 cost of staying or of switching.
+
+The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
+tree grows from either terminal over edges that are not saturated; where the two meet, flow is
+pushed along the path, and the nodes that this cuts off look for another parent in their tree.
 """
 
 from __future__ import annotations
 
-import maxflow
+from typing import NamedTuple
+
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 ROUNDING = 1e-3
 """A move must lower the energy by more than the rounding of its sums."""
+# Parents that are not a neighbour: those have the number of their side, 0 to 3.
+_TERMINAL, _ORPHAN, _FREE = 4, 5, 6
 
 
+class _Flow(NamedTuple):
+    """State of a maximum flow: n nodes with up to four neighbours.
+
+    The source stands for staying, the sink for switching.
+
+    Attributes
+    ----------
+    neighbour : (n, 4) int32
+        Node on each side, -1 for none; for the other, this one is on side (k + 2) % 4.
+    residual : (n, 4) float64
+        What the edge to that side can still take.
+    terminal : (n,) float64
+        What the edge from the source, or to the sink where negative, can still take.
+    parent : (n,) int8
+        Side of the parent in its tree.
+    sink : (n,) bool
+        Whether the tree is that of the sink.
+    stamp, depth : (n,) int32
+        When the distance to the terminal was last known, and that distance.
+    queue : (n,) int32
+        Ring of the nodes from which the trees grow.
+    queued : (n,) bool
+        Whether a node is in it.
+    """
+
+    neighbour: NDArray[np.int32]
+    residual: NDArray[np.float64]
+    terminal: NDArray[np.float64]
+    parent: NDArray[np.int8]
+    sink: NDArray[np.bool_]
+    stamp: NDArray[np.int32]
+    depth: NDArray[np.int32]
+    queue: NDArray[np.int32]
+    queued: NDArray[np.bool_]
+
+
+@njit(cache=True, nogil=True)
 def minimum_cut(
-    excess: NDArray[np.float64],
-    i: NDArray[np.integer],
-    j: NDArray[np.integer],
-    capacity: NDArray[np.float64],
+    excess: NDArray[np.float64], neighbour: NDArray[np.int32], link: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Choice x (n,) bool that minimises sum excess x + sum capacity |x_i - x_j|.
+    """Choice x (n,) bool that minimises sum excess x + sum link |x - x of the neighbour|.
+
+    Of several, the one that chooses fewest nodes.
 
     Parameters
     ----------
     excess : (n,) float64
         Cost of choosing a node, of either sign.
-    i, j : (m,) int
-        Ends of the edges.
-    capacity : (m,) float64
-        Cost of an edge whose ends are not chosen alike, not negative.
+    neighbour : (n, 4) int32
+        Node on each side, -1 for none; for that node, this one is on side (k + 2) % 4.
+    link : (n, 4) float64
+        Cost of the edge to that side if its ends are not chosen alike, not negative; the same
+        seen from either end.
     """
-    graph = maxflow.GraphFloat(len(excess), len(i))
-    nodes = graph.add_nodes(len(excess))
-    graph.add_grid_tedges(nodes, np.maximum(excess, 0), np.maximum(-excess, 0))
-    graph.add_edges(i, j, capacity, capacity)
-    graph.maxflow()
-    return graph.get_grid_segments(nodes)
+    count = len(excess)
+    flow = _Flow(
+        neighbour,
+        link.copy(),
+        excess.copy(),
+        np.full(count, _FREE, np.int8),
+        np.zeros(count, np.bool_),
+        np.zeros(count, np.int32),
+        np.zeros(count, np.int32),
+        np.empty(count, np.int32),
+        np.zeros(count, np.bool_),
+    )
+    orphans = np.empty(count, np.int32)
+    first = last = waiting = 0
+    for p in range(count):
+        if excess[p] != 0:
+            flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, excess[p] < 0, 1
+            flow.queue[last] = p
+            flow.queued[p] = True
+            last = (last + 1) % count
+            waiting += 1
+    time = 0
+    while waiting > 0:
+        p = flow.queue[first]
+        side = -1
+        if flow.parent[p] != _FREE:
+            # Grow the tree from p, until it meets the other one.
+            for k in range(4):
+                q = neighbour[p, k]
+                if q < 0:
+                    continue
+                opposite = (k + 2) % 4
+                free = flow.residual[q, opposite] if flow.sink[p] else flow.residual[p, k]
+                if free <= 0:
+                    continue
+                if flow.parent[q] == _FREE:
+                    flow.parent[q], flow.sink[q] = opposite, flow.sink[p]
+                    flow.stamp[q], flow.depth[q] = flow.stamp[p], flow.depth[p] + 1
+                    if not flow.queued[q]:
+                        flow.queue[last] = q
+                        flow.queued[q] = True
+                        last = (last + 1) % count
+                        waiting += 1
+                elif flow.sink[q] != flow.sink[p]:
+                    side = k
+                    break
+                elif flow.stamp[q] <= flow.stamp[p] and flow.depth[q] > flow.depth[p]:
+                    flow.parent[q] = opposite
+                    flow.stamp[q], flow.depth[q] = flow.stamp[p], flow.depth[p] + 1
+        if side < 0:
+            # Nothing more to grow here.
+            flow.queued[p] = False
+            first = (first + 1) % count
+            waiting -= 1
+            continue
+        time += 1
+        found = _push(flow, p, side, orphans)
+        # Orphans look for parents; those that find none leave orphans of their own.
+        done = 0
+        while done < found:
+            q = orphans[done % count]
+            done += 1
+            if _adopt(flow, q, time):
+                continue
+            for k in range(4):
+                r = neighbour[q, k]
+                if r < 0 or flow.parent[r] == _FREE or flow.sink[r] != flow.sink[q]:
+                    continue
+                opposite = (k + 2) % 4
+                free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
+                if free > 0 and not flow.queued[r]:
+                    flow.queue[last] = r
+                    flow.queued[r] = True
+                    last = (last + 1) % count
+                    waiting += 1
+                if flow.parent[r] == opposite:
+                    flow.parent[r] = _ORPHAN
+                    orphans[found % count] = r
+                    found += 1
+            flow.parent[q] = _FREE
+    chosen = np.empty(count, np.bool_)
+    for p in range(count):
+        chosen[p] = flow.parent[p] != _FREE and flow.sink[p]
+    return chosen
+
+
+@njit(cache=True, nogil=True)
+def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
+    """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
+    neighbour, residual, terminal, parent = (
+        flow.neighbour,
+        flow.residual,
+        flow.terminal,
+        flow.parent,
+    )
+    if flow.sink[p]:
+        p, side = neighbour[p, side], (side + 2) % 4
+    pushed = residual[p, side]
+    # From p up to the source, against the flow, and from its neighbour on to the sink.
+    a = p
+    while parent[a] != _TERMINAL:
+        k = parent[a]
+        a = neighbour[a, k]
+        pushed = min(pushed, residual[a, (k + 2) % 4])
+    pushed = min(pushed, terminal[a])
+    b = neighbour[p, side]
+    while parent[b] != _TERMINAL:
+        k = parent[b]
+        pushed = min(pushed, residual[b, k])
+        b = neighbour[b, k]
+    pushed = min(pushed, -terminal[b])
+
+    found = 0
+    residual[p, side] -= pushed
+    b = neighbour[p, side]
+    residual[b, (side + 2) % 4] += pushed
+    a = p
+    while parent[a] != _TERMINAL:
+        k = parent[a]
+        above = neighbour[a, k]
+        residual[a, k] += pushed
+        residual[above, (k + 2) % 4] -= pushed
+        if residual[above, (k + 2) % 4] <= 0:
+            parent[a] = _ORPHAN
+            orphans[found] = a
+            found += 1
+        a = above
+    terminal[a] -= pushed
+    if terminal[a] <= 0:
+        parent[a] = _ORPHAN
+        orphans[found] = a
+        found += 1
+    while parent[b] != _TERMINAL:
+        k = parent[b]
+        above = neighbour[b, k]
+        residual[above, (k + 2) % 4] += pushed
+        residual[b, k] -= pushed
+        if residual[b, k] <= 0:
+            parent[b] = _ORPHAN
+            orphans[found] = b
+            found += 1
+        b = above
+    terminal[b] += pushed
+    if terminal[b] >= 0:
+        parent[b] = _ORPHAN
+        orphans[found] = b
+        found += 1
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _adopt(flow: _Flow, p: int, time: int) -> bool:
+    """Find an orphan the nearest parent of its tree that still leads to the terminal."""
+    neighbour, parent, stamp, depth = flow.neighbour, flow.parent, flow.stamp, flow.depth
+    best = -1
+    least = np.int32(2147483647)
+    for k in range(4):
+        q = neighbour[p, k]
+        if q < 0 or parent[q] == _FREE or flow.sink[q] != flow.sink[p]:
+            continue
+        free = flow.residual[p, k] if flow.sink[p] else flow.residual[q, (k + 2) % 4]
+        if free <= 0:
+            continue
+        steps, r = np.int32(0), q
+        while True:
+            if stamp[r] == time:
+                steps += depth[r]
+                break
+            steps += 1
+            if parent[r] == _TERMINAL:
+                stamp[r], depth[r] = time, 1
+                break
+            if parent[r] == _ORPHAN:
+                steps = np.int32(-1)
+                break
+            r = neighbour[r, parent[r]]
+        if steps < 0:
+            continue
+        if steps < least:
+            least, best = steps, k
+        # What was learnt on the way is kept.
+        r = q
+        while stamp[r] != time:
+            stamp[r], depth[r] = time, steps
+            steps -= 1
+            r = neighbour[r, parent[r]]
+    if best < 0:
+        return False
+    parent[p], stamp[p], depth[p] = best, time, least + 1
+    return True

@@ -2,7 +2,7 @@
 
 Sites are pixels, numbered in raster order. A site whose data speak louder than all of its
 neighbours together is decided without a cut, and what it decides often decides its neighbours:
-partial optimality, exact, and most of the band. The rest is a minimum cut (`moves`).
+partial optimality, and exact. The rest is a minimum cut (`cut`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,41 @@ Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
 
-@njit(cache=True)
+class GridLabelling(NamedTuple):
+    """A labelling of n pixels, in raster order, while expansions change it.
+
+    Attributes
+    ----------
+    labels : (n,) int32
+    data : (n,) float32
+        Data cost of each pixel's label.
+    links : (2, n) float32
+        See `energy.link_costs`.
+    width : int
+        Pixels in a row.
+    position : (n,) int32
+        Scratch of the expansions: -1 between them.
+    """
+
+    labels: NDArray[np.int32]
+    data: NDArray[np.float32]
+    links: NDArray[np.float32]
+    width: int
+    position: NDArray[np.int32]
+
+    @classmethod
+    def of(
+        cls,
+        labels: NDArray[np.int32],
+        data: NDArray[np.float32],
+        links: NDArray[np.float32],
+        width: int,
+    ) -> GridLabelling:
+        """Begin with these labels and data costs, which change in place."""
+        return cls(labels, data, links, width, np.full(len(labels), -1, np.int32))
+
+
+@njit(cache=True, nogil=True)
 def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, count: int) -> Sites:
     """Sites across an edge from each label's own.
 
@@ -59,15 +93,9 @@ def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> 
     return start[: count + 1], result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def band(
-    alpha: int,
-    front: NDArray[np.int32],
-    reach: int,
-    labels: NDArray[np.int32],
-    links: NDArray[np.float32],
-    width: int,
-    position: NDArray[np.int32],
+    alpha: int, front: NDArray[np.int32], reach: int, labelling: GridLabelling
 ) -> NDArray[np.int32]:
     """Sites of other labels within `reach` edges of a label.
 
@@ -77,17 +105,15 @@ def band(
     front : (m,) int32
         Sites next to those of the label.
     reach : int
-    labels : (n,) int32
-    links : (2, n) float32
-    width : int
-    position : (n,) int32
-        -1; receives the place of each site in the result.
+    labelling : GridLabelling
+        `position` receives the place of each site in the result.
 
     Returns
     -------
     (s,) int32
     """
-    offsets = np.array([1, width, -1, -width])
+    labels, links, position = labelling.labels, labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
     sites = np.empty(max(64, 2 * reach * len(front)), np.int32)
     count = done = 0
     for p in front:
@@ -112,104 +138,83 @@ def band(
     return sites[:count]
 
 
-class Choice(NamedTuple):
-    """The binary problem of an expansion, as far as it could be decided without a cut.
-
-    Attributes
-    ----------
-    sites : (s,) int32
-        Those that may switch to the label.
-    new : (s,) float32
-        Data cost of the label there.
-    switch : (s,) bool
-        Whether the decided ones switch.
-    value : float
-        Change of the energy by the decided ones.
-    open : (m,) int32
-        Which of the sites are not decided.
-    excess : (m,) float64
-        What switching costs each of these more than staying.
-    first, second : (e,) int32
-        Ends of the edges between open sites, as places in `open`.
-    link : (e,) float64
-        Costs of cutting these.
-    """
-
-    sites: NDArray[np.int32]
-    new: NDArray[np.float32]
-    switch: NDArray[np.bool_]
-    value: float
-    open: NDArray[np.int32]
-    excess: NDArray[np.float64]
-    first: NDArray[np.int32]
-    second: NDArray[np.int32]
-    link: NDArray[np.float64]
-
-    def make(
-        self, alpha: int, labels: NDArray[np.int32], data: NDArray[np.float32], least: float
-    ) -> bool:
-        """Give label `alpha` to the best set of sites; in place. Whether that lowered the energy.
-
-        Parameters
-        ----------
-        alpha : int
-        labels, data : (n,) int32, (n,) float32
-            Labelling and its data costs.
-        least : float
-            An improvement of no more than this is rounding.
-        """
-        value = self.value
-        if len(self.open):
-            chosen = minimum_cut(self.excess, self.first, self.second, self.link)
-            self.switch[self.open] = chosen
-            value += self.excess[chosen].sum()
-            value += self.link[chosen[self.first] != chosen[self.second]].sum()
-        if value >= -least:
-            return False
-        switched = self.sites[self.switch]
-        labels[switched] = alpha
-        data[switched] = self.new[self.switch]
-        return True
-
-
-@njit(cache=True)
-def choice(
+@njit(cache=True, nogil=True)
+def expand(
     alpha: int,
     sites: NDArray[np.int32],
     new: NDArray[np.float32],
-    labels: NDArray[np.int32],
-    data: NDArray[np.float32],
-    links: NDArray[np.float32],
-    width: int,
-    position: NDArray[np.int32],
-) -> Choice:
-    """Decide the sites that can be decided without a cut.
+    labelling: GridLabelling,
+    least: float,
+) -> bool:
+    """Give label `alpha` to the best set of sites; in place.
 
     Parameters
     ----------
     alpha : int
     sites : (s,) int32
-        Those that may switch, none of which has the label.
+        Those that may switch, none of which has the label. `labelling.position` has their places.
     new : (s,) float32
         Data cost of the label there.
-    labels, data : (n,) int32, (n,) float32
-        Labelling and its data costs.
-    links : (2, n) float32
-    width : int
-    position : (n,) int32
-        Place of each site in `sites`, -1 elsewhere; becomes -1 again.
+    labelling : GridLabelling
+    least : float
+        An improvement of no more than this is rounding.
+
+    Returns
+    -------
+    bool
+        Whether that lowered the energy.
     """
-    offsets = np.array([1, width, -1, -width])
+    excess, neighbour, link = _problem(alpha, sites, new, labelling)
+    count = len(sites)
+    switch = np.zeros(count, np.bool_)
+    is_open, value = _decide(excess, neighbour, link, switch)
+    # What is left, numbered anew.
+    number = np.cumsum(is_open) - 1
+    rest = np.flatnonzero(is_open)
+    if len(rest):
+        beside = np.full((len(rest), 4), -1, np.int32)
+        for a in range(len(rest)):
+            for k in range(4):
+                t = neighbour[rest[a], k]
+                if t >= 0:
+                    beside[a, k] = number[t]
+        link, excess = link[rest], excess[rest]
+        chosen = minimum_cut(excess, beside, link)
+        for a in range(len(rest)):
+            switch[rest[a]] = chosen[a]
+            if not chosen[a]:
+                continue
+            value += excess[a]
+            for k in range(4):
+                if beside[a, k] >= 0 and not chosen[beside[a, k]]:
+                    value += link[a, k]
+    if value >= -least:
+        return False
+    for s in range(count):
+        if switch[s]:
+            labelling.labels[sites[s]] = alpha
+            labelling.data[sites[s]] = new[s]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _problem(
+    alpha: int, sites: NDArray[np.int32], new: NDArray[np.float32], labelling: GridLabelling
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]:
+    """What switching costs each site more than staying, and its edges to other sites.
+
+    (s,), and neighbours and weights as of `minimum_cut`. Clears `labelling.position`.
+    """
+    labels, links, position = labelling.labels, labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
     count = len(sites)
     excess = np.empty(count)
     link = np.zeros((count, 4))
-    # Weights of the edges to open sites.
-    swing = np.zeros(count)
-    beside = np.full((count, 4), -1, np.int32)
+    neighbour = np.full((count, 4), -1, np.int32)
     for s in range(count):
         p = sites[s]
         here = labels[p]
-        total = np.float64(new[s]) - np.float64(data[p])
+        total = np.float64(new[s]) - np.float64(labelling.data[p])
         for k in range(4):
             q = p + offsets[k]
             u = np.float64(links[k % 2, min(p, q)])
@@ -220,25 +225,40 @@ def choice(
                 if here != there:
                     u /= 2
                     total -= u
-                beside[s, k], link[s, k] = t, u
-                swing[s] += u
+                neighbour[s, k], link[s, k] = t, u
             elif there == alpha:
                 total -= u
             elif there == here:
                 total += u
         excess[s] = total
-    switch = np.zeros(count, np.bool_)
+    for p in sites:
+        position[p] = -1
+    return excess, neighbour, link
+
+
+@njit(cache=True, nogil=True)
+def _decide(
+    excess: NDArray[np.float64],
+    neighbour: NDArray[np.int32],
+    link: NDArray[np.float64],
+    switch: NDArray[np.bool_],
+) -> tuple[NDArray[np.bool_], float]:
+    """Decide the sites whose excess outweighs their undecided neighbours together.
+
+    In place: `switch` for those decided, for the others `excess` and `neighbour` without them.
+    Also returns which are open, (s,), and the change of the energy by the decided ones.
+    """
+    count = len(excess)
+    pairwise = link.sum(axis=1)
     is_open = np.ones(count, np.bool_)
     waiting = np.empty(count, np.int32)
-    last = 0
+    last = done = 0
     for s in range(count):
-        position[sites[s]] = -1
-        if excess[s] >= swing[s] or excess[s] < -swing[s]:
+        if excess[s] >= pairwise[s] or excess[s] < -pairwise[s]:
             waiting[last] = s
             is_open[s] = False
             last += 1
     value = 0.0
-    done = 0
     while done < last:
         s = waiting[done]
         done += 1
@@ -246,31 +266,18 @@ def choice(
         if switch[s]:
             value += excess[s]
         for k in range(4):
-            t, u = beside[s, k], link[s, k]
+            t, u = neighbour[s, k], link[s, k]
             if t < 0:
                 continue
-            beside[t, (k + 2) % 4] = -1
-            swing[t] -= u
+            neighbour[t, (k + 2) % 4] = -1
+            pairwise[t] -= u
             if switch[s]:
                 value += u
                 excess[t] -= u
             else:
                 excess[t] += u
-            if is_open[t] and (excess[t] >= swing[t] or excess[t] < -swing[t]):
+            if is_open[t] and (excess[t] >= pairwise[t] or excess[t] < -pairwise[t]):
                 waiting[last] = t
                 is_open[t] = False
                 last += 1
-    number = np.cumsum(is_open) - 1
-    rest = np.flatnonzero(is_open).astype(np.int32)
-    ends = np.empty((2, 2 * len(rest)), np.int32)
-    cut = np.empty(2 * len(rest))
-    edges = 0
-    for a in range(len(rest)):
-        s = rest[a]
-        for k in range(2):
-            if beside[s, k] >= 0:
-                ends[0, edges], ends[1, edges] = a, number[beside[s, k]]
-                cut[edges] = link[s, k]
-                edges += 1
-    first, second, cut = ends[0, :edges], ends[1, :edges], cut[:edges]
-    return Choice(sites, new, switch, value, rest, excess[rest], first, second, cut)
+    return is_open, value

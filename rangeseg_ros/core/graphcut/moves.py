@@ -9,9 +9,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.cut import ROUNDING, minimum_cut
 from rangeseg_ros.core.graphcut.energy import link_costs
-from rangeseg_ros.core.graphcut.expansion import choice
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -47,9 +47,10 @@ class Labelling:
         self._shape = labels.shape
         self.labels = labels.astype(np.int32).ravel()
         self._cost = cost
-        self._links = link_costs(grid, smoothness)
         self.data = np.empty(labels.size, np.float32)
-        self._position = np.full(labels.size, -1, np.int32)
+        self._state = expansion.GridLabelling.of(
+            self.labels, self.data, link_costs(grid, smoothness), labels.shape[1]
+        )
         for label in np.unique(self.labels):
             pixels = np.flatnonzero(self.labels == label)
             self.data[pixels] = cost(int(label), pixels)
@@ -83,10 +84,8 @@ class Labelling:
         """Give label `alpha` to the best set of pixels; True if that lowers the energy."""
         pixels = np.flatnonzero(self.labels != alpha).astype(np.int32)
         cost = np.asarray(self._cost(alpha, pixels), np.float32)
-        self._position[pixels] = np.arange(len(pixels))
-        links, width = self._links, self._shape[1]
-        move = choice(alpha, pixels, cost, self.labels, self.data, links, width, self._position)
-        return move.make(alpha, self.labels, self.data, ROUNDING)
+        self._state.position[pixels] = np.arange(len(pixels))
+        return bool(expansion.expand(alpha, pixels, cost, self._state, ROUNDING))
 
     def swap(self, alpha: int, beta: int) -> bool:
         """Share out the pixels of labels `alpha` and `beta` anew; True if the energy falls."""
@@ -95,23 +94,26 @@ class Labelling:
             return False
         of_alpha, of_beta = self._cost(alpha, pixels), self._cost(beta, pixels)
         excess = of_alpha.astype(np.float64) - of_beta
-        # Edges to other labels cost the same either way; of the rest each once, right and down.
-        inside = np.zeros(len(self.labels), np.bool_)
-        inside[pixels] = True
-        self._position[pixels] = np.arange(len(pixels))
-        ends, capacity = [], []
-        for links, offset in zip(self._links, (1, self._shape[1]), strict=True):
-            one = pixels[links[pixels] > 0]
-            one = one[inside[one + offset]]
-            ends.append(self._position[[one, one + offset]])
-            capacity.append(links[one].astype(np.float64))
-        first, second = np.concatenate(ends, axis=1)
-        link = np.concatenate(capacity)
+        # Edges to other labels cost the same either way.
+        place = np.full(len(self.labels), -1, np.int32)
+        place[pixels] = np.arange(len(pixels))
+        neighbour = np.full((len(pixels), 4), -1, np.int32)
+        link = np.zeros((len(pixels), 4))
+        for k, (links, offset) in enumerate(
+            zip(self._state.links, (1, self._shape[1]), strict=True)
+        ):
+            one = np.flatnonzero(links[pixels] > 0)
+            other = place[pixels[one] + offset]
+            one, other = one[other >= 0], other[other >= 0]
+            neighbour[one, k], neighbour[other, k + 2] = other, one
+            link[one, k] = link[other, k + 2] = links[pixels[one]]
+        chosen = minimum_cut(excess, neighbour, link)
 
         def value(chosen: NDArray[np.bool_]) -> float:
-            return excess[chosen].sum() + link[chosen[first] != chosen[second]].sum()
+            # Each edge is seen from both ends.
+            unlike = (neighbour >= 0) & (chosen[neighbour] != chosen[:, None])
+            return excess[chosen].sum() + link[unlike].sum() / 2
 
-        chosen = minimum_cut(excess, first, second, link)
         if value(chosen) >= value(self.labels[pixels] == alpha) - ROUNDING:
             return False
         self.labels[pixels] = np.where(chosen, alpha, beta)
