@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from rangeseg_ros.evaluation.sensitivity import find_constants
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'rangeseg_ros'
 PAGES = [ROOT / 'README.md', ROOT / 'CONTRIBUTING.md', *sorted((ROOT / 'docs').glob('*.md'))]
@@ -43,6 +45,16 @@ def test_functions_that_the_architecture_names_are_where_it_says():
         paths = paths or list(PACKAGE.rglob(file))
         pattern = rf'^(def|class|   ) {name}\b|^{name}\b.* = '
         assert re.search(pattern, paths[0].read_text(), re.M), (name, file)
+
+
+def test_the_table_of_constants_is_that_of_the_code():
+    text = (ROOT / 'docs/method.md').read_text()
+    rows = re.findall(
+        r'^\| `([\w/]+)` \| `(\w+)` \| (.*?) \| ([acd]) \| (.+?) \| (.*?) ?\|$', text, re.M
+    )
+    told = {(module, name): value for module, name, value, *_ in rows}
+    found = {(constant.module, constant.name): constant.source for constant in find_constants()}
+    assert told == found
 
 
 def test_every_page_is_in_the_site():
