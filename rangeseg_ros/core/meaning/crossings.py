@@ -8,7 +8,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.classes import DROP, GROUND
-from rangeseg_ros.core.meaning.ground import Terrain, interpolated
+from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.meaning.ground_field import GroundField, plane_at
 from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -87,12 +88,12 @@ def _ground_inverse(
     first: int,
     after: int,
     rays: NDArray[np.float32],
-    field: NDArray[np.float64],
+    field: GroundField,
     inverse: NDArray[np.float32],
 ) -> None:
     """Inverse range at which rays cross the ground; not positive where they do not."""
     for i in range(first, after):
         for j in range(rays.shape[1]):
-            theta = interpolated(field, i, j)
+            theta = plane_at(field, i, j)
             ray = rays[i, j]
             inverse[i, j] = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]

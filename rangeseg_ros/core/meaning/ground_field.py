@@ -1,4 +1,4 @@
-"""The ground everywhere in an image, as a plane for every block, continued where there is none.
+"""The ground everywhere in an image: a plane for every block, continued where there is none.
 
 Each block's plane is fitted to the ground in a window around it, with the plane of a window twice
 as wide as its prior, up to the whole image and the plane under the robot: where the ground is
@@ -7,14 +7,17 @@ seen, the field follows undulation and distortion; where it is not, it goes on s
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.continuity import COLUMNS, Cells
+from rangeseg_ros.core.meaning.cells import Cells, CellSize
+from rangeseg_ros.core.runtime.threads import strips
 
-BLOCK = 16
-"""Rows and columns of a block, pixels."""
+# Cells of a block, which is about square.
+_ROWS, _COLUMNS = 16, 2
 # The prior counts as so much of a window full of ground: each of the about five levels leaves a
 # fifth of what the one before has left.
 _PRIOR = 0.25
@@ -56,15 +59,15 @@ def _moments(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Sums of ray ray^T (6) and ray * inverse (3): of the ground, and the first of all cells."""
     rows, columns = on_ground.shape
-    per = BLOCK // COLUMNS
-    ground = np.zeros((-(-rows // BLOCK), -(-columns // per), 9))
-    every = np.zeros((-(-rows // BLOCK), -(-columns // per), 6))
+    blocks = -(-rows // _ROWS), -(-columns // _COLUMNS)
+    ground = np.zeros((*blocks, 9))
+    every = np.zeros((*blocks, 6))
     for i in range(rows):
         for c in range(columns):
             value = cells.inverse[i, c]
             if value == 0:
                 continue
-            m, n = i // BLOCK, c // per
+            m, n = i // _ROWS, c // _COLUMNS
             x, y, z = cells.ray[i, c]
             for k, product in enumerate((x * x, x * y, x * z, y * y, y * z, z * z)):
                 every[m, n, k] += product
@@ -116,3 +119,87 @@ def _fitted(
             theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
             theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
     return theta
+
+
+class GroundField(NamedTuple):
+    """Planes of the ground.
+
+    Attributes
+    ----------
+    theta : (M, N, 3) float64
+        theta . ray is the inverse range of the ground at the middle of a block.
+    rows, columns : int
+        Pixels of a block.
+    up : (3,) float64
+    """
+
+    theta: NDArray[np.float64]
+    rows: int
+    columns: int
+    up: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, theta: NDArray[np.float64], size: CellSize, up: NDArray[np.float64]
+    ) -> GroundField:
+        """With blocks of cells of that size."""
+        return cls(theta, _ROWS * size.rows, _COLUMNS * size.columns, up)
+
+    def turned(self) -> GroundField:
+        """Of the image with rows and columns exchanged."""
+        theta = np.ascontiguousarray(self.theta.transpose(1, 0, 2))
+        return GroundField(theta, self.columns, self.rows, self.up)
+
+
+def cell_heights(cells: Cells, field: GroundField, size: CellSize) -> NDArray[np.float32]:
+    """Heights of cells above the ground, metres along up; NaN where nothing is measured."""
+    result = np.full(cells.inverse.shape, np.nan, np.float32)
+    strips(_cell_heights, len(result), cells, field, size, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _cell_heights(
+    first: int,
+    after: int,
+    cells: Cells,
+    field: GroundField,
+    size: CellSize,
+    result: NDArray[np.float32],
+) -> None:
+    for i in range(first, after):
+        for c in range(result.shape[1]):
+            if cells.inverse[i, c] > 0:
+                row, column = (i + 0.5) * size.rows - 0.5, (c + 0.5) * size.columns - 0.5
+                theta = plane_at(field, row, column)
+                result[i, c] = height_above(theta, cells.inverse[i, c], cells.ray[i, c], field.up)
+
+
+@njit(cache=True, inline='always')
+def plane_at(field: GroundField, row: float, column: float) -> tuple[float, float, float]:
+    """Plane of the ground at a pixel, between those of the blocks around it."""
+    theta = field.theta
+    y = min(max((row + 0.5) / field.rows - 0.5, 0.0), theta.shape[0] - 1.0)
+    x = min(max((column + 0.5) / field.columns - 0.5, 0.0), theta.shape[1] - 1.0)
+    i, j = int(y), int(x)
+    k, m = min(i + 1, theta.shape[0] - 1), min(j + 1, theta.shape[1] - 1)
+    v, u = y - i, x - j
+    a, b, c, d = (1 - v) * (1 - u), (1 - v) * u, v * (1 - u), v * u
+    return (
+        a * theta[i, j, 0] + b * theta[i, m, 0] + c * theta[k, j, 0] + d * theta[k, m, 0],
+        a * theta[i, j, 1] + b * theta[i, m, 1] + c * theta[k, j, 1] + d * theta[k, m, 1],
+        a * theta[i, j, 2] + b * theta[i, m, 2] + c * theta[k, j, 2] + d * theta[k, m, 2],
+    )
+
+
+@njit(cache=True, inline='always')
+def height_above(
+    theta: tuple[float, float, float],
+    inverse: float,
+    ray: NDArray[np.float32],
+    up: NDArray[np.float64],
+) -> float:
+    """Height of the point above the plane theta . p = 1, along up."""
+    along = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]
+    rise = theta[0] * up[0] + theta[1] * up[1] + theta[2] * up[2]
+    return (along / inverse - 1) / rise

@@ -11,6 +11,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.meaning.cells import Cells
+from rangeseg_ros.core.meaning.continuity import Steps
+
 ROWS, COLUMNS = 4, 2
 """Cells of a tile, along columns and rows."""
 # Tiles of a block: the window of a prediction is three blocks high and wide.
@@ -24,12 +27,10 @@ _SLOPE = 0.05
 @njit(cache=True, nogil=True)
 def grown(
     height: NDArray[np.float32],
-    place: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    cells: Cells,
     candidate: NDArray[np.bool_],
     seed: NDArray[np.bool_],
-    slope: float,
-    tolerance: NDArray[np.float32],
+    steps: Steps,
 ) -> NDArray[np.bool_]:
     """Cells of the ground.
 
@@ -37,24 +38,20 @@ def grown(
     ----------
     height : (rows, columns) float32
         Above the plane under the robot, metres.
-    place : (rows, columns, 3) float32
-        Horizontal position in the last two entries, metres.
-    variance : (rows, columns) float32
-        Of the height.
+    cells : Cells
     candidate : (rows, columns) bool
         Cells that no step crosses.
     seed : (rows, columns) bool
         Cells that are ground.
-    slope : float
-        Tangent of the steepest ground.
-    tolerance : (rows, columns) float32
-        By which ground may differ from its prediction, metres.
+    steps : Steps
+        Its `least` is what ground may differ by from its prediction.
 
     Returns
     -------
     (rows, columns) bool
     """
     rows, columns = height.shape
+    place = cells.place
     high, wide = -(-rows // ROWS), -(-columns // COLUMNS)
     sums = np.zeros((-(-high // _HIGH), wide, 10))
     ground = np.zeros((rows, columns), np.bool_)
@@ -62,7 +59,7 @@ def grown(
     for i in range(rows):
         for c in range(columns):
             if seed[i, c]:
-                _add(sums, ground, height, place, variance, i, c)
+                _add(sums, ground, height, cells, i, c)
             if candidate[i, c]:
                 tile = (i // ROWS) * wide + c // COLUMNS
                 reach = np.hypot(place[i, c, 1], place[i, c, 2])
@@ -76,11 +73,9 @@ def grown(
                     tile // wide,
                     tile % wide,
                     height,
-                    place,
-                    variance,
+                    cells,
                     candidate,
-                    slope,
-                    tolerance,
+                    steps,
                     sums,
                     ground,
                 )
@@ -92,11 +87,9 @@ def _grow_tile(
     m: int,
     n: int,
     height: NDArray[np.float32],
-    place: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    cells: Cells,
     candidate: NDArray[np.bool_],
-    slope: float,
-    tolerance: NDArray[np.float32],
+    steps: Steps,
     sums: NDArray[np.float64],
     ground: NDArray[np.bool_],
 ) -> None:
@@ -110,7 +103,8 @@ def _grow_tile(
         return
     w = total[0]
     x, y, h = total[1] / w, total[2] / w, total[6] / w
-    prior = 1 / _SLOPE**2
+    # The weights are those of the sensor model, which the image shows to err by a factor.
+    prior = (steps.noise[-1] / _SLOPE) ** 2
     xx, xy, yy = (
         total[3] - w * x * x + prior,
         total[4] - w * x * y,
@@ -120,14 +114,15 @@ def _grow_tile(
     determinant = xx * yy - xy * xy
     p, q = (yy * xh - xy * yh) / determinant, (xx * yh - xy * xh) / determinant
     steepness = np.hypot(p, q)
-    if steepness > slope:
-        p, q = p * slope / steepness, q * slope / steepness
+    if steepness > steps.slope:
+        p, q = p * steps.slope / steepness, q * steps.slope / steepness
+    place = cells.place
     for i in range(m * ROWS, min((m + 1) * ROWS, height.shape[0])):
         for c in range(n * COLUMNS, min((n + 1) * COLUMNS, height.shape[1])):
             if candidate[i, c] and not ground[i, c]:
                 expected = h + p * (place[i, c, 1] - x) + q * (place[i, c, 2] - y)
-                if abs(height[i, c] - expected) <= tolerance[i, c]:
-                    _add(sums, ground, height, place, variance, i, c)
+                if abs(height[i, c] - expected) <= steps.least:
+                    _add(sums, ground, height, cells, i, c)
 
 
 @njit(cache=True, inline='always')
@@ -135,14 +130,14 @@ def _add(
     sums: NDArray[np.float64],
     ground: NDArray[np.bool_],
     height: NDArray[np.float32],
-    place: NDArray[np.float32],
-    variance: NDArray[np.float32],
+    cells: Cells,
     i: int,
     c: int,
 ) -> None:
     ground[i, c] = True
     total = sums[i // (ROWS * _HIGH), c // COLUMNS]
-    w = 1 / max(variance[i, c], 1e-9)
+    w = 1 / max(cells.error[i, c] ** 2, np.float32(1e-10))
+    place = cells.place
     x, y, h = place[i, c, 1], place[i, c, 2], height[i, c]
     total[0] += w
     total[1] += w * x

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
 from rangeseg_ros.core.meaning.roles import unit
+from rangeseg_ros.core.meaning.under_robot import HEIGHT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -48,4 +49,5 @@ class Survey:
 
     def terrain(self) -> Terrain:
         """Find it."""
-        return terrain_of(self.image, self.sensor, self.up, self.sensor_height, self.limits)
+        known = (self.sensor_height, HEIGHT) if self.sensor_height > 0 else (0.0, 0.0)
+        return terrain_of(self.image, self.sensor, self.up, known, self.limits)
