@@ -69,7 +69,12 @@ def write_frame(
     folder: Path, stem: str, image: RangeImage, result: Segmentation, names: Iterable[str]
 ) -> dict[str, Path]:
     """Write the files of these `names` of `FRAME_FILES` for an image; where they are."""
-    paths = {name: folder / f'{stem}{FRAME_FILES[name].ending}' for name in names}
+    paths = {name: frame_path(folder, stem, name) for name in names}
     for name, path in paths.items():
         FRAME_FILES[name].write(path, image, result)
     return paths
+
+
+def frame_path(folder: Path, stem: str, name: str) -> Path:
+    """Where a file of an image is written."""
+    return folder / f'{stem}{FRAME_FILES[name].ending}'

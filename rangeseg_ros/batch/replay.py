@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
+from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
+from rangeseg_ros.batch.result_folder import PICTURES, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -21,7 +20,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import colours
-from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
@@ -29,10 +28,8 @@ from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
-BAG = 'bag'
-"""Name of the bag among the results."""
-PICTURES = ('labels', 'overlay')
-"""Which of `FRAME_FILES` every frame has."""
+# Of the files of a rosbag2.
+_SUFFIXES = ('.mcap', '.db3', '.yaml', '.zstd')
 
 Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
 
@@ -73,8 +70,9 @@ class Replay:
     """Segmentation of one recording.
 
     The bag among the results appears under its name when all else is there. It tells that the
-    recording is done, and a further `run` leaves it alone as long as recording, parameters and
-    code are the same; any other state is started anew, as ids depend on all frames before.
+    recording is done, and a further `run` leaves it alone as long as recording, parameters, code
+    and the other results are the same; any other state is started anew, as ids depend on all
+    frames before.
 
     Attributes
     ----------
@@ -89,6 +87,8 @@ class Replay:
         Copy the topics of the recording into the bag.
     raw : bool
         See `DepthBag`.
+    overwrite : bool
+        Also replace files with the names of results that no replay has written.
     """
 
     recording: Path
@@ -99,12 +99,11 @@ class Replay:
     topics: tuple[str, ...] = ('labels', 'planes', 'markers')
     copy: bool = False
     raw: bool = False
+    overwrite: bool = False
 
     def check(self) -> str:
         """Topics that will be read; BagError when the recording or the folder will not do."""
-        found = self.folder / BAG
-        if found.exists() and not read_record(found):
-            raise BagError(f'{found}: exists already, not overwritten')
+        ResultFolder(self.folder).check(self.recording, self.overwrite)
         if self.copy:
             open_source(self.recording).close()
         with self._open() as source:
@@ -118,14 +117,14 @@ class Replay:
         ValueError
             As `check`; a frame that is no range image.
         """
-        key = self._key()
-        record = read_record(self.folder / BAG)
-        if record.get('key') == key:
+        key, results_folder = self._key(), ResultFolder(self.folder)
+        record = read_record(results_folder.bag)
+        if record.get('key') == key and results_folder.whole():
             return Outcome(**record['outcome'], found_done=True)
         self.check()
-        self._clear()
         with (
-            replacing(self.folder / BAG) as partial,
+            results_folder.begun(),
+            replacing(results_folder.bag) as partial,
             PlaneTable(self.folder / 'planes.csv', ('frame', 'stamp')) as table,
             self._open() as source,
             ResultBag(partial, self.topics) as bag,
@@ -169,33 +168,23 @@ class Replay:
             )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
-            bag.record({'key': key, 'outcome': kept})
+            files = results_folder.digest()
+            bag.record({'key': key, 'outcome': kept, 'files': files})
         return outcome
 
     def _open(self) -> DepthBag:
         return DepthBag(self.recording, self.depth_topic, self.camera_topic, self.raw)
 
-    def _clear(self) -> None:
-        """Remove what other or interrupted runs have left."""
-        endings = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
-        whole = r'planes\.csv|map\.(csv|ply)|report\.html'
-        own = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({endings})|{whole}')
-        partial = re.compile(rf'\.\d+\.({own.pattern}|{BAG})')
-        shutil.rmtree(self.folder / BAG, ignore_errors=True)
-        for path in self.folder.glob('*'):
-            if own.fullmatch(path.name):
-                path.unlink()
-            elif partial.fullmatch(path.name):
-                shutil.rmtree(path, ignore_errors=True)
-
     def _key(self) -> str:
         """Digest of all that the results depend on: code, parameters, the recording's files."""
         digest = hashlib.sha256(code_digest())
-        settings = replace(self, recording=Path(), folder=Path())
+        settings = replace(self, recording=Path(), folder=Path(), overwrite=False)
         digest.update(repr(settings).encode())
         if self.config.distortion_map:
             digest.update(Path(self.config.distortion_map).read_bytes())
-        parts = self.recording.iterdir() if self.recording.is_dir() else [self.recording]
+        parts = [self.recording]
+        if self.recording.is_dir():
+            parts = [path for path in self.recording.iterdir() if path.suffix in _SUFFIXES]
         for path in sorted(parts):
             state = path.stat()
             digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())

@@ -14,6 +14,7 @@ from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.report.evaluation import write_evaluation
+from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.tasks import run_all
 
 
@@ -43,6 +44,7 @@ from rangeseg_ros.tasks import run_all
     'tolerance 0.8: correct white, over-segmented green, under-segmented blue, missed orange, '
     'noise red.',
 )
+@options.overwrite
 @measures.json_file
 def command(
     folder: Path,
@@ -54,6 +56,7 @@ def command(
     unknown_height: bool,
     jobs: int | None,
     output: Path | None,
+    overwrite: bool,
     json_file: Path | None,
 ) -> None:
     """Segment the images in DIR and compare the results with their ground truth.
@@ -87,6 +90,12 @@ def command(
     if not cases:
         raise click.ClickException(f'{folder}: no {split} images')
     tasks = [Task(case, config, output=output) for case in cases]
+    if output:
+        page = output / 'report.html'
+        ours = page.is_file() and page_kind(page) == 'evaluation'
+        outputs = [page, *(path for task in tasks for path in task.pictures(output).values())]
+        inputs = [path for case in cases for path in (case.image, case.truth)]
+        options.check_new(outputs, inputs, overwrite or ours)
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
     figures = evaluation_figures(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,12 +13,33 @@ from tqdm import tqdm
 
 from rangeseg_ros.cli import interrupts
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.files import NotReplacedError, check_regular, clear_abandoned, replacing
 from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
 
-FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+
+class _RegularFile(click.Path):
+    """A file that can be read to its end: no pipe, no device."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = Path(str(super().convert(value, param, ctx)))
+        if not path.is_file():
+            self.fail(f'{path} is not a regular file.', param, ctx)
+        return path
+
+
+class Finite(click.FloatRange):
+    """A number of a range, and not nan."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        number = super().convert(value, param, ctx)
+        if not math.isfinite(number):
+            self.fail(f'{number} is not finite.', param, ctx)
+        return number
+
+
+FILE = _RegularFile(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 camera: Callable[..., Any] = click.option(
@@ -50,9 +72,36 @@ exact: Callable[..., Any] = click.option(
 )
 depth_scale: Callable[..., Any] = click.option(
     '--depth-scale',
-    type=click.FloatRange(min=0, min_open=True),
+    type=Finite(min=1e-9, max=1e3),
     help='Metres per unit of the images.  [default: 0.001 for integers, 1 for floats]',
 )
+overwrite: Callable[..., Any] = click.option(
+    '--overwrite', is_flag=True, help='Replace files that are there already.'
+)
+
+
+def check_replaceable(path: Path, beginning: bytes) -> None:
+    """Refuse to replace what is no earlier result: a file that does not begin like one.
+
+    Also what is no regular file, and a file in a folder that is not there.
+    """
+    check_regular(path)
+    if not path.parent.is_dir():
+        raise click.ClickException(f'{path}: no such folder')
+    if path.is_file() and path.stat().st_size:
+        with path.open('rb') as file:
+            if file.read(len(beginning)) != beginning:
+                raise NotReplacedError(path)
+
+
+def check_new(paths: Iterable[Path], inputs: Iterable[Path], overwrite: bool) -> None:
+    """Refuse to write over the inputs of a command, and without `overwrite` over anything."""
+    taken = {path.resolve() for path in inputs}
+    for path in paths:
+        if path.resolve() in taken:
+            raise NotReplacedError(path, 'is an input, not overwritten')
+        if not overwrite and path.exists():
+            raise NotReplacedError(path, 'exists already, not overwritten (see --overwrite)')
 
 
 def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
@@ -73,6 +122,7 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder that appears under its name once it is complete."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise click.ClickException(f'{path}: exists already, not overwritten')
+    clear_abandoned(path)
     with replacing(path) as partial:
         partial.mkdir()
         yield partial

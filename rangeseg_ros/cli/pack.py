@@ -30,7 +30,7 @@ SUFFIXES = ('.png', '.tif', '.tiff')
 )
 @click.option(
     '--rate',
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.Finite(min=0, min_open=True, max=1e9),
     default=30.0,
     show_default=True,
     help='Images per second.',
@@ -68,6 +68,8 @@ def command(
     )
     if not paths:
         raise click.ClickException(f'{frames_dir}: no {", ".join(SUFFIXES)} images')
+    if (len(paths) - 1) / rate > 2**31 - 2:
+        raise click.UsageError(f'--rate {rate:g} leads to stamps that ROS cannot tell')
     camera = read_camera(camera_file, raw)
     poses = match_poses(paths, poses_dir) if poses_dir else {}
     without: list[str] = []

@@ -15,7 +15,9 @@ from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
+from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.report.replay import write_overview
 from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
 
@@ -31,6 +33,7 @@ from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_s
 @click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
 @options.raw
+@options.overwrite
 @click.option(
     '--topic',
     'topics',
@@ -64,6 +67,7 @@ def command(
     depth_topic: str | None,
     camera_topic: str | None,
     raw: bool,
+    overwrite: bool,
     topics: tuple[str, ...],
     copy: bool,
     jobs: int | None,
@@ -101,10 +105,13 @@ def command(
         folders = [folder.absolute() for folder in folders]
     topics = tuple(name for name in OUTPUTS if name in topics)
     tasks = [
-        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy, raw)
+        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy, raw, overwrite)
         for bag, folder in zip(bags, folders, strict=True)
     ]
     # All are opened, and so checked, before anything is written.
+    index = output / 'index.html'
+    if len(tasks) > 1 and index.exists() and not overwrite and page_kind(index) != 'overview':
+        raise NotReplacedError(index)
     found = [task.check() for task in tasks]
     rows, codes = [], []
     for task, read, outcome in zip(tasks, found, _outcomes(tasks, jobs, scheduler), strict=True):
@@ -112,7 +119,7 @@ def command(
         codes.append(_report(task, outcome))
         rows.append(_row(task, outcome))
     if len(tasks) > 1:
-        write_overview(output / 'index.html', output.name, rows)
+        write_overview(index, output.name, rows)
     if any(codes):
         ctx.exit(max(codes))
 

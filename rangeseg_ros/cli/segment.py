@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from rangeseg_ros.batch.frame_files import FRAME_FILES, write_frame
+from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.distortion import DistortionError
@@ -31,6 +31,7 @@ from rangeseg_ros.io.images import read_depth
 )
 @options.depth_scale
 @options.params
+@options.overwrite
 @options.exact
 @click.option(
     '--normals',
@@ -45,13 +46,15 @@ def command(
     output: Path,
     depth_scale: float | None,
     params_file: Path | None,
+    overwrite: bool,
     exact: bool,
     normals: bool,
 ) -> None:
     """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
 
     Writes for each image <stem>_labels.png (16 bits, 0 = no plane), <stem>_planes.csv (a row for
-    each plane, metres, x right, y down, z forward) and <stem>_overlay.png.
+    each plane, metres, x right, y down, z forward) and <stem>_overlay.png. Nothing that is there
+    already is replaced, unless --overwrite says so.
     """
     name, count = Counter(path.stem for path in depth).most_common(1)[0]
     if count > 1:
@@ -59,6 +62,9 @@ def command(
     camera = read_camera(camera_file, raw)
     segmenter = Segmenter(options.read_parameters(params_file, exact))
     files = [name for name in FRAME_FILES if name != 'normals' or normals]
+    outputs = [frame_path(output, path.stem, kind) for path in depth for kind in files]
+    inputs = [*depth, camera_file, *filter(None, [params_file])]
+    options.check_new(outputs, inputs, overwrite)
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path), camera, depth_scale)

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from rangeseg_ros.cli.options import check_replaceable
 from rangeseg_ros.evaluation.figures import TOLERANCES, as_json
 from rangeseg_ros.evaluation.overlap import check_tolerance
 from rangeseg_ros.io.files import replacing
@@ -53,10 +54,22 @@ tolerance = click.option(
     help=f'Overlap from which regions match, in (0.5, 1]; several may follow.  '
     f'[default: {" ".join(map(str, TOLERANCES))}]',
 )
+
+
+def _checked_output(
+    context: click.Context, parameter: click.Parameter, path: Path | None
+) -> Path | None:
+    # Before the work that the figures are of.
+    if path:
+        check_replaceable(path, b'{')
+    return path
+
+
 json_file = click.option(
     '--json',
     'json_file',
-    type=click.Path(dir_okay=False, path_type=Path),
+    type=click.Path(path_type=Path),
+    callback=_checked_output,
     help='Write the figures to this file.',
 )
 

@@ -54,6 +54,7 @@ def command(
     code is then 1.
     """
     config = options.read_parameters(params_file, exact)
+    options.check_replaceable(output, b'RRF')
     rerun = _rerun()
     with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as file:
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)

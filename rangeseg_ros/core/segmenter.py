@@ -170,6 +170,11 @@ class Segmenter:
         method = self._by_planes if config.method == 'planes' else self._by_normals
         regions, fits, labelling = method(image, grid, watch)
         planes = described(regions, image, fits)
+        if len(planes) < regions.max():
+            # Of some no plane is known: a pixel or two, or so steep that they have no end.
+            kept = np.zeros(int(regions.max()) + 1, np.uint16)
+            kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
+            regions = kept[regions]
         watch.lap('planes')
         reason = _reason(image, planes)
         survey = Survey.of(image, SensorModel.from_config(config), config)

@@ -7,7 +7,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -203,11 +203,25 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
     ):
         cases = list(layout)
         if cases:
-            return cases
+            return _distinct(cases)
     raise EvaluationError(
         f'{folder}: no range images of a known layout (segcomp, depth/ with truth/, '
         'folders of depth.png and truth.png, *.pcd)'
     )
+
+
+def _distinct(cases: list[Case]) -> list[Case]:
+    """The cases under names of their own: a/b and a_b have the same one at first."""
+    taken: set[str] = set()
+    distinct = []
+    for case in cases:
+        number, name = 1, case.name
+        while name in taken:
+            number += 1
+            name = f'{case.name}_{number}'
+        taken.add(name)
+        distinct.append(replace(case, name=name))
+    return distinct
 
 
 def _segcomp_cases(folder: Path) -> Iterator[Case]:

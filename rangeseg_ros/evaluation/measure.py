@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
@@ -105,12 +106,17 @@ class Task:
         if self.cache is None:
             return self._measure()
         path = self.cache / f'{self.case.name}-{self._key()}.json'
-        if path.exists():
+        with suppress(OSError, ValueError, KeyError, TypeError):  # none, or a damaged one
             return Measurement.from_json(path.read_text())
         measurement = self._measure()
         with replacing(path) as partial:
             partial.write_text(measurement.to_json())
         return measurement
+
+    def pictures(self, folder: Path) -> dict[str, Path]:
+        """Where pictures of the image are left."""
+        kinds = 'labels', 'classes'
+        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}
 
     def _measure(self) -> Measurement:
         sample = self.case.load()
@@ -132,8 +138,9 @@ class Task:
     def _save(self, folder: Path, sample: Sample, result: Segmentation, overlap: Overlap) -> None:
         name, labels = self.case.name, result.labels
         picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
-        write_image(folder / f'{name}_labels.png', labels)
-        write_image(folder / f'{name}_classes.png', picture)
+        paths = self.pictures(folder)
+        write_image(paths['labels'], labels)
+        write_image(paths['classes'], picture)
         if isinstance(self.case, SegcompCase) and len(result.planes) <= MAX_REGIONS:
             image = to_segcomp(labels, ~sample.image.valid)
             normals = {int(image[labels == p.label][0]): p.normal for p in result.planes}

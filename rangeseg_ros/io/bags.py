@@ -20,7 +20,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.bag_writer import BagWriter
 from rangeseg_ros.io.chunks import Lost
-from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.files import clear_abandoned, replacing
 from rangeseg_ros.io.recordings import (
     RecordingError,
     make_rosbags,
@@ -299,6 +299,7 @@ class DepthBagWriter:
     def __enter__(self) -> DepthBagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
+        clear_abandoned(self.path)
         with ExitStack() as stack:
             partial = stack.enter_context(replacing(self.path))
             self._writer = stack.enter_context(BagWriter(partial))

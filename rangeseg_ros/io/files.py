@@ -1,33 +1,105 @@
-"""Files that are whole or not there, and the order of their names."""
+"""Files that are whole or not there, what may be replaced, and the order of names."""
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+
+class NotReplacedError(OSError):
+    """Something that is there already, and is not to be replaced."""
+
+    def __init__(self, path: Path, reason: str = 'exists already, not overwritten') -> None:
+        super().__init__(f'{path}: {reason}')
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary place for a file or folder of the name of `path`.
 
-    On success it is moved to `path`; after an exception or an interruption nothing is left.
+    On success it is moved to `path`, or to what that links to; after an exception or an
+    interruption nothing is left. A file keeps its mode, and its other names where it has several.
+
+    Raises
+    ------
+    NotReplacedError
+        `path` is a device, a pipe or the like.
     """
+    path = path.resolve() if path.is_symlink() else path
+    check_regular(path)
     folder = path.with_name(f'.{os.getpid()}.{path.name}')
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with temporary_folder(folder):
         yield folder / path.name
+        if path.is_file():
+            shutil.copymode(path, folder / path.name)
+            if path.stat().st_nlink > 1:
+                path.write_bytes((folder / path.name).read_bytes())
+                return
         os.replace(folder / path.name, path)
+
+
+def check_regular(path: Path) -> None:
+    """Raise NotReplacedError for devices, pipes and the like."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise NotReplacedError(path, 'not a regular file')
+
+
+@contextmanager
+def temporary_folder(folder: Path) -> Iterator[None]:
+    """Make a folder that is gone in the end; while it is there, `abandoned` knows that it is used.
+
+    Raises
+    ------
+    FileExistsError
+        Another process uses a folder of this name.
+    """
+    if abandoned(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(mode=0o700, parents=True)
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
     finally:
+        os.close(lock)
         try:
             shutil.rmtree(folder, ignore_errors=True)
         except KeyboardInterrupt:
             # It may come just here.
             shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+def abandoned(folder: Path) -> bool:
+    """Whether this is a `temporary_folder` whose process was killed."""
+    try:
+        if not stat.S_ISDIR(folder.lstat().st_mode):
+            return False
+        lock = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    finally:
+        os.close(lock)
+    return True
+
+
+def clear_abandoned(path: Path) -> None:
+    """Remove the temporary folders that killed processes have left of `replacing(path)`."""
+    pattern = re.compile(rf'\.\d+\.{re.escape(path.name)}')
+    if path.parent.is_dir():
+        for folder in path.parent.iterdir():
+            if pattern.fullmatch(folder.name) and abandoned(folder):
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 def natural_order(path: Path) -> list[str | int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from base64 import b64encode
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,9 +32,17 @@ class Picture(NamedTuple):
 
 def write_page(path: Path, template: str, **values: Any) -> None:
     """Write the page of a template of this package, whole or not at all."""
+    values['kind'] = template.removesuffix('.html')
     text = _environment().get_template(template).render(values)
     with replacing(path) as partial:
         partial.write_text(text, encoding='utf-8')
+
+
+def page_kind(path: Path) -> str:
+    """Which of the pages of this package a file is: the name of its template, or ''."""
+    with path.open('rb') as file:
+        found = re.search(rb'<meta name="generator" content="rangeseg (\w+)">', file.read(500))
+    return found[1].decode() if found else ''
 
 
 def spread(pictures: Sequence[Picture]) -> list[Picture]:
@@ -86,8 +95,10 @@ def _svg(text: str) -> str:
 
 
 def _jpeg(path: Path) -> str:
-    bgr = np.asarray(cv2.imread(str(path)), np.uint8)
-    return as_jpeg(bgr[..., ::-1])
+    bgr = cv2.imread(str(path))
+    if bgr is None:  # somebody has removed it meanwhile
+        bgr = np.zeros((1, 1, 3), np.uint8)
+    return as_jpeg(np.asarray(bgr, np.uint8)[..., ::-1])
 
 
 def as_jpeg(picture: NDArray[np.uint8]) -> str:

@@ -18,6 +18,10 @@ TOLERANCE = 1.5
 """Distance of the polygon from the outline at most, pixels: what segmentation leaves open."""
 
 
+# Of the largest component of a plane's theta; a ray whose inverse range is less grazes the plane.
+_GRAZING = 1e-3
+
+
 @dataclass(frozen=True, eq=False)
 class Outline:
     """Border of a region, put on its plane when first asked for.
@@ -55,6 +59,16 @@ class Outline:
         """Hull and holes of each part: of the largest one."""
         return [[self.hull, *self.holes]]
 
+    def exists(self) -> bool:
+        """Whether there is a polygon: steep planes may lie behind the sensor at their border."""
+        if isinstance(self.rays, Camera) and self.rays.pinhole:
+            # All of the box lies ahead where its corners do.
+            height, width = self.mask.shape
+            box = np.array([(x, y) for x in (0, width) for y in (0, height)])
+            if self._ahead(self._rays(box)).all():
+                return True
+        return len(self.hull) > 2 and bool(np.isfinite(self.hull).all())
+
     @cached_property
     def _rings(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
         # A pixel covers its four corners. On this lattice, contours run along the sides of the
@@ -77,12 +91,16 @@ class Outline:
         # Contours run counter-clockwise on the screen, x right and y down, and so does the
         # sensor see them.
         corners = cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0]
+        if len(corners) < 3:  # of regions no wider than the tolerance nothing would be left
+            corners = contour[:, 0]
         rays = self._rays(corners)
-        level = rays @ self.theta
-        # Grazing planes end in the distance.
-        ahead = level > 1e-3 * np.abs(self.theta).max()
-        points: NDArray[np.float64] = rays[ahead] / level[ahead, None]
+        ahead = self._ahead(rays)
+        points: NDArray[np.float64] = rays[ahead] / (rays[ahead] @ self.theta)[:, None]
         return points
+
+    def _ahead(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Where rays (N, 3) meet the plane: grazing planes end in the distance."""
+        return rays @ self.theta > _GRAZING * np.abs(self.theta).max()
 
     def _rays(self, corners: NDArray[Any]) -> NDArray[np.float64]:
         """Rays (N, 3) of corners (x, y) of pixels in the box."""

@@ -111,7 +111,8 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     Parameters
     ----------
     labels : (H, W) uint16
-        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
+        1...M, 0 for no plane; labels whose pixels determine no plane, or one without a finite
+        outline, are left out.
     image : RangeImage
         (H, W).
     fits : Fits
@@ -132,6 +133,7 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     surface = common_surfaces(fits)
     jacobian = plane_jacobians(normal, distance)
     covariance = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
+    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2  # rounding
 
     inliers = np.maximum(sums[:, COUNT], 1)
     centroid = sums[:, POINT:SCATTER] / inliers[:, None]
@@ -147,14 +149,24 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
 
     area, major = areas_and_axes(labels, image, theta, _tangents(normal))
     axes = np.stack([major, np.cross(normal, major)], axis=1)
-    limits = rectangles(labels, image, theta, axes)[found]
+    limits = rectangles(labels, image, theta, axes)
+    boxes = fits.boxes()
+    outlines = {k: _outline(k, labels, image, boxes[k], theta[k]) for k in found.tolist()}
+    # Steep planes may have pixels whose rays do not meet them.
+    finite = (
+        np.isfinite(limits).all(axis=(1, 2)) & np.isfinite(area) & np.isfinite(centroid).all(1)
+    )
+    shown = [outline.exists() for outline in outlines.values()]
+    found = found[finite[found] & np.array(shown)]
+    if not len(found):
+        return []
+    limits = limits[found]
     extents = limits[..., 1] - limits[..., 0]
     centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes[found])
     centre -= distance[found, None] * normal[found]
     frames = np.stack([axes[found, 0], axes[found, 1], normal[found]], axis=2)
     orientation = Rotation.from_matrix(frames).as_quat()
     orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
-    boxes = fits.boxes()
     return [
         Plane(
             label=int(k),
@@ -171,7 +183,7 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
             extents=extents[index],
             centre=centre[index],
             orientation=orientation[index],
-            outline=_outline(int(k), labels, image, boxes[k], theta[k]),
+            outline=outlines[int(k)],
         )
         for index, k in enumerate(found)
     ]

@@ -1,0 +1,224 @@
+"""What is there already: kept, replaced when that is said, repaired when it is our own."""
+
+import json
+import os
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recordings import depth_images
+from replays import record_walls, results
+
+from rangeseg_ros import Camera
+from rangeseg_ros.batch.result_folder import MARK
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.files import NotReplacedError, clear_abandoned, replacing
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.report.page import page_kind
+
+
+def write(path, text='new'):
+    with replacing(path) as partial:
+        partial.write_text(text)
+
+
+def test_links_are_followed(tmp_path):
+    (tmp_path / 'there').write_text('old')
+    (tmp_path / 'there').chmod(0o640)
+    (tmp_path / 'soft').symlink_to('there')
+    (tmp_path / 'hard').hardlink_to(tmp_path / 'there')
+    (tmp_path / 'dangling').symlink_to('elsewhere')
+    write(tmp_path / 'soft', 'one')
+    assert (tmp_path / 'hard').read_text() == 'one' and (tmp_path / 'soft').is_symlink()
+    assert stat.S_IMODE((tmp_path / 'there').stat().st_mode) == 0o640
+    write(tmp_path / 'dangling', 'two')
+    assert (tmp_path / 'elsewhere').read_text() == 'two'
+
+
+def test_pipes_and_devices_stay(tmp_path):
+    os.mkfifo(tmp_path / 'pipe')
+    for path in (tmp_path / 'pipe', Path('/dev/null')):
+        mode = path.stat().st_mode
+        with pytest.raises(NotReplacedError, match='not a regular file'):
+            write(path)
+        assert path.stat().st_mode == mode
+    assert [path.name for path in tmp_path.iterdir()] == ['pipe']
+
+
+def test_folders_of_killed_processes_are_cleared_and_those_in_use_are_not(tmp_path):
+    program = (
+        'import os, sys; from pathlib import Path; from rangeseg_ros.io.files import replacing\n'
+        'with replacing(Path(sys.argv[1])) as partial: os.kill(os.getpid(), 9)'
+    )
+    subprocess.run([sys.executable, '-c', program, tmp_path / 'bag'], check=False)
+    (left,) = tmp_path.iterdir()
+    with replacing(tmp_path / 'bag') as partial:
+        partial.write_text('')
+        clear_abandoned(tmp_path / 'bag')
+        assert not left.exists() and partial.exists()
+
+
+@pytest.fixture
+def images(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    for name in ('a', 'a_labels'):
+        write_image(tmp_path / f'{name}.png', depth_images(1)[0])
+    return tmp_path
+
+
+def test_segment_replaces_no_input_and_nothing_without_being_told(images, run):
+    segment = ('segment', '--camera', 'camera.yaml', '--output')
+    before = (images / 'a_labels.png').read_bytes()
+    for more in ((), ('--overwrite',)):
+        code, _, error = run(*segment, '.', 'a.png', 'a_labels.png', *more)
+        assert code == 2 and 'a_labels.png: is an input' in error and error.count('\n') == 1
+    assert (images / 'a_labels.png').read_bytes() == before
+    assert run(*segment, 'out', 'a.png')[0] == 0
+    (images / 'out/a_planes.csv').write_text('mine')
+    code, _, error = run(*segment, 'out', 'a.png')
+    assert code == 2 and 'exists already' in error
+    assert (images / 'out/a_planes.csv').read_text() == 'mine'
+    assert run(*segment, 'out', 'a.png', '--overwrite')[0] == 0
+    assert (images / 'out/a_planes.csv').read_text() != 'mine'
+
+
+def test_figures_replace_figures_alone(images, run):
+    compare = ('compare', 'a.png', 'a.png', '--json')
+    before = (images / 'a_labels.png').read_bytes()
+    code, _, error = run(*compare, 'a_labels.png')
+    assert code == 2 and 'exists already' in error
+    assert (images / 'a_labels.png').read_bytes() == before
+    code, _, error = run(*compare, 'nowhere/x.json')
+    assert code == 2 and 'no such folder' in error and not (images / 'nowhere').exists()
+    os.mkfifo('pipe')
+    assert run(*compare, 'pipe')[0] == 2 and Path('pipe').is_fifo()
+    for _ in range(2):
+        assert run(*compare, 'x.json')[0] == 0
+    assert json.loads(Path('x.json').read_text())['images'] == 1
+
+
+@pytest.fixture
+def walls(tmp_path):
+    record_walls(tmp_path / 'walls', 3)
+    return tmp_path / 'walls', tmp_path / 'out'
+
+
+@pytest.mark.parametrize('name', ['report.html', 'planes.csv', '000000_1.000000000_labels.png'])
+def test_replay_leaves_what_no_replay_has_written(walls, run, name):
+    recording, out = walls
+    out.mkdir()
+    (out / name).write_text('mine')
+    code, _, error = run('replay', recording, '--output', out)
+    assert code == 2 and f'{name}: exists already' in error and error.count('\n') == 1
+    assert [path.name for path in out.iterdir()] == [name]
+    assert run('replay', recording, '--output', out, '--overwrite')[0] == 0
+    assert (out / 'bag').exists() and not (out / MARK).exists()
+
+
+def test_replay_leaves_the_overview_of_somebody_else(walls, run):
+    recording, out = walls
+    shutil.copytree(recording, recording.with_name('more'))
+    arguments = ('replay', recording, recording.with_name('more'), '--output', out, '--jobs', 1)
+    out.mkdir()
+    (out / 'index.html').write_text('mine')
+    assert run(*arguments)[0] == 2 and [path.name for path in out.iterdir()] == ['index.html']
+    (out / 'index.html').unlink()
+    for _ in range(2):
+        assert run(*arguments)[0] == 0
+    assert page_kind(out / 'index.html') == 'overview'
+
+
+def test_results_that_are_gone_or_changed_are_made_again(walls, run):
+    recording, out = walls
+    run('replay', recording, '--output', out)
+    expected = results(out)
+    for spoil in (
+        lambda: next(out.glob('*_labels.png')).unlink(),
+        lambda: (out / 'planes.csv').write_text('frame'),
+        lambda: next(out.glob('bag/*.mcap')).write_bytes(b''),
+        lambda: next(out.glob('bag/*.mcap')).unlink(),
+    ):
+        spoil()
+        code, output, _ = run('replay', recording, '--output', out)
+        assert code == 0 and 'done before' not in output
+        assert results(out) == expected
+    assert 'done before' in run('replay', recording, '--output', out)[1]
+
+
+def test_a_recording_in_its_own_folder_is_found_done(walls, run):
+    recording, _ = walls
+    assert run('replay', recording, '--output', recording)[0] == 0
+    assert 'done before' in run('replay', recording, '--output', recording)[1]
+
+
+def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
+    recording, out = walls
+    out.mkdir()
+    shutil.move(recording, out / 'bag')
+    for more in ((), ('--overwrite',)):
+        code, _, error = run('replay', out / 'bag', '--output', out, *more)
+        assert code == 2 and 'it is the recording' in error
+    assert list((out / 'bag').glob('*.mcap'))
+
+
+KILLED = """
+import os, shutil, sys
+from rangeseg_ros.cli.main import main
+rmtree = shutil.rmtree
+def killed(path, *rest, **more):
+    if str(path).endswith('.bag'):
+        os.remove(path / 'metadata.yaml')
+        os.kill(os.getpid(), 9)
+    rmtree(path, *rest, **more)
+shutil.rmtree = killed
+sys.argv[0] = 'rangeseg'
+main()
+"""
+
+
+def test_a_kill_while_old_results_are_cleared_is_repaired(walls, run):
+    recording, out = walls
+    run('replay', recording, '--output', out)
+    expected = results(out)
+    options = ('replay', recording, '--output', out)
+    (out.parent / 'other.yaml').write_text('min_pixels: 50')
+    command = [sys.executable, '-c', KILLED, *options, '--params', out.parent / 'other.yaml']
+    assert subprocess.run(command, check=False).returncode == -9
+    assert run(*options)[0] == 0
+    assert results(out) == expected
+
+
+def test_two_replays_do_not_write_into_one_folder(walls, run):
+    import fcntl
+
+    recording, out = walls
+    out.mkdir()
+    with (out / MARK).open('a') as mark:
+        fcntl.flock(mark, fcntl.LOCK_EX)
+        code, _, error = run('replay', recording, '--output', out)
+    assert code == 2 and 'another replay writes there' in error
+    assert run('replay', recording, '--output', out)[0] == 0
+
+
+def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run):
+    monkeypatch.chdir(tmp_path)
+    for name in ('set/a/b', 'set/a_b', 'set/c'):
+        folder = tmp_path / name
+        write_image(folder / 'depth.png', np.full((48, 64), 1000, np.uint16))
+        write_image(folder / 'truth.png', np.ones((48, 64), np.uint16))
+        (folder / 'camera.txt').write_text('50 50 31.5 23.5')
+    evaluate = ('evaluate', 'set', '--json', 'x.json', '--output', 'out', '--jobs', 1)
+    for _ in range(2):
+        assert run(*evaluate)[0] == 0
+    figures = json.loads(Path('x.json').read_text())
+    assert figures['images'] == 3 and len(figures['per_image']) == 3
+    assert len(list(Path('out').glob('*_labels.png'))) == 3
+    Path('out/report.html').write_text('mine')
+    code, _, error = run(*evaluate)
+    assert code == 2 and 'exists already' in error
+    assert run(*evaluate, '--overwrite')[0] == 0
