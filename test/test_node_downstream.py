@@ -244,7 +244,7 @@ def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
     # Who asks for no accelerometer gets none.
     planes, _ = planes_of(bench, room(bench.camera))
     assert planes['floor']['distance'] == level
-    assert "/imu is in frame 'imu_link'" in bench.log()
+    assert 'up imu in imu_link' in bench.log()
 
 
 def test_acceleration_is_smoothed_by_the_time_constant():

@@ -6,24 +6,28 @@ from collections import Counter
 from pathlib import Path
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.mapping.placement import Placement, placed
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.messages.frames import DepthFrame
 
 
 class Locator:
-    """Where the camera was at each frame of a recording, in the fixed frame.
+    """What tf told of the camera at each frame of a recording.
 
     Attributes
     ----------
     problems : Counter
-        Why that is not known -> number of frames.
+        Which frame of the parameters is not known, and why -> number of images.
+    last : Placement
+        Of the last frame.
     """
 
     def __init__(self, recording: Path, config: Config) -> None:
-        self._fixed = config.fixed_frame
+        self._config = config
         self._recorded = RecordedTransforms(recording, config.tf_timeout)
         self.problems: Counter[str] = Counter()
+        self.last = Placement()
 
     def __enter__(self) -> Locator:
         return self
@@ -31,12 +35,12 @@ class Locator:
     def __exit__(self, *exception: object) -> None:
         self._recorded.close()
 
-    def pose(self, frame: DepthFrame) -> Transform | None:
-        """Fixed frame from the frame of the image; None where it is not known."""
-        if not self._fixed:
-            return None
-        try:
-            return self._recorded.lookup(self._fixed, frame.frame_id, frame.stamp, frame.time)
-        except TransformError as error:
-            self.problems[error.reason] += 1
-            return None
+    def place(self, frame: DepthFrame) -> Placement:
+        """Where the camera was."""
+
+        def lookup(target: str, source: str) -> Transform:
+            return self._recorded.lookup(target, source, frame.stamp, frame.time)
+
+        self.last = found = placed(self._config, frame.frame_id, lookup)
+        self.problems.update(f'{what} {why}' for what, why in found.missing.items())
+        return found

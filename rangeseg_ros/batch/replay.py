@@ -14,7 +14,7 @@ from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_re
 from rangeseg_ros.batch.result_folder import PICTURES, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -53,7 +53,7 @@ class Outcome:
     mapped : int
         Number of planes in the map.
     unlocated : dict
-        Why frames do not count for the map -> number of these frames.
+        Which frame of tf was not known, and why -> number of images.
     """
 
     frames: int
@@ -135,14 +135,16 @@ class Replay:
             located = stack.enter_context(Locator(self.recording, self.config))
 
             def results() -> Iterator[Timed]:
-                found = segmented(source, sequence, located.pose, progress)
+                found = segmented(source, sequence, located.place, progress)
                 for index, frame, image, result in found:
                     stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                     stem = f'{index:06d}_{stamp}'
                     files = write_frame(self.folder, stem, image, result, PICTURES)
                     table.write(result.planes, index, stamp)
                     report.add(frame.stamp, result, files['overlay'])
-                    yield from bag.messages(frame, image, result)
+                    motion = located.last.target
+                    target = (self.config.target_frame, motion) if motion else None
+                    yield from bag.messages(frame, image, result, target)
 
             streams = [results()]
             if self.copy:
@@ -194,10 +196,10 @@ class Replay:
 def segmented(
     source: DepthBag,
     sequence: SequenceSegmenter,
-    pose: Callable[[DepthFrame], Transform | None] = lambda frame: None,
+    place: Callable[[DepthFrame], Placement] = lambda frame: Placement(),
     progress: Progress | None = None,
 ) -> Iterator[tuple[int, DepthFrame, RangeImage, Segmentation]]:
-    """Segment the frames of a recording, with persistent ids and roles; `pose` locates them.
+    """Segment the frames of a recording, with persistent ids and roles; `place` locates them.
 
     Yields their numbers among the frames of the recording, of which those that cannot be read are
     left out and counted by `source.lost`.
@@ -213,7 +215,8 @@ def segmented(
                 source.lose(str(error))
                 continue
             image = corrected(image, sequence.config)
-            result = sequence.segment(image, frame.stamp, pose=pose(frame))
+            at = place(frame)
+            result = sequence.segment(image, frame.stamp, at.up, at.pose)
             yield done + source.lost.total(), frame, image, result
             done += 1
     except DamagedBagError as error:

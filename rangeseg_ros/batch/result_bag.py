@@ -14,6 +14,7 @@ import yaml
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.typesys import Stores
 
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_writer import BagWriter
@@ -21,7 +22,7 @@ from rangeseg_ros.io.bags import BagError
 from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.recordings import Recording, make_rosbags, message_types
 from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.outputs import OUTPUTS
+from rangeseg_ros.messages.outputs import IN_TARGET, OUTPUTS, in_target
 
 NAMESPACE = '/segment_planes'
 """Name of the node that publishes the topics."""
@@ -77,14 +78,24 @@ class ResultBag:
         self._writer.set_custom_data(_KEY, json.dumps(facts, sort_keys=True))
 
     def messages(
-        self, frame: DepthFrame, image: RangeImage, result: Segmentation
+        self,
+        frame: DepthFrame,
+        image: RangeImage,
+        result: Segmentation,
+        target: tuple[str, Transform] | None = None,
     ) -> Iterator[Timed]:
-        """What is published of `result`, at the time of the frame's recording."""
+        """What is published of `result`, at the time of the frame's recording.
+
+        `target` is the frame of planes and markers, and the motion to it.
+        """
         sec, nanosec = divmod(frame.stamp, 10**9)
         stamp = make_rosbags('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
         header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id=frame.frame_id)
+        here = header, result
+        there = in_target(make_rosbags, header, result, *target) if target else here
         for name, connection in self._topics.items():
-            message = OUTPUTS[name].message(make_rosbags, header, image, result)
+            head, shown = there if name in IN_TARGET else here
+            message = OUTPUTS[name].message(make_rosbags, head, image, shown)
             data = self._store.serialize_cdr(message, connection.msgtype)
             yield frame.time, connection, bytes(data)
 

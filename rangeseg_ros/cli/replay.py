@@ -164,7 +164,7 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
     for reason, count in outcome.reasons.items():
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():
-        click.echo(f'{count} frames not in the map: {problem}')
+        click.echo(f'{count} frames without the {problem}')
     mapped = f', {outcome.mapped} planes in the map' if task.config.fixed_frame else ''
     already = ', done before' if outcome.found_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')

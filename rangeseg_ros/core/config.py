@@ -239,6 +239,15 @@ class Config:
         'frame in which planes stay put, like odom or map: the map of planes is in it, and ids '
         'follow the motion that tf tells; without a name there is no map',
     )
+    gravity_frame: str = option(
+        '',
+        'frame whose z is up and whose z = 0 is the ground, like base_footprint: tf then tells up '
+        'and the height of the camera, before the accelerometer and up_x, up_y, up_z',
+    )
+    target_frame: str = option(
+        '',
+        'frame of ~/planes and ~/markers, like base_link; without a name, that of the images',
+    )
     tf_timeout: float = option(
         0.1, 'seconds that an image waits for its transforms', low=0.0, high=60.0
     )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.placement import moved_planes
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
 from rangeseg_ros.core.meaning.ground import Terrain
@@ -119,3 +122,20 @@ OUTPUTS = {
     'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': Output('visualization_msgs/msg/MarkerArray', _outline),
 }
+
+IN_TARGET = frozenset({'planes', 'markers'})
+"""Outputs in the target frame, where there is one; the others belong to the sensor's pixels."""
+
+MAP_OUTPUTS: dict[str, tuple[str, Callable[[Make, Any, Sequence[Plane]], Any]]] = {
+    'map': ('sensor_msgs/msg/PointCloud2', planes_message),
+    'map_markers': ('visualization_msgs/msg/MarkerArray', markers_message),
+}
+"""Topics of the map of planes: their types and how messages are made, in the fixed frame."""
+
+
+def in_target(
+    make: Make, header: Any, result: Segmentation, frame: str, motion: Transform
+) -> tuple[Any, Segmentation]:
+    """Header and result of the outputs `IN_TARGET`, in the frame that `motion` leads to."""
+    there = make('std_msgs/msg/Header', stamp=header.stamp, frame_id=frame)
+    return there, replace(result, planes=moved_planes(result.planes, motion))

@@ -98,6 +98,10 @@ class FrameStatistics:
         What is being done with parameters that are not in use yet; empty when all are.
     problem : str
         Why the last frame could not be segmented; empty when it could.
+    sources : dict of str
+        What up, fixed frame, target frame and map of the last frame come from.
+    missing : str
+        Which frames of the parameters were not known for the last frame, and why.
     planes : int
         Number of planes in the last frame.
     reason : str
@@ -114,6 +118,8 @@ class FrameStatistics:
         self.activity, self.publishing = Activity(), Activity()
         self.pending = ''
         self.problem = ''
+        self.sources: dict[str, str] = {}
+        self.missing = ''
         self.planes = 0
         self.reason = ''
         self.times: FrameTimes | None = None
@@ -158,6 +164,7 @@ class FrameStatistics:
             'camera_info': source.pairing if source else '',
             'doing': self.doing() or 'waiting for a frame',
             'parameters': self.pending or 'in use',
+            **{f'{what} from': source for what, source in self.sources.items()},
             'planes': str(self.planes),
             'reason for no planes': self.reason,
         }
@@ -205,6 +212,8 @@ class FrameStatistics:
             return DiagnosticStatus.WARN, self.compiling
         if lost:
             return DiagnosticStatus.WARN, lost
+        if self.missing:
+            return DiagnosticStatus.WARN, self.missing
         if self.published.total and not self.planes:
             return DiagnosticStatus.WARN, f'no planes: {self.reason}'
         return DiagnosticStatus.OK, f'{self.planes} planes at {self.published.rate():.1f} Hz'

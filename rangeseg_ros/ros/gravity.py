@@ -53,24 +53,17 @@ class Gravity:
         self._reading: Reading | None = None
         self._subscription = MatchedSubscription(node, Imu, IMU_TOPIC, self._on_imu)
 
-    def up(self, frame: str) -> NDArray[np.float64] | None:
-        """Upward vector (3,) in that frame; None when no measurement is in it."""
-        reading, topic = self._reading, self._subscription.topic
-        # Each with a line of its own, as that is what the logger throttles by.
+    @property
+    def reading(self) -> tuple[str, NDArray[np.float64]] | None:
+        """Frame of the accelerometer and the upward vector (3,) in it; None before the first."""
+        reading = self._reading
         if reading is None:
             self._node.get_logger().warning(
-                f'{topic}: no acceleration of rest yet, up is that of the parameters',
+                f'{self._subscription.topic}: no acceleration of rest yet',
                 throttle_duration_sec=5.0,
             )
             return None
-        if reading.frame != frame:
-            self._node.get_logger().warning(
-                f'{topic} is in frame {reading.frame!r}, not in {frame!r} like the images: '
-                'ignored, up is that of the parameters; imu_transformer (imu_pipeline) turns it',
-                throttle_duration_sec=5.0,
-            )
-            return None
-        return reading.acceleration
+        return reading.frame, reading.acceleration
 
     def follow_publishers(self) -> None:
         """Keep the quality of service at what the publishers offer."""

@@ -10,7 +10,6 @@ from typing import NoReturn
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.exceptions import (
@@ -19,21 +18,25 @@ from rclpy.exceptions import (
     ParameterException,
 )
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.messages.make import message_class
-from rangeseg_ros.messages.outputs import OUTPUTS
+from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.arguments import check_arguments, check_parameters
 from rangeseg_ros.ros.depth_input import DepthInput, input_topics
 from rangeseg_ros.ros.diagnostics import FrameStatistics
-from rangeseg_ros.ros.gravity import IMU_TOPIC, Gravity
+from rangeseg_ros.ros.gravity import IMU_TOPIC
 from rangeseg_ros.ros.parameters import bind
 from rangeseg_ros.ros.pipeline import Pipeline
 from rangeseg_ros.ros.settings import Settings
 
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
+
+
+# Parameters that decide what the node subscribes to.
+_SUBSCRIBED_FOR = ('input', 'raw', 'use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
 
 
 class SegmentPlanes(Node):
@@ -49,7 +52,6 @@ class SegmentPlanes(Node):
         config = bind(self, lambda config: self._settings.want(config))
         self._config = config
         self._input: DepthInput | None = None
-        self._gravity: Gravity | None = None
         self._statistics = FrameStatistics()
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
         overriding = QoSOverridingOptions.with_default_policies()
@@ -63,6 +65,18 @@ class SegmentPlanes(Node):
             )
             for name, output in OUTPUTS.items()
         }
+        # A map is for whoever comes, whenever that is.
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._maps = {
+            name: self.create_publisher(
+                message_class(kind),
+                f'~/{name}',
+                latched,
+                event_callbacks=events,
+                qos_overriding_options=overriding,
+            )
+            for name, (kind, _) in MAP_OUTPUTS.items()
+        }
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -71,7 +85,7 @@ class SegmentPlanes(Node):
         self._changed = self.create_guard_condition(self._configure)
         self._settings = Settings(config, self._on_compiling, self._changed.trigger)
         self._pipeline = Pipeline(
-            self, self._outputs, self._settings, self._statistics, self._up_in
+            self, self._outputs, self._settings, self._statistics, self._maps
         )
         self.get_logger().info(self._waits_for())
 
@@ -94,39 +108,34 @@ class SegmentPlanes(Node):
             self.get_logger().info('kernels are compiled')
         self._statistics.compiling = progress
 
-    def _up_in(self, frame: str) -> NDArray | None:
-        gravity = self._gravity
-        return gravity.up(frame) if gravity else None
-
     def _configure(self) -> None:
         """Follow the configuration that has come into use."""
         before, config = self._config, self._settings.in_use()
         if config is None:
             return
         self._config = config
-        restart = any(
-            getattr(config, name) != getattr(before, name) for name in ('input', 'raw', 'use_imu')
-        )
+        restart = any(getattr(config, name) != getattr(before, name) for name in _SUBSCRIBED_FOR)
         if restart and self._input:
             self._unsubscribe()
             self._follow_demand()
 
     def _follow_demand(self) -> None:
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
-        listeners = sum(output.get_subscription_count() for output in self._outputs.values())
+        publishers = [*self._outputs.values(), *self._maps.values()]
+        listeners = sum(publisher.get_subscription_count() for publisher in publishers)
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses
             self._input = DepthInput(self, config.input, config.raw, self._pipeline.put, losses)
-            self._gravity = Gravity(self) if self._config.use_imu else None
+            self._pipeline.locator.subscribe(config)
             self._statistics.problem = ''
         elif not listeners and self._input:
             self._unsubscribe()
 
     def _unsubscribe(self) -> None:
-        for subscribed in (self._input, self._gravity):
-            if subscribed:
-                subscribed.destroy()
-        self._input = self._gravity = None
+        if self._input:
+            self._input.destroy()
+        self._pipeline.locator.unsubscribe()
+        self._input = None
 
     def _look_around(self) -> None:
         """Once a second: follow the publishers, report."""
@@ -134,8 +143,7 @@ class SegmentPlanes(Node):
             self._input.follow_publishers()
             if lost := self._statistics.lost(self._input):
                 self.get_logger().warning(f'{lost} (said once; see /diagnostics)', once=True)
-        if self._gravity:
-            self._gravity.follow_publishers()
+        self._pipeline.locator.follow_publishers()
         if self._settings.pending:
             self._statistics.pending = 'in preparation, those before serve'
         else:

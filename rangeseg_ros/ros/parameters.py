@@ -35,8 +35,8 @@ class NodeConfig(Config):
     )
     use_imu: bool = option(
         False,
-        'take up from the accelerometer on the topic imu, once there is one in the frame of the '
-        'images, instead of up_x, up_y, up_z; not turned by tf, imu_transformer does that',
+        'take up from the accelerometer on the topic imu, in the frame of the images or one that '
+        'tf leads from, where gravity_frame does not tell, instead of up_x, up_y, up_z',
     )
     stall_timeout: float = option(
         2.0,

@@ -4,25 +4,32 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from itertools import pairwise
 from threading import Thread
 from typing import Any, NamedTuple
 
-from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from rangeseg_ros.core.mapping.placement import Placement
+from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.distortion import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy
-from rangeseg_ros.messages.outputs import OUTPUTS
+from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
-from rangeseg_ros.ros.latest import HandOver, Latest
+from rangeseg_ros.ros.latest import HandOver
+from rangeseg_ros.ros.locator import Locator
 from rangeseg_ros.ros.settings import Settings
+from rangeseg_ros.ros.waiting import WaitingRoom
+
+_MAP_INTERVAL = 1.0
+"""Seconds between messages of the map: it changes with every frame, and is not for control."""
 
 
 class Result(NamedTuple):
@@ -33,6 +40,8 @@ class Result(NamedTuple):
     segmentation: Segmentation
     start: int
     ticks: list[float]
+    target: tuple[str, Transform] | None = None
+    map: list[MapPlane] | None = None
 
 
 class Pipeline:
@@ -41,12 +50,15 @@ class Pipeline:
     Parameters
     ----------
     node : rclpy.node.Node
-    publishers : mapping
-        By the names of `OUTPUTS`; what nobody subscribes to is not made.
+    publishers, map_publishers : mapping
+        By the names of `OUTPUTS` and `MAP_OUTPUTS`; what nobody subscribes to is not made.
     settings : Settings
     statistics : FrameStatistics
-    up : callable
-        Upward vector in a frame of that name, or None.
+
+    Attributes
+    ----------
+    locator : Locator
+        Tells where the camera is.
     """
 
     def __init__(
@@ -55,14 +67,16 @@ class Pipeline:
         publishers: Mapping[str, Publisher],
         settings: Settings,
         statistics: FrameStatistics,
-        up: Callable[[str], NDArray | None],
+        map_publishers: Mapping[str, Publisher],
     ) -> None:
         self._node = node
         self._publishers = publishers
         self._settings = settings
         self._statistics = statistics
-        self._up = up
-        self._frames: Latest[DepthFrame] = Latest()
+        self._map_publishers = map_publishers
+        self._map_time = 0.0
+        self._frames: WaitingRoom[DepthFrame] = WaitingRoom(self._delay)
+        self.locator = Locator(node, self._frames.look_again)
         # Every result is published: the segmentation waits rather than replace one.
         self._results: HandOver[Result] = HandOver()
         self._threads = [
@@ -74,7 +88,10 @@ class Pipeline:
 
     def put(self, frame: DepthFrame) -> None:
         """Take a frame in place of one that waits."""
-        self._statistics.accepted(replaced=self._frames.put(frame))
+        dropped = self._frames.put(frame)
+        self._statistics.accepted(replaced=dropped > 0)
+        if dropped > 1:
+            self._statistics.dropped.add(dropped - 1)
 
     def stop(self, patience: float) -> bool:
         """Let the frame in hand be finished; False when it takes more seconds than that."""
@@ -89,7 +106,10 @@ class Pipeline:
         if (config := self._settings.in_use()) is None:
             return
         sequence = SequenceSegmenter(config)
-        while frame := self._frames.take():
+        while taken := self._frames.take():
+            frame, dropped = taken
+            if dropped:
+                self._statistics.dropped.add(dropped)
             # Here and not where parameters change, so that one frame is of one configuration.
             if (config := self._settings.in_use()) is None:
                 return
@@ -116,10 +136,38 @@ class Pipeline:
         image = corrected(frame.range_image(), sequence.config)
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
-        found = sequence.segment(image, frame.stamp, self._up(frame.frame_id))
+        at = self.locator.place(sequence.config, frame)
+        found = sequence.segment(image, frame.stamp, at.up, at.pose)
+        self._tell(sequence, at)
         ticks.append(time.perf_counter())
         doing()
-        return Result(frame, image, found, start, ticks)
+        target = (sequence.config.target_frame, at.target) if at.target else None
+        planes = self._map_to_send(sequence)
+        return Result(frame, image, found, start, ticks, target, planes)
+
+    def _delay(self, frame: DepthFrame, waited: float) -> float:
+        return self.locator.delay(self._settings.wanted, frame, waited)
+
+    def _tell(self, sequence: SequenceSegmenter, at: Placement) -> None:
+        """Report where up and the frames come from."""
+        statistics, config = self._statistics, sequence.config
+        statistics.sources = dict(at.sources)
+        statistics.missing = '; '.join(f'{what} {why}' for what, why in at.missing.items())
+        if config.fixed_frame:
+            count = len(sequence.map)
+            statistics.sources['map'] = f'{count} planes in {config.fixed_frame}'
+        if statistics.missing:
+            self._node.get_logger().warning(statistics.missing, throttle_duration_sec=5.0)
+
+    def _map_to_send(self, sequence: SequenceSegmenter) -> list[MapPlane] | None:
+        """The planes of the map, once a second while somebody listens."""
+        config = sequence.config
+        listeners = sum(p.get_subscription_count() for p in self._map_publishers.values())
+        now = time.monotonic()
+        if not config.fixed_frame or not listeners or now - self._map_time < _MAP_INTERVAL:
+            return None
+        self._map_time = now
+        return sequence.map.planes
 
     def _publish_all(self) -> None:
         while result := self._results.take():
@@ -129,13 +177,19 @@ class Pipeline:
                 self._fail(error)
 
     def _publish(self, result: Result) -> None:
-        frame, image, found, start, ticks = result
+        frame, image, found, start, ticks = result[:5]
         doing = self._statistics.publishing.now
+        here = frame.message.header, found
+        there = in_target(make_rclpy, *here, *result.target) if result.target else here
         for name, output in OUTPUTS.items():
             publisher = self._publishers[name]
             if publisher.get_subscription_count():
                 doing(f'publishing {name}')
-                publisher.publish(output.message(make_rclpy, frame.message.header, image, found))
+                header, shown = there if name in IN_TARGET else here
+                publisher.publish(output.message(make_rclpy, header, image, shown))
+        if result.map is not None:
+            doing('publishing the map')
+            self._publish_map(result.map, frame.message.header.stamp)
         doing()
         times = [*ticks, time.perf_counter()]
         conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(times))
@@ -151,6 +205,12 @@ class Pipeline:
         statistics.planes = len(found.planes)
         statistics.reason = found.reason
         statistics.answered(statistics.published)
+
+    def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:
+        fixed = self._settings.wanted.fixed_frame
+        header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id=fixed)
+        for name, (_, message) in MAP_OUTPUTS.items():
+            self._map_publishers[name].publish(message(make_rclpy, header, planes))
 
     def _refuse(self, problem: str) -> None:
         self._statistics.problem = problem
