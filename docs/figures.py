@@ -16,17 +16,13 @@ from matplotlib.figure import Figure
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes import method
-from rangeseg_ros.core.by_planes.blocks import (
-    block_links,
-    block_moments,
-    block_size,
-    residual_noise,
-    slopes_and_residuals,
-    weighted,
-)
+from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.patches import patches
 from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, surfaces
-from rangeseg_ros.core.regions import plane_regions
+from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
+from rangeseg_ros.core.regions import least_pixels, plane_regions
+from rangeseg_ros.core.sensing.blocks import Blocks, quads
+from rangeseg_ros.core.sensing.bridges import bridged
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -86,33 +82,38 @@ def settings(name):
 def stages(image, config):
     """Pictures (H, W, 3) of what each stage has found, in their order."""
     pictures = {'depth': in_grey(image)}
-    jumps = jump_edges(image, config)
-    grid = weights(image, jumps, config.weighting)
+    fine = Blocks.of(image)
+    stated = SensorModel.from_config(config)
+    sensor = measured_sensor(image, fine, stated)
+    steps, slopes = jump_steps(fine, sensor)
+    bridges = bridged(image, steps, slopes)
+    jumps = jump_edges(bridges, config.jump_edges, steps, slopes)
+    grid = weights(bridges, jumps, config.weighting)
     pictures['edges'] = with_edges(image, jumps)
 
-    size = block_size(image.shape)
-    blocks = block_moments(image.inverse, image.rays, grid, size)
-    slope, residual = slopes_and_residuals(blocks, image.rays, size)
-    stated = SensorModel.from_config(config)
-    noise = residual_noise(blocks, residual, size)
-    sensor = stated.measured(*noise)
-    pictures['noise'] = noise_chart(*noise, stated, sensor)
-    whole = blocks[..., COUNT] > 0
+    size, least = block_size(image.shape), least_pixels(config.min_pixels, image.shape)
+    blocks = fine if size == 4 else Blocks.planes(quads(fine.moments), image.rays, size)
+    whole = whole_blocks(bridges.inverse, grid, size)
+    count = np.maximum(blocks.moments[..., COUNT] - 3, 1)[whole]
+    shown = np.sqrt(blocks.squared[whole]), blocks.residual[whole] / count
+    pictures['noise'] = noise_chart(*shown, stated, sensor)
     pictures['blocks'] = over(image, whole.astype(np.intp), size)
 
-    moments = weighted(blocks, sensor, slope)
+    moments = weighted(blocks, whole, sensor)
     links = block_links(grid, size)
-    roots = patches(0, len(moments), moments, *links, _PATCH_LARGEST * size**2)
+    roots = patches(0, len(moments), moments, *links, _PATCH_LARGEST)
     patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
     alone = np.bincount(patch.ravel())[patch] == 1
     pictures['patches'] = over(image, np.where(alone, 0, patch), size)
-    surface, _ = surfaces(moments, links, size, config.min_pixels // 2)
+    surface, _ = surfaces(moments, links, size, least // 2)
     pictures['surfaces'] = over(image, surface, size)
 
-    labelling = method.segment(image, grid, config, lambda stage: None)
+    labelling = method.segment(
+        bridges, image.inverse, fine, grid, sensor, config, lambda stage: None
+    )
     labels = labelling.labels
     pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
-    regions = labelling.flat(plane_regions(labels, labels > 0, grid, config))
+    regions = labelling.flat(plane_regions(labels, labels > 0, grid, config.noise_regions, least))
     pictures['regions'] = overlay(image.inverse, regions)
     result = Segmenter(config).segment(image)
     pictures['planes'] = overlay(image.inverse, result.labels, result.planes)

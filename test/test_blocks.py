@@ -3,14 +3,9 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import (
-    block_links,
-    block_moments,
-    residual_noise,
-    slopes_and_residuals,
-    weighted,
-)
+from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.blocks import Blocks, block_moments
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -31,19 +26,20 @@ def grid(height, width, seed=0):
 
 def test_blocks_are_sums_over_their_pixels():
     inverse, rays, edges = grid(12, 14)
-    blocks = block_moments(inverse, rays, edges, 4)
+    blocks = block_moments(inverse, rays, 4)
     assert blocks.shape == (3, 4, SIZE)
     part = slice(4, 8), slice(8, 12)
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
     expected = [*(own.T @ own)[np.triu_indices(3)], *own.T @ y, y @ y, 16, 0, 0]
     np.testing.assert_allclose(blocks[1, 2], expected, rtol=1e-12)
     assert (blocks[:, :3, COUNT] == 16).all()
-    assert not blocks[:, 3].any(), 'half a block at the border'
+    assert (blocks[:, 3, COUNT] == 8).all(), 'half a block at the border'
+    assert not whole_blocks(inverse, edges, 4)[:, 3].any()
 
 
 def test_blocks_that_jumps_cross_are_left_out():
     """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
-    inverse, rays, edges = grid(12, 20)
+    inverse, _, edges = grid(12, 20)
     horizontal, vertical = edges
     horizontal[1, 1] = 0  # inside block (0, 0)
     vertical[6, 9] = 0  # inside block (1, 2)
@@ -52,21 +48,17 @@ def test_blocks_that_jumps_cross_are_left_out():
     inverse[1, 17] = 0
     horizontal[1, 16:18] = 0
     vertical[0:2, 17] = 0
-    count = block_moments(inverse, rays, edges, 4)[..., COUNT]
-    expected = np.full((3, 5), 16)
-    expected[0, 0] = expected[1, 2] = 0
-    expected[0, 4] = 15
-    np.testing.assert_array_equal(count, expected)
+    expected = np.ones((3, 5), bool)
+    expected[0, 0] = expected[1, 2] = False
+    np.testing.assert_array_equal(whole_blocks(inverse, edges, 4), expected)
 
 
 @pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
 def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
     """30 % of 16 pixels are 4.8."""
-    inverse, rays, edges = grid(4, 4)
+    inverse, _, edges = grid(4, 4)
     inverse.ravel()[:missing] = 0
-    block = block_moments(inverse, rays, edges, 4)[0, 0]
-    assert block[COUNT] == (16 - missing if kept else 0)
-    assert block.any() == kept
+    assert whole_blocks(inverse, edges, 4)[0, 0] == kept
 
 
 @pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
@@ -84,40 +76,27 @@ def test_blocks_touch_along_half_of_their_border(shape):
         assert below[i, j] == (vertical[4 * i + 3, 4 * j : 4 * j + 4].sum() >= 2)
 
 
-def noise_of(blocks, rays):
-    _, residual = slopes_and_residuals(blocks, rays, 4)
-    return residual_noise(blocks, residual, 4)
-
-
 def test_slopes_and_residuals_are_those_of_the_planes():
     random = np.random.default_rng(5)
-    inverse, rays, edges = grid(40, 60)
-    blocks = block_moments(inverse, rays, edges, 4)
-    slope, residual = slopes_and_residuals(blocks, rays, 4)
+    inverse, rays, _ = grid(40, 60)
+    blocks = Blocks.planes(block_moments(inverse, rays, 4), rays, 4)
     i, j = random.integers(0, (10, 15))
     part = slice(4 * i, 4 * i + 4), slice(4 * j, 4 * j + 4)
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
     theta, square, _, _ = np.linalg.lstsq(own, y, rcond=None)
-    assert residual[i, j] == pytest.approx(square[0], rel=1e-6)
-    # Rays are 1/50 apart.
-    assert slope[i, j] == pytest.approx(np.hypot(*theta[:2]) / 50, rel=1e-4)
-
-
-def test_residual_noise_is_unbiased():
-    inverse, rays, edges = grid(200, 240, seed=3)
-    inverse[0, 0] = 0  # an incomplete block does not count
-    at, variance = noise_of(block_moments(inverse, rays, edges, 4), rays)
-    assert len(at) == len(variance) == 50 * 60 - 1
-    # 3000 blocks of 13 degrees of freedom: 0.7 % of standard error.
-    assert variance.mean() == pytest.approx(0.002**2, rel=0.03)
-    assert at.mean() == pytest.approx(inverse.mean(), rel=1e-3)
+    assert blocks.residual[i, j] == pytest.approx(square[0], rel=1e-6)
+    assert blocks.squared[i, j] == pytest.approx((y**2).mean(), rel=1e-6)
+    # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
+    expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
+    assert blocks.slope[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
 
 
 def test_weights_count_in_variances_of_the_sensor():
-    inverse, rays, edges = grid(80, 80, seed=4)
+    inverse, rays, _ = grid(80, 80, seed=4)
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
-    plain = block_moments(inverse, rays, edges, 4)
-    blocks = weighted(plain, sensor, np.zeros(plain.shape[:2]))
+    plain = block_moments(inverse, rays, 4)
+    facing = Blocks.planes(plain, rays, 4)._replace(slope=np.zeros(plain.shape[:2]))
+    blocks = weighted(facing, np.ones(plain.shape[:2], bool), sensor)
     theta, residual = fit_all(blocks.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.reshape(-1, SIZE))
     np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)

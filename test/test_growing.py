@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import block_links, block_moments, weighted
+from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
@@ -29,10 +30,11 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     """Surfaces of the blocks of an image with white noise, and their moments."""
     inverse = inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    edges = weights(image, plane_deviation(image, Config().edge_step))
+    edges = weights(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(**sensor))
-    blocks = block_moments(image.inverse, image.rays, edges, 4)
-    blocks = weighted(blocks, model, np.zeros(blocks.shape[:2]))
+    blocks = Blocks.of(image)
+    blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
+    blocks = weighted(blocks, whole_blocks(image.inverse, edges, 4), model)
     return surfaces(blocks, block_links(edges, 4), 4, least)
 
 

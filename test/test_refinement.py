@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
-from rangeseg_ros.core.by_planes.blocks import block_links, block_moments, weighted
+from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -224,8 +225,9 @@ def small_room(seed=900):
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config())
     edges = weights(image)
-    blocks = block_moments(image.inverse, image.rays, edges, BLOCK)
-    blocks = weighted(blocks, sensor, np.zeros(blocks.shape[:2]))
+    blocks = Blocks.of(image)
+    blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
+    blocks = weighted(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
     found = surfaces(blocks, block_links(edges, BLOCK), BLOCK)
     return Problem.of(image, sensor, edges, BLOCK), found, sensor
 

@@ -5,7 +5,6 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.regions import (
     connected_components,
     is_noise,
@@ -90,8 +89,8 @@ def test_noise_regions_are_left_marked_or_merged(noise_regions, line, speck):
     labels = np.zeros((40, 40), int)
     labels[:, 20] = 5
     labels[10, 10] = 5
-    config = Config(noise_regions=noise_regions, min_pixels=30)
-    found = plane_regions(labels, np.ones((40, 40), bool), uncut((40, 40)), config)
+    everywhere = np.ones((40, 40), bool)
+    found = plane_regions(labels, everywhere, uncut((40, 40)), noise_regions, 30)
     assert found[20, 5] == 1
     assert found[20, 35] in (1, 2)
     assert (found[20, 20] > 0) == (line > 0)
@@ -103,7 +102,6 @@ def test_small_regions_and_shadow_are_no_plane():
     labels[:5, :5] = 1
     valid = np.ones((20, 20), bool)
     valid[:, 15:] = False
-    config = Config(min_pixels=26, noise_regions='leave')
-    found = plane_regions(labels, valid, uncut((20, 20)), config)
+    found = plane_regions(labels, valid, uncut((20, 20)), 'leave', 26)
     assert not found[:5, :5].any() and not found[:, 15:].any()
     assert (found[5:, :15] == 1).all()

@@ -19,7 +19,9 @@ from rangeseg_ros.simulation.scenes import kinect_room
 
 NORMALS = Config(method='normals')
 # Without noise neither a wide baseline nor much smoothing is called for.
-NOISE_FREE = replace(NORMALS, normal_baseline=1, smoothness=20.0, noise_regions='leave')
+NOISE_FREE = replace(
+    NORMALS, normal_baseline=1, smoothness=20.0, noise_regions='leave', edge_step=0.0065
+)
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
@@ -116,7 +118,7 @@ def test_frames_without_a_plane_say_why(depth, method):
 @pytest.mark.parametrize('shape', [(1, 1), (1, 50), (50, 1), (2, 2), (7, 9)])
 def test_tiny_images(shape, method):
     camera = Camera(shape[1], shape[0], 50.0, 50.0, 0.0, 0.0)
-    result = segment(np.full(shape, 1500, np.uint16), Config(method=method), camera)
+    result = segment(np.full(shape, 1500, np.uint16), Config(method=method, min_pixels=64), camera)
     assert result.planes == [] and result.labels.shape == shape
     assert result.reason
 

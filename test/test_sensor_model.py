@@ -1,93 +1,172 @@
-"""The sensor's noise, as stated and as an image shows it."""
+"""The sensor model measured in simulated images whose errors are known."""
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
 
-from rangeseg_ros.core.by_planes.blocks import block_moments, residual_noise, slopes_and_residuals
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    correlated_residuals,
+    random_variance,
+    systematic_variance,
+)
+from rangeseg_ros.simulation.kinect import smooth_field
 
-CAMERA = Camera(320, 240, 290.0, 290.0, 159.5, 119.5)
-STATED = SensorModel.from_config(Config(noise=1e-5, range_noise=0.0))
+CAMERA = Camera(640, 480, 580.0, 580.0, 319.5, 239.5)
+STATED = SensorModel.from_config(Config())
 
 
-def shown(noise, range_noise, outliers=0.0, seed=0):
-    """What an image of three planes, 0.5 to 5 m away, shows of white noise."""
-    random = np.random.default_rng(seed)
+def three_planes():
+    """Inverse range of planes 0.5 to 5 m away."""
     inverse = CAMERA.rays @ np.array([0.1, 0.05, 1.2])
-    inverse[80:] = CAMERA.rays[80:] @ np.array([0.05, -0.1, 0.7])
-    inverse[160:] = CAMERA.rays[160:] @ np.array([0.02, 0.02, 0.25])
-    sigma = np.hypot(noise, range_noise * inverse**2)
-    inverse = inverse + sigma * random.normal(size=CAMERA.shape)
-    inverse[random.random(CAMERA.shape) < outliers] += 0.05
+    inverse[160:] = CAMERA.rays[160:] @ np.array([0.05, -0.1, 0.7])
+    inverse[320:] = CAMERA.rays[320:] @ np.array([0.02, 0.02, 0.25])
+    return inverse
+
+
+def sensor_of(inverse, prior=STATED):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    blocks = block_moments(image.inverse, image.rays, weights(image), 4)
-    _, residual = slopes_and_residuals(blocks, image.rays, 4)
-    return residual_noise(blocks, residual, 4)
+    return measured_sensor(image, Blocks.of(image), prior)
 
 
 def test_variance_is_the_sum_of_both_kinds():
     sensor = STATED._replace(noise=0.003, range_noise=0.001, distortion=0.002)
-    inverse = np.array([0.2, 1.0, 3.0])
+    squared = np.array([0.2, 1.0, 3.0]) ** 2
     np.testing.assert_allclose(
-        random_variance(sensor, inverse**2), 9e-6 + 1e-6 * inverse**4, rtol=1e-5
+        random_variance(sensor, squared), 9e-6 + 1e-6 * squared**2, rtol=1e-5
     )
     sensor = sensor._replace(range_distortion=0.005)
     np.testing.assert_allclose(
-        systematic_variance(sensor, inverse**2), 4e-6 + 25e-6 * inverse**4, rtol=1e-5
+        systematic_variance(sensor, squared), 4e-6 + 25e-6 * squared**2, rtol=1e-5
     )
 
 
-@pytest.mark.parametrize('noise', [0.0005, 0.003])
-@pytest.mark.parametrize('outliers', [0.0, 0.005])
-def test_white_noise_of_the_inverse_range_is_recovered(noise, outliers):
-    """Within 10 %, also where 8 % of the blocks hold an outlier."""
-    sensor = STATED.measured(*shown(noise, 0.0, outliers))
-    for inverse in (0.25, 0.7, 1.2):
-        assert np.sqrt(random_variance(sensor, inverse**2)) == pytest.approx(noise, rel=0.1)
+@pytest.mark.parametrize('noise', [0.0002, 0.003])
+@pytest.mark.parametrize('holes', [0.0, 0.3])
+def test_white_noise_is_measured_up_and_down(noise, holes):
+    """Far below what is known beforehand as well as above it, and with holes."""
+    random = np.random.default_rng(1)
+    inverse = three_planes() + random.normal(0, noise, CAMERA.shape)
+    inverse[random.random(CAMERA.shape) < holes] = 0
+    sensor = sensor_of(inverse)
+    assert sensor.noise == pytest.approx(noise, rel=0.15)
+    assert sensor.range_noise == 0
+    assert sensor.white > 0.7
+    assert sensor.distortion < 0.6 * noise
 
 
-def test_white_noise_of_the_range_is_recovered():
-    sensor = STATED.measured(*shown(0.0, 0.004))
-    for inverse in (0.25, 0.7, 1.2):
-        assert np.sqrt(random_variance(sensor, inverse**2)) == pytest.approx(
-            0.004 * inverse**2, rel=0.15
-        )
+def test_noise_of_the_range_is_told_from_that_of_its_inverse():
+    random = np.random.default_rng(2)
+    inverse = three_planes()
+    sensor = sensor_of(inverse + 0.004 * inverse**2 * random.normal(size=CAMERA.shape))
+    assert sensor.range_noise == pytest.approx(0.004, rel=0.15)
+    assert sensor.noise <= 1e-4
 
 
-def test_a_clean_image_leaves_the_stated_noise():
-    stated = SensorModel.from_config(Config())
-    sensor = stated.measured(*shown(1e-5, 0.0))
-    inverse = np.array([0.25, 0.7, 1.2])
-    np.testing.assert_allclose(
-        random_variance(sensor, inverse**2), random_variance(stated, inverse**2), rtol=1e-6
-    )
+def test_clutter_and_outliers_change_little():
+    random = np.random.default_rng(3)
+    inverse = three_planes() + random.normal(0, 0.002, CAMERA.shape)
+    inverse[random.random(CAMERA.shape) < 0.005] += 0.05
+    inverse[100:240, 200:420] += random.normal(0, 0.05, (140, 220))
+    assert sensor_of(inverse).noise == pytest.approx(0.002, rel=0.15)
 
 
-def test_few_blocks_say_nothing():
-    inverse, residual = shown(0.01, 0.0)
-    assert STATED.measured(inverse[:10], residual[:10]) == STATED
-    assert STATED.measured(inverse[:0], residual[:0]) == STATED
+@pytest.mark.parametrize('width', [1.0, 2.0, 4.0])
+def test_correlated_noise_is_told_with_its_length(width):
+    random = np.random.default_rng(4)
+    field = smooth_field(CAMERA.shape, (width, width), random)
+    sensor = sensor_of(three_planes() + 0.002 * field)
+    assert sensor.noise == pytest.approx(0.002, rel=0.2)
+    assert sensor.correlation == pytest.approx(width, rel=0.45)
+    assert sensor.white < 0.2
 
 
-@given(
-    arrays(np.float64, 100, elements=st.floats(1e-3, 1e3)),
-    arrays(np.float64, 100, elements=st.floats(0, 1e3)),
-    st.floats(0, 0.1),
-    st.floats(0, 0.1),
-)
-def test_never_below_the_stated(inverse, residual, noise, range_noise):
-    stated = STATED._replace(noise=noise, range_noise=range_noise)
-    sensor = stated.measured(inverse, residual)
-    assert sensor.noise >= noise and sensor.range_noise >= range_noise
-    assert np.isfinite(random_variance(sensor, inverse**2)).all()
-    assert sensor == stated._replace(noise=sensor.noise, range_noise=sensor.range_noise)
+@pytest.mark.parametrize('bend', [0.002, 0.006])
+def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
+    """Not its overall size, but what it moves parts of planes by, to within half."""
+    random = np.random.default_rng(5)
+    field = smooth_field(CAMERA.shape, (12.0, 12.0), random)
+    inverse = three_planes() + random.normal(0, 0.0005, CAMERA.shape)
+    sensor = sensor_of(inverse + bend * field)
+    assert 0.5 * bend < sensor.distortion < 1.5 * bend
+
+
+@pytest.mark.parametrize('step', [0.005, 0.02])
+def test_depth_rounded_to_steps_tells_the_step(step):
+    inverse = three_planes()
+    with np.errstate(divide='ignore'):
+        sensor = sensor_of(1 / (step * np.rint(1 / inverse / step)))
+    assert sensor.range_quantum == pytest.approx(step, rel=0.01)
+    assert sensor.quantum == 0
+    assert sensor.range_noise >= 0.99 * step / np.sqrt(12)
+
+
+def test_disparity_rounded_to_steps_tells_the_step():
+    random = np.random.default_rng(6)
+    inverse = three_planes() + 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
+    sensor = sensor_of(0.0029 * np.rint(inverse / 0.0029))
+    assert sensor.quantum == pytest.approx(0.0029, rel=0.01)
+    assert sensor.range_quantum == 0
+
+
+def test_an_image_that_says_too_little_leaves_what_is_known():
+    inverse = np.zeros(CAMERA.shape)
+    assert sensor_of(inverse) == STATED
+    inverse[100:110, 100:110] = 0.5
+    assert sensor_of(inverse) == STATED
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.floats(0, 1), st.sampled_from([1e-6, 1.0, 1e5]))
+def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
+    random = np.random.default_rng(seed)
+    inverse = scale * random.random((60, 80))
+    inverse[random.random(inverse.shape) < holes] = 0
+    camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
+    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    blocks = Blocks.of(image)
+    sensor = measured_sensor(image, blocks, STATED)
+    assert np.isfinite(sensor).all() and min(sensor) >= 0
+    assert sensor.white <= 1
+    steps, slopes = jump_steps(blocks, sensor)
+    assert np.isfinite(steps).all() and (steps > 0).all() and np.isfinite(slopes).all()
+
+
+def test_jumps_follow_the_noise():
+    """About 0.0065 1/m for a Kinect."""
+    random = np.random.default_rng(7)
+    image = RangeImage(CAMERA.rays, three_planes().astype(np.float32), CAMERA)
+    steps, _ = jump_steps(Blocks.of(image), STATED._replace(pixel_noise=0.0))
+    np.testing.assert_allclose(steps, 0.0065, rtol=0.05)
+    inverse = three_planes() + random.normal(0, 1e-5, CAMERA.shape)
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    blocks = Blocks.of(image)
+    steps, _ = jump_steps(blocks, measured_sensor(image, blocks, STATED))
+    assert np.median(steps) < 6e-4
+
+
+@pytest.mark.parametrize('width', [0.7, 2.0, 4.0])
+def test_what_blocks_leave_of_correlated_noise(width):
+    """Against fits to simulated fields."""
+    random = np.random.default_rng(8)
+    field = smooth_field((256, 256), (width, width), random)
+    rows, columns = np.indices((16, 16)).reshape(2, -1)
+    left = {}
+    for side in (4, 8, 16):
+        parts = field.reshape(256 // side, side, -1, side).transpose(0, 2, 1, 3)
+        parts = parts.reshape(-1, side * side)
+        rows, columns = np.indices((side, side)).reshape(2, -1)
+        basis, _ = np.linalg.qr(np.stack([np.ones(side**2), rows, columns], axis=1))
+        rest = parts - parts @ basis @ basis.T
+        left[side] = (rest**2).sum(axis=1).mean()
+    expected = left[4] / 13, left[8] / 61, left[16] / 253, (left[8] - 4 * left[4]) / 9
+    np.testing.assert_allclose(correlated_residuals(width), expected, rtol=0.15, atol=0.01)
 
 
 @pytest.mark.parametrize(('white', 'width'), [(1.0, 2.0), (0.33, 2.0), (0.0, 0.7), (0.5, 0.0)])

@@ -54,7 +54,7 @@ def mixed(found, front, valid):
 
 def flooded(image, config):
     """Numbers (H, W) of what the links connect, whatever the normals."""
-    grid = weights(image, jump_edges(image, config))
+    grid = weights(image, jump_edges(image, config.jump_edges, config.edge_step))
     height, width = image.shape
     canvas = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
     canvas[::2, ::2] = 1

@@ -85,9 +85,9 @@ class Config:
         choices=('plane', 'sobel', 'none'),
     )
     edge_step: float = option(
-        0.0065,
-        'jump_edges plane: smallest jump of the inverse range, 1/m; the default is 2.2 steps of '
-        'the disparity of a Kinect, 26 mm at 2 m',
+        0.0,
+        'jump_edges plane: smallest jump of the inverse range, 1/m; 0 follows the noise of the '
+        'sensor: about 0.0065 for a Kinect, 26 mm at 2 m',
         low=0.0,
         high=10.0,
     )
@@ -140,7 +140,10 @@ class Config:
         choices=('leave', 'identify', 'merge'),
     )
     min_pixels: int = option(
-        500, 'smallest region that makes a plane, pixels', low=1, high=100000000
+        0,
+        'smallest region that makes a plane, pixels; 0 follows the size of the image: 500 of VGA',
+        low=0,
+        high=100000000,
     )
     noise: float = option(
         0.0013,
@@ -187,6 +190,12 @@ class Config:
         'width of the Gaussian the distortion looks smoothed with, pixels',
         low=0.0,
         high=10000.0,
+    )
+    sensor_model: str = option(
+        'measured',
+        'errors of the sensor: measured in every image, where noise and distortion given here '
+        'hold as far as it says too little (measured), or as given (fixed)',
+        choices=('measured', 'fixed'),
     )
     dithering: float = option(
         0.0,

@@ -6,16 +6,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.threads import halves
 from rangeseg_ros.core.sensing.grid import Grid
+
+VGA = 640 * 480
+"""Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
+
+
+def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
+    """Pixels of the smallest plane: `min_pixels`, or for 0 what follows the size of the image.
+
+    500 of VGA are a face of 22 x 22 pixels, 2 degrees wide for most cameras.
+    """
+    return min_pixels or max(round(500 * shape[0] * shape[1] / VGA), 1)
 
 
 def plane_regions(
     labels: NDArray[np.integer],
     valid: NDArray[np.bool_],
     grid: Grid,
-    config: Config,
+    noise_regions: str,
+    min_pixels: int,
 ) -> NDArray[np.uint16]:
     """Segmentation of a labelling: its connected components that are large enough for planes.
 
@@ -25,8 +36,10 @@ def plane_regions(
     valid : (H, W) bool
         Pixels without measurement become no plane.
     grid : Grid
-    config : Config
-        `noise_regions` and `min_pixels` are read.
+    noise_regions : {'leave', 'identify', 'merge'}
+        What becomes of small and thin regions.
+    min_pixels : int
+        Smaller regions become no plane.
 
     Returns
     -------
@@ -35,14 +48,14 @@ def plane_regions(
     """
     regions = connected_components(labels, grid, valid)
     area, perimeter = _measures(regions)
-    if config.noise_regions != 'leave':
+    if noise_regions != 'leave':
         noise = _thin(area, perimeter)
-        if config.noise_regions == 'merge':
+        if noise_regions == 'merge':
             regions = merge(regions, noise)
             area = np.bincount(regions.ravel(), minlength=len(area))
         area = np.where(noise, 0, area)
     area[0] = 0
-    return translated(regions, by_falling_size(np.where(area < config.min_pixels, 0, area)))
+    return translated(regions, by_falling_size(np.where(area < min_pixels, 0, area)))
 
 
 def connected_components(

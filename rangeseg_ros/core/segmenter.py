@@ -15,15 +15,21 @@ from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, described
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.regions import plane_regions
+from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
+from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.bridges import bridged
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.jump_edges import GridEdges, jump_edges, pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
+
+STATED = SensorModel.from_config(Config())
+"""The sensor that the defaults describe."""
 
 
 class Labelling(Protocol):
@@ -64,6 +70,8 @@ class Segmentation:
         Milliseconds per stage, in the order of the stages.
     reason : str
         Why there is no plane; empty when there is one.
+    sensor : SensorModel
+        Errors of the sensor, as the image shows them.
     labelling : Labelling
         What the regions were made from.
     jumps : (horizontal, vertical) of bool or None
@@ -76,6 +84,7 @@ class Segmentation:
     planes: list[Plane]
     timings: dict[str, float]
     reason: str
+    sensor: SensorModel = STATED
     labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
     survey: Survey | Terrain | None = field(default=None, repr=False)
@@ -164,44 +173,77 @@ class Segmenter:
             )
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        jumps = jump_edges(image, config)
-        grid = weights(image, jumps, config.weighting)
+        blocks = Blocks.of(image)
+        sensor = SensorModel.from_config(config)
+        if config.sensor_model == 'measured':
+            sensor = measured_sensor(image, blocks, sensor)
+        watch.lap('noise')
+        steps, slopes = jump_steps(blocks, sensor)
+        if config.edge_step > 0:
+            steps = np.full_like(steps, config.edge_step)
+        # What was measured tells the planes; where they end is told with small holes bridged.
+        whole = bridged(image, steps, slopes)
+        jumps = jump_edges(whole, config.jump_edges, steps, slopes)
+        grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, fits, labelling = method(image, grid, watch)
-        planes = described(regions, image, fits)
+        regions, labelling = method(whole, image.inverse, blocks, grid, sensor, watch)
+        if config.method == 'planes':
+            regions, fits = by_planes.united(regions, image, sensor, grid)
+        else:
+            # Its labels know no noise: their regions spill by more than a precise sensor errs.
+            fits = Fits.of(regions, image, SensorModel.from_config(config))
+        planes = described(regions, whole, fits)
         if len(planes) < regions.max():
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
             kept = np.zeros(int(regions.max()) + 1, np.uint16)
             kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
             regions = kept[regions]
+        labels = np.where(image.valid, regions, np.uint16(0))
         watch.lap('planes')
         reason = _reason(image, planes)
-        survey = Survey.of(image, SensorModel.from_config(config), config)
-        return Segmentation(regions, planes, watch.laps, reason, labelling, jumps, survey)
+        survey = Survey.of(image, sensor, config)
+        laps = watch.laps
+        return Segmentation(labels, planes, laps, reason, sensor, labelling, jumps, survey)
 
     def _by_planes(
-        self, image: RangeImage, grid: Grid, watch: Stopwatch
-    ) -> tuple[NDArray[np.uint16], Fits, by_planes.Labelling]:
-        """Regions, their planes and the labelling they are made from, by planes as labels."""
-        labelling = by_planes.segment(image, grid, self.config, watch.lap)
+        self,
+        image: RangeImage,
+        measured: NDArray[np.float32],
+        blocks: Blocks,
+        grid: Grid,
+        sensor: SensorModel,
+        watch: Stopwatch,
+    ) -> tuple[NDArray[np.uint16], by_planes.Labelling]:
+        """Regions and the labelling they are made from, by planes as labels."""
+        config = self.config
+        least = least_pixels(config.min_pixels, image.shape)
+        labelling = by_planes.segment(image, measured, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
-        regions = labelling.flat(plane_regions(labels, labels > 0, grid, self.config))
+        regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
+        regions = labelling.flat(regions)
         watch.lap('regions')
-        return *by_planes.united(regions, image, labelling.sensor, grid), labelling
+        return regions, labelling
 
     def _by_normals(
-        self, image: RangeImage, grid: Grid, watch: Stopwatch
-    ) -> tuple[NDArray[np.uint16], Fits, by_normals.Labelling]:
+        self,
+        image: RangeImage,
+        measured: NDArray[np.float32],
+        blocks: Blocks,
+        grid: Grid,
+        sensor: SensorModel,
+        watch: Stopwatch,
+    ) -> tuple[NDArray[np.uint16], by_normals.Labelling]:
         """The same by discretised normals as labels."""
+        config = self.config
+        least = least_pixels(config.min_pixels, image.shape)
         before = self._labels_before(image)
-        labelling = by_normals.segment(image, grid, self.config, before, watch.lap)
-        if self.config.warm_start:
+        labelling = by_normals.segment(image, grid, config, before, watch.lap)
+        if config.warm_start:
             self._before = image.camera, labelling.labels
-        regions = plane_regions(labelling.labels, image.valid, grid, self.config)
+        regions = plane_regions(labelling.labels, image.valid, grid, config.noise_regions, least)
         watch.lap('regions')
-        fits = Fits.of(regions, image, SensorModel.from_config(self.config))
-        return regions, fits, labelling
+        return regions, labelling
 
     def _labels_before(self, image: RangeImage) -> NDArray[np.integer] | None:
         """Directions of the frame before, if it was taken like this one."""

@@ -54,7 +54,7 @@ def curved(
     rays = problem.rays.reshape(*shape, 3)[sparse]
     weight = problem.weight.reshape(shape)[sparse]
     moments = region_moments(regions, count, inverse, rays, weight, sensor)
-    models = Models.of(moments)
+    models = Models.of(moments, problem.enlarged)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
     parts = halves(
@@ -73,7 +73,7 @@ def curved(
     # What the quadratic explains more than its constant and linear terms do.
     whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
     bending = (whole - flat) / np.maximum(pixels, 1)
-    distortion = _SHARE * ratio * (size / _PIXELS) ** _EXPONENT
+    distortion = _SHARE * ratio * (size / (problem.enlarged * _PIXELS)) ** _EXPONENT
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
     noise = np.maximum((square - whole) / np.maximum(pixels, 1), 1)
     visible = bending > distortion + _NOISE * noise / size

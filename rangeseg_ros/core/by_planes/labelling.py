@@ -66,7 +66,7 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    starts, models = surfaces.astype(np.int32), Models.of(moments)
+    starts, models = surfaces.astype(np.int32), Models.of(moments, problem.enlarged)
     labels, cost = _descended(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains)
@@ -76,7 +76,10 @@ def refine(
         arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
         weight = problem.weight.reshape(shape)
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
-        refitted, better = Models.of(moments)._replace(price=models.price), labels.copy()
+        refitted, better = (
+            Models.of(moments, problem.enlarged)._replace(price=models.price),
+            labels.copy(),
+        )
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
         last, value = value, energy(better, problem, refitted)
         if value >= last - _STEP:

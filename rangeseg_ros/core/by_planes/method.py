@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import (
     block_links,
-    block_moments,
     block_size,
-    residual_noise,
-    slopes_and_residuals,
     weighted,
+    whole_blocks,
 )
 from rangeseg_ros.core.by_planes.curvature import curved
 from rangeseg_ros.core.by_planes.labelling import refine
@@ -22,9 +20,11 @@ from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.coplanar import parts, touching
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.regions import by_falling_size, translated, without
+from rangeseg_ros.core.regions import VGA, by_falling_size, least_pixels, translated, without
 from rangeseg_ros.core.runtime.threads import aside
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, block_moments, quads
 from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -65,33 +65,48 @@ class Labelling:
 
 
 def segment(
-    image: RangeImage, grid: Grid, config: Config, lap: Callable[[str], None]
+    image: RangeImage,
+    measured: NDArray[np.float32],
+    blocks: Blocks,
+    grid: Grid,
+    sensor: SensorModel,
+    config: Config,
+    lap: Callable[[str], None],
 ) -> Labelling:
     """Label every pixel with a plane.
 
     Parameters
     ----------
     image : RangeImage
-        (H, W).
+        (H, W), holes bridged.
+    measured : (H, W) float32
+        Inverse ranges without what was bridged.
+    blocks : Blocks
+        Of 4 x 4 pixels, without what was bridged.
     grid : Grid
         Of the image.
+    sensor : SensorModel
+        Errors of the image.
     config : Config
-        The sensor, `min_pixels`, `exact` and `refits` are read.
+        `min_pixels`, `exact` and `refits` are read.
     lap : callable
         Told the name of every stage that ends.
     """
     size = block_size(image.shape)
-    blocks = block_moments(image.inverse, image.rays, grid, size)
-    slope, residual = slopes_and_residuals(blocks, image.rays, size)
-    noise = residual_noise(blocks, residual, size)
-    sensor = SensorModel.from_config(config).measured(*noise)
+    if size == 2 * BLOCK:
+        blocks = Blocks.planes(quads(blocks.moments), image.rays, size)
+    elif size != BLOCK:
+        blocks = Blocks.planes(block_moments(measured, image.rays, size), image.rays, size)
+    # Of a block of holes, a quarter measured will do.
+    whole = whole_blocks(image.inverse, grid, size)
+    whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)
     lap('blocks')
     pending = aside(Problem.of, image, sensor, grid, size)
     # A region may gain as much again from pixels that no block could take.
-    least = config.min_pixels // 2 or 1
-    surface, moments = surfaces(
-        weighted(blocks, sensor, slope), block_links(grid, size), size, least
-    )
+    least = max(least_pixels(config.min_pixels, image.shape) // 2, 1)
+    enlarged = image.inverse.size / VGA
+    weights = weighted(blocks, whole, sensor)
+    surface, moments = surfaces(weights, block_links(grid, size), size, least, enlarged)
     problem = pending.result()
     lap('surfaces')
     labels, models = refine(problem, surface, moments, sensor, config.exact, config.refits)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
 from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
@@ -49,6 +50,8 @@ class Problem(NamedTuple):
         Columns of the image.
     block : int
         Rows and columns of the blocks that surfaces are grown from.
+    enlarged : float
+        Pixels of the image over those of VGA.
     """
 
     inverse: NDArray[np.float32]
@@ -57,6 +60,7 @@ class Problem(NamedTuple):
     links: NDArray[np.float32]
     width: int
     block: int
+    enlarged: float = 1.0
 
     @classmethod
     def of(
@@ -70,7 +74,8 @@ class Problem(NamedTuple):
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor)
         prior = link_costs(grid, _SMOOTHNESS * sensor.patch)
-        return cls(inverse, rays, weight, prior, image.shape[1], block)
+        enlarged = len(inverse) / VGA
+        return cls(inverse, rays, weight, prior, image.shape[1], block, enlarged)
 
 
 @njit(cache=True, nogil=True)
@@ -98,12 +103,12 @@ class Models(NamedTuple):
     price: NDArray[np.float64]
 
     @classmethod
-    def of(cls, moments: NDArray[np.float64]) -> Models:
-        """Planes of moment vectors (K + 1, 13)."""
+    def of(cls, moments: NDArray[np.float64], enlarged: float = 1.0) -> Models:
+        """Planes of moment vectors (K + 1, 13) in an image of so many times VGA's pixels."""
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
-        ratio = moments[:, RATIO] / (count + DISTORTION_PIXELS)
-        granted = 1 + moments[:, SLOPE] / count + _GRANTED * ratio
+        ratio = moments[:, RATIO] / (count + enlarged * DISTORTION_PIXELS)
+        granted = (1 + moments[:, SLOPE] / count) * (1 + _GRANTED * ratio)
         return cls(theta, 0.5 / granted)
 
 

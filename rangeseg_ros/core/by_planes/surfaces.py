@@ -27,12 +27,16 @@ DISTORTION_PIXELS = 2000.0
 # Systematic variances granted between neighbouring patches, and within a surface (4 standard
 # deviations).
 _BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
-# Blocks of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
-_PATCH_MINIMUM, _PATCH_LARGEST = 5, 94
+# Pixels of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
+_PATCH_MINIMUM, _PATCH_LARGEST = 80, 1504
 
 
 def surfaces(
-    moments: NDArray[np.float64], links: Links, block: int, least: int = 1
+    moments: NDArray[np.float64],
+    links: Links,
+    block: int,
+    least: int = 1,
+    enlarged: float = 1.0,
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
@@ -46,6 +50,8 @@ def surfaces(
         Rows and columns of a block.
     least : int
         Pixels of the smallest surface.
+    enlarged : float
+        Pixels of the image over those of VGA, which numbers of pixels are for.
 
     Returns
     -------
@@ -57,10 +63,14 @@ def surfaces(
     shape = moments.shape[:2]
     blocks = moments.reshape(-1, SIZE)
     # No patch reaches over the middle, but neither does any reach across a large surface.
-    roots = halves(patches, shape[0], moments, *links, _PATCH_LARGEST * block**2)
-    patch, moments = _renumbered(np.concatenate(roots), blocks, _PATCH_MINIMUM * block**2)
+    roots = halves(patches, shape[0], moments, *links, enlarged * _PATCH_LARGEST)
+    patch, moments = _renumbered(
+        np.concatenate(roots), blocks, max(enlarged * _PATCH_MINIMUM, 1.5 * block**2)
+    )
     border = _borders(patch.reshape(shape), *links, len(moments))
-    surface, moments = _renumbered(_join(moments, border, _BETWEEN_PATCHES), moments, least)
+    surface, moments = _renumbered(
+        _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, least
+    )
     return surface[patch].reshape(shape), moments
 
 
@@ -112,7 +122,7 @@ def _borders(
 
 @njit(cache=True)
 def _join(
-    moments: NDArray[np.float64], border: NDArray[np.float64], granted: float
+    moments: NDArray[np.float64], border: NDArray[np.float64], granted: float, enlarged: float
 ) -> NDArray[np.intp]:
     """Join patches 1...P to surfaces, those that agree best first; returns the roots.
 
@@ -145,7 +155,7 @@ def _join(
         chi2 = common_residual(moments[a], moments[b])
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
-        within = _WITHIN_SURFACE * pixels / (pixels + DISTORTION_PIXELS)
+        within = _WITHIN_SURFACE * pixels / (pixels + enlarged * DISTORTION_PIXELS)
         if misfit(extra, moments[a], moments[b], within) >= 1:
             continue
         parent[b] = a

@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.threads import aside, strips
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
@@ -17,18 +17,20 @@ GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 _WINDOW = 3
 # The farthest window that a boundary looks at.
 _MARGIN = 2 * _WINDOW - 1
-# A step between two pixels that needs no look at their surroundings, in units of `step`: steeper
-# than all but planes seen edge-on from centimetres away.
+# A step between two pixels that needs no look at their surroundings, in units of `step`
+# and of the slope: steeper than all but planes seen edge-on from centimetres away.
 _CLEAR = 5
 # Response of the Sobel operator of 3 x 3 to a step of one: 1 + 2 + 1.
 _SOBEL_GAIN = 4
 
 
-def jump_edges(image: RangeImage, config: Config) -> GridEdges | None:
-    """Jump edges by the method that `config` names."""
-    if config.jump_edges == 'plane':
-        return plane_deviation(image, config.edge_step)
-    if config.jump_edges == 'sobel':
+def jump_edges(
+    image: RangeImage, method: str, step: ArrayLike, slope: ArrayLike = 0.0
+) -> GridEdges | None:
+    """Jump edges by method `plane`, `sobel` or `none`; the first takes the smallest step."""
+    if method == 'plane':
+        return plane_deviation(image, step, slope)
+    if method == 'sobel':
         return sobel(image)
     return None
 
@@ -132,7 +134,7 @@ def _joins(pattern: int) -> bool:
 _JOINS = np.array([_joins(pattern) for pattern in range(256)])
 
 
-def plane_deviation(image: RangeImage, step: float) -> GridEdges:
+def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) -> GridEdges:
     """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
 
     In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
@@ -145,8 +147,10 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
     ----------
     image : RangeImage
         (H, W).
-    step : float
-        Deviation that makes a jump, 1/m.
+    step : float or (rows, columns) float
+        Deviation that makes a jump, 1/m, of all or of every block of 4 x 4 pixels.
+    slope : float or (rows, columns) float
+        Change of the inverse range from pixel to pixel on surfaces, 1/m.
 
     Returns
     -------
@@ -154,12 +158,15 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
         Never true beside a pixel that was not measured.
     """
     inverse = image.inverse
+    blocks = -(-image.shape[0] // BLOCK), -(-image.shape[1] // BLOCK)
+    limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
+    clear = _CLEAR * limits + 2 * np.asarray(slope, np.float32)
     mask = (inverse > 0).astype(np.float32)
     wide = aside(_window_sums, inverse, mask, 2 * _WINDOW + 1)
     mean = _means(*_window_sums(inverse, mask, _WINDOW))
     height, width = image.shape
     strong = np.zeros((height, width), np.bool_)
-    strips(_find_strong, height, mean, step, strong)
+    strips(_find_strong, height, mean, limits, strong)
     horizontal = np.zeros((height, width - 1), np.bool_)
     vertical = np.zeros((height - 1, width), np.bool_)
     strips(
@@ -168,8 +175,8 @@ def plane_deviation(image: RangeImage, step: float) -> GridEdges:
         inverse,
         strong,
         *wide.result(),
-        step,
-        _CLEAR * step,
+        limits,
+        clear,
         horizontal,
         vertical,
     )
@@ -200,7 +207,11 @@ def _means(total: NDArray[np.float32], count: NDArray[np.float32]) -> NDArray[np
 
 @njit(cache=True, nogil=True)
 def _find_strong(
-    first: int, after: int, mean: NDArray[np.float32], step: float, strong: NDArray[np.bool_]
+    first: int,
+    after: int,
+    mean: NDArray[np.float32],
+    step: NDArray[np.float32],
+    strong: NDArray[np.bool_],
 ) -> None:
     """Pixels at which the step to some neighbour leaves the steps beside it by more than `step`.
 
@@ -210,17 +221,20 @@ def _find_strong(
     height, width = strong.shape
     leaving = np.zeros(width, np.bool_)
     below = np.zeros(width, np.bool_)
+    limit = np.empty(width, np.float32)
     for i in range(first - 1, after):
+        for j in range(width):
+            limit[j] = step[max(i, 0) // BLOCK, j // BLOCK]
         # Boundaries with the next pixel: the windows around the last but one and so on.
         k = i + _MARGIN
         above, below = below, np.zeros(width, np.bool_)
         if 0 <= i < height - 1:
             columns = mean[:, _MARGIN : _MARGIN + width]
-            _leave(columns[k - 4], columns[k - 1], columns[k + 2], columns[k + 5], step, below)
+            _leave(columns[k - 4], columns[k - 1], columns[k + 2], columns[k + 5], limit, below)
         if i < first:
             continue
         row = mean[k, _MARGIN - 4 :]
-        _leave(row, row[3:], row[6:], row[9:], step, leaving[: width - 1])
+        _leave(row, row[3:], row[6:], row[9:], limit, leaving[: width - 1])
         for j in range(width):
             strong[i, j] = above[j] | below[j] | leaving[j]
         for j in range(1, width):
@@ -233,7 +247,7 @@ def _leave(
     b: NDArray[np.float32],
     c: NDArray[np.float32],
     d: NDArray[np.float32],
-    step: float,
+    step: NDArray[np.float32],
     result: NDArray[np.bool_],
 ) -> None:
     """Whether the steps from b to c lie outside those from a to b and from c to d so far.
@@ -241,8 +255,8 @@ def _leave(
     A side that was not measured (NaN) is left out.
     """
     # Without branches, so that the compiler takes many at a time.
-    limit = np.float32(step)
     for j in range(len(result)):
+        limit = step[j]
         here = c[j] - b[j]
         before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
         first, last = before != before, after != after
@@ -259,8 +273,8 @@ def _find_crossings(
     strong: NDArray[np.bool_],
     total: NDArray[np.float32],
     count: NDArray[np.float32],
-    step: float,
-    clear: float,
+    steps: NDArray[np.float32],
+    clear: NDArray[np.float32],
     horizontal: NDArray[np.bool_],
     vertical: NDArray[np.bool_],
 ) -> None:
@@ -277,13 +291,14 @@ def _find_crossings(
             if here == 0:
                 continue
             above = here * count[i, j] > total[i, j]
+            step, limit = steps[i // BLOCK, j // BLOCK], clear[i // BLOCK, j // BLOCK]
             if j + 1 < width and inverse[i, j + 1] > 0:
                 there = inverse[i, j + 1]
                 left = inverse[i, j - 1] if j > 0 else np.float32(0)
                 right = inverse[i, j + 2] if j + 2 < width else np.float32(0)
                 either, both = strong[i, j] | strong[i, j + 1], strong[i, j] & strong[i, j + 1]
                 horizontal[i, j] = (
-                    abs(here - there) > clear
+                    abs(here - there) > limit
                     or (both and above != (there * count[i, j + 1] > total[i, j + 1]))
                     or (either and _stands_out(left, here, there, right, step))
                 )
@@ -293,7 +308,7 @@ def _find_crossings(
                 lower = inverse[i + 2, j] if i + 2 < height else np.float32(0)
                 either, both = strong[i, j] | strong[i + 1, j], strong[i, j] & strong[i + 1, j]
                 vertical[i, j] = (
-                    abs(here - there) > clear
+                    abs(here - there) > limit
                     or (both and above != (there * count[i + 1, j] > total[i + 1, j]))
                     or (either and _stands_out(upper, here, there, lower, step))
                 )

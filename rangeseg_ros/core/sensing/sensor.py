@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from rangeseg_ros.core.config import Config
-
-_BINS = 8
-_PER_BIN = 20
-# Blocks enough to tell the noise by.
-_MOST = 4000
-# Most blocks lie on planes, but edges and curvature only ever add to the residuals.
-_QUANTILE = 0.4
 
 
 class SensorModel(NamedTuple):
@@ -44,6 +37,12 @@ class SensorModel(NamedTuple):
     pixel_noise : float
         Random error of a pixel's direction, pixels: what surfaces seen at a grazing angle are
         noisier by.
+    pixel_distortion : float
+        Smooth systematic error of a pixel's direction, pixels.
+    quantum : float
+        Step that the inverse range is rounded to, 1/m; 0 for none.
+    range_quantum : float
+        Step that the range is rounded to, metres.
     """
 
     noise: float
@@ -54,6 +53,9 @@ class SensorModel(NamedTuple):
     range_distortion: float
     distortion_length: float
     pixel_noise: float = 0.0
+    pixel_distortion: float = 0.0
+    quantum: float = 0.0
+    range_quantum: float = 0.0
 
     @classmethod
     def from_config(cls, config: Config) -> SensorModel:
@@ -80,33 +82,40 @@ class SensorModel(NamedTuple):
         alike = (1 - self.white) * np.exp(-np.array([1, 2]) / (4 * self.correlation**2))
         return float(1 + 2 * alike[0] + alike[1])
 
-    def measured(self, inverse: NDArray[np.float64], residual: NDArray[np.float64]) -> SensorModel:
-        """The model with the random error an image shows, never less than its own.
+    @property
+    def agreement(self) -> float:
+        """By how much the noise of neighbouring blocks of 4 pixels exceeds that of white noise."""
+        if self.correlation == 0:
+            return 1.0
+        return self.white + (1 - self.white) * correlated_residuals(self.correlation)[3]
 
-        Parameters
-        ----------
-        inverse : (N,) float64
-            Mean inverse range of small blocks, 1/m.
-        residual : (N,) float64
-            Mean square residual of a plane fitted to each block, unbiased, (1/m)^2.
-        """
-        sparse = slice(None, None, max(len(inverse) // _MOST, 1))
-        inverse, residual = inverse[sparse], residual[sparse]
-        bins = min(_BINS, len(inverse) // _PER_BIN)
-        if bins == 0:
-            return self
-        parts = np.array_split(np.argsort(inverse, kind='stable'), bins)
-        at = np.array([inverse[part[len(part) // 2]] for part in parts])
-        ranked = [np.sort(residual[part]) for part in parts]
-        shown = np.array([part[int(_QUANTILE * len(part))] for part in ranked])
-        variance = np.maximum(shown, random_variance(self, at**2))
-        # Relative errors count the same at every range.
-        terms = np.stack([np.ones(bins), at**4], axis=1) / variance[:, None]
-        (constant, quartic), _ = nnls(terms, np.ones(bins))
-        return self._replace(
-            noise=max(float(np.sqrt(constant)), self.noise),
-            range_noise=max(float(np.sqrt(quartic)), self.range_noise),
-        )
+
+@cache
+def correlated_residuals(width: float) -> tuple[float, float, float, float]:
+    """What planes through blocks leave of correlated noise of unit variance.
+
+    Parameters
+    ----------
+    width : float
+        Of the Gaussian kernel it looks smoothed with, pixels: two pixels d apart correlate by
+        exp(-d^2 / (4 width^2)).
+
+    Returns
+    -------
+    tuple of 4 float
+        Mean square residual, for each degree of freedom, within blocks of 4, 8 and 16 pixels; and
+        what one plane through four blocks of 4 pixels leaves beyond the planes of the four.
+    """
+    left = []
+    for side in (4, 8, 16):
+        line = np.arange(side)
+        field = np.exp(-((line[:, None] - line) ** 2) / (4 * width**2))
+        row, column = np.indices((side, side)).reshape(2, -1)
+        basis, _ = np.linalg.qr(np.stack([np.ones(side**2), row, column], axis=1))
+        covariance = np.kron(field, field)
+        left.append(np.trace(covariance) - np.trace(basis.T @ covariance @ basis))
+    four, eight, sixteen = (float(square) for square in left)
+    return four / 13, eight / 61, sixteen / 253, (eight - 4 * four) / 9
 
 
 # No sensor is without error: an exact (simulated) image has that of its float32 numbers.
