@@ -1,6 +1,7 @@
 """Draw the figures of the documents: python docs/figures.py [FOLDER], docs/ by default.
 
 docs/terrain.png, the picture in the README: depth, planes, and what they are to a robot.
+docs/normals.png: observed normals, jump edges, and the normals that both methods reconstruct.
 docs/figures/*.png, one picture for each stage of method `planes`: of a Kinect's frame of a room
 and, on the right, of a stereo camera's.
 """
@@ -15,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.by_planes import method
 from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.patches import patches
@@ -24,10 +26,10 @@ from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.sensing.blocks import Blocks, quads
 from rangeseg_ros.core.sensing.bridges import bridged
 from rangeseg_ros.core.sensing.grid import weights
-from rangeseg_ros.core.sensing.jump_edges import jump_edges
+from rangeseg_ros.core.sensing.jump_edges import jump_edges, pixels_beside
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
-from rangeseg_ros.drawing import colours, grey, overlay
+from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.simulation.render import simulate
@@ -37,6 +39,7 @@ from rangeseg_ros.simulation.terrain import simulate_terrain, stated, terrain_sc
 
 ROOT = Path(__file__).parents[1]
 WIDTH = 360
+METHODS = 'normals', 'planes'
 
 
 def main():
@@ -44,11 +47,24 @@ def main():
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
     robots = [terrain('hole', 2), terrain('stairs up', 2)]
     write_image(folder / 'terrain.png', np.vstack(robots))
+    write_image(folder / 'normals.png', normals(frame('kinect', 8, 1)))
     frames = [(frame('kinect', 8, 1), Config()), (frame('realsense', 3, 1), settings('realsense'))]
     both = [stages(*each) for each in frames]
     for name in both[0]:
         pair = [fitted(pictures[name]) for pictures in both]
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
+
+
+def normals(image):
+    """Observed normals and jump edges above, those of method normals and planes below."""
+    config = Config(method='normals')
+    jumps = jump_edges(image, config)
+    observed = observed_normals(image, weights(image, jumps), config)
+    edges = np.repeat(255 * pixels_beside(jumps).astype(np.uint8)[..., None], 3, axis=2)
+    found = [Segmenter(Config(method=name)).segment(image).normals for name in METHODS]
+    above = [normals_picture(observed), edges]
+    below = [normals_picture(one) for one in found]
+    return np.vstack([np.hstack([fitted(one) for one in row]) for row in (above, below)])
 
 
 def terrain(kind, seed):
