@@ -51,29 +51,46 @@ def test_room():
     assert roles(found, LEVEL) == ['floor', 'wall', 'wall', 'ceiling']
 
 
-def test_table_above_the_floor_whatever_the_order():
-    low, high = slice(95, 120), slice(65, 90)
-    floor = (high, slice(0, 80)), UP, 1.2
-    table = (low, slice(80, 160)), UP, 0.5
-    assert roles(planes(floor, table), LEVEL) == ['floor', 'table']
-    assert roles(planes(table, floor), LEVEL) == ['table', 'floor']
+def test_the_floor_is_the_surface_at_the_stated_height():
+    """Whatever reaches nearer, or lies lower: a table in front, the landing below a drop."""
+    near, far = slice(95, 120), slice(65, 90)
+    low, high = ((where, slice(0, 80)) for where in (far, near))
+    table, floor = (high, UP, 0.5), (low, UP, 1.2)
+    known = Config(sensor_height=1.21)
+    assert roles(planes(floor, table), known) == ['floor', 'table']
+    assert roles(planes(table, floor), known) == ['table', 'floor']
+    for depth in (0.15, 0.5):
+        own, landing = (high, UP, 1.2), (low, UP, 1.2 + depth)
+        assert roles(planes(own, landing), known) == ['floor', 'lower']
+        # Without a height, the surface that reaches nearest.
+        assert roles(planes(landing, own), LEVEL) == ['lower', 'floor']
+    assert roles(planes(table), known) == ['other']
 
 
-def test_parts_of_the_floor_and_what_lies_beneath_it():
+def test_parts_of_the_floor_steps_and_what_lies_beneath_it():
     scrap = slice(100, 106)
     found = planes(
-        ((slice(80, 95), slice(0, 160)), UP, 1.2),
-        ((scrap, slice(0, 10)), UP, 1.11),
-        ((scrap, slice(30, 40)), UP, 1.09),
-        ((scrap, slice(60, 70)), UP, 1.29),
-        ((scrap, slice(90, 100)), UP, 1.31),
+        ((slice(106, 120), slice(0, 160)), UP, 1.2),
+        *(
+            ((scrap, slice(30 * k, 30 * k + 10)), UP, height)
+            for k, height in enumerate((1.11, 1.09, 0.93, 1.29, 1.31))
+        ),
     )
     apart = [replace(plane, surface=plane.label) for plane in found]
     together = [replace(plane, surface=1) for plane in found]
     for found in (apart, together):
-        assert roles(found, LEVEL) == ['floor', 'floor', 'table', 'floor', 'other']
-    assert roles(found, Config(role_height=0.0905))[1:3] == ['floor', 'table']
-    assert roles(found, Config(role_height=0.12))[1:] == ['floor'] * 4
+        assert roles(found, LEVEL) == ['floor', 'floor', 'step', 'table', 'floor', 'lower']
+    assert roles(found, Config(role_height=0.0905))[1:3] == ['floor', 'step']
+    assert roles(found, Config(role_height=0.12))[1:3] == ['floor'] * 2
+
+
+def test_a_ramp_rises_from_the_floor():
+    steep, gentle = ((0, -np.cos(a), -np.sin(a)) for a in np.radians((14, 8)))
+    for normal, role in ((gentle, 'ramp'), (steep, 'other')):
+        # The ramp begins 5 m ahead: its plane passes through (0, 1.2, 5).
+        ramp, distance = (slice(65, 96), slice(0, 160)), -np.dot(normal, (0, 1.2, 5))
+        found = planes(((slice(97, 120), slice(0, 160)), UP, 1.2), (ramp, normal, distance))
+        assert roles(found, LEVEL) == ['floor', role]
 
 
 def test_small_planes_are_no_floor_wall_or_ceiling():

@@ -1,4 +1,4 @@
-"""What planes are to a robot: floor, ceiling, wall, table, by the direction that is up."""
+"""What planes are to a robot: floor, ramp, step, table, wall, by the direction that is up."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 
-ROLES = ('other', 'floor', 'ceiling', 'wall', 'table')
+ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
+STEP = 0.25
+"""Height of the highest step that people climb, metres."""
+LEVEL = 3.0
+"""Slope that is a ramp and no error of a plane, degrees."""
 
 
 class RolesError(ValueError):
@@ -25,24 +30,25 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     (facing down), vertical when it is within `role_tolerance` of a right angle to it. The size
     of a plane is that of its surface, so that all parts of a floor count together.
 
-    - floor: of the large surfaces facing up the one farthest below the sensor, and all that face
-      up and continue it within `role_height`
-    - table: other planes facing up, of any size, that lie above the floor
+    - floor: the large surface facing up at `sensor_height` below the sensor, within
+      `role_height`; without a height, the one that reaches nearest to below the sensor; and all
+      that face up and continue it within `role_height`
+    - ramp: planes that rise or fall from the floor, by no more than `ground_slope` against it
+    - step: other planes facing up that lie no more than a step, 0.25 m, above the floor
+    - table: planes facing up that lie higher
+    - lower: planes facing up that lie below the floor
     - ceiling: of the large surfaces facing down the one farthest above the sensor, and all that
       face down and continue it within `role_height`
     - wall: large vertical planes
     - other: the rest
-
-    Without a floor in sight the lowest large table takes its place: a single image does not tell
-    them apart.
 
     Parameters
     ----------
     planes : sequence of Plane
         Of one image.
     config : Config
-        `role_tolerance`, `role_height`, `role_area`: the area from which a surface is large; and
-        `up_x`, `up_y`, `up_z`.
+        `role_tolerance`, `role_height`, `role_area`: the area from which a surface is large;
+        `ground_slope`, `sensor_height`, and `up_x`, `up_y`, `up_z`.
     up : (3,) float, optional
         Direction, of any length, in the frame of the image; the configured one when not given.
 
@@ -63,11 +69,23 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
 
     found = np.full(len(planes), 'other', dtype='<U7')
     found[large & (np.abs(rise) <= config.role_tolerance)] = 'wall'
-    for facing, role in ((upward, 'floor'), (downward, 'ceiling')):
-        offset = _before_farthest(planes, facing & large)
-        found[facing & (np.abs(offset) <= config.role_height)] = role
-        if role == 'floor':
-            found[facing & (offset > config.role_height)] = 'table'
+    ceiling = _farthest(planes, downward & large)
+    if ceiling:
+        offset = _offsets(planes, ceiling)
+        found[downward & (np.abs(offset) <= config.role_height)] = 'ceiling'
+    floor = _floor(planes, upward & large, up, config)
+    if floor:
+        offset = _offsets(planes, floor)
+        found[upward & (offset > config.role_height)] = 'step'
+        found[upward & (offset > STEP)] = 'table'
+        found[upward & (offset < -config.role_height)] = 'lower'
+        found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
+        slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
+        ramp = (slope > LEVEL) & (slope <= config.ground_slope)
+        for k in np.flatnonzero(ramp):
+            foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
+            if foot <= config.role_height:
+                found[k] = 'ramp'
     return [str(role) for role in found]
 
 
@@ -80,19 +98,49 @@ def unit(direction: ArrayLike) -> NDArray[np.float64]:
     return vector / length
 
 
-def _before_farthest(
-    planes: Sequence[Plane], candidates: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """(N,) distance of the planes' centroids from the candidate farthest from the sensor.
+def _floor(
+    planes: Sequence[Plane], candidates: NDArray[np.bool_], up: NDArray[np.float64], config: Config
+) -> Plane | None:
+    """The largest plane of the surface that is the floor."""
+    largest = _largest(planes, candidates)
+    if config.sensor_height > 0:
+        # Where the plane meets the vertical through the sensor.
+        depth = [plane.distance / (plane.normal @ up) for plane in largest]
+        off = np.abs(np.array(depth) - config.sensor_height)
+        near = np.flatnonzero(off <= config.role_height)
+        return largest[near[off[near].argmin()]] if len(near) else None
 
-    In metres, positive towards the sensor; all NaN without a candidate. A surface is as far as
-    the largest of its parts.
-    """
+    def reach(plane: Plane) -> float:
+        corners = _corners(plane)
+        depth = -corners @ up
+        across = np.linalg.norm(corners + depth[:, None] * up, axis=1)
+        return float((across / np.maximum(depth, 1e-3)).min())
+
+    return min(largest, key=reach, default=None)
+
+
+def _farthest(planes: Sequence[Plane], candidates: NDArray[np.bool_]) -> Plane | None:
+    """The plane of a large surface that is farthest from the sensor."""
+    return max(_largest(planes, candidates), key=lambda plane: plane.distance, default=None)
+
+
+def _largest(planes: Sequence[Plane], candidates: NDArray[np.bool_]) -> list[Plane]:
+    """The largest plane of each surface that has a candidate."""
     largest: dict[int, Plane] = {}
     for plane, candidate in zip(planes, candidates, strict=True):
         if candidate and plane.area > getattr(largest.get(plane.surface), 'area', 0):
             largest[plane.surface] = plane
-    if not largest:
-        return np.full(len(planes), np.nan)
-    farthest = max(largest.values(), key=lambda plane: plane.distance)
-    return np.array([p.centroid for p in planes]) @ farthest.normal + farthest.distance
+    return list(largest.values())
+
+
+def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
+    """(N,) distance of the planes' centroids from a plane, metres, positive towards the sensor."""
+    return np.array([plane.centroid for plane in planes]) @ level.normal + level.distance
+
+
+def _corners(plane: Plane) -> NDArray[np.float64]:
+    """(4, 3) corners of the rectangle around a plane."""
+    axes = Rotation.from_quat(plane.orientation).as_matrix()[:, :2]
+    half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2
+    corners: NDArray[np.float64] = plane.centre + half @ axes.T
+    return corners

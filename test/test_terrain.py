@@ -1,0 +1,221 @@
+"""Terrain: what robots fall into and run into, in scenes with known answers."""
+
+import pickle
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
+from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.kinect import Kinect
+from rangeseg_ros.simulation.sensors.sensor import resized
+from rangeseg_ros.simulation.solids import box
+from rangeseg_ros.simulation.terrain import (
+    ALL,
+    KINDS,
+    Piece,
+    Terrain,
+    simulate_terrain,
+    slab,
+    stated,
+    terrain_scene,
+)
+
+CAMERA = resized(Kinect().camera, 320, 240)
+HEIGHT = 1.0
+FLOOR = slab(-3, 12, 0, 0, ALL)
+
+
+def scene(*pieces, pitch=30, roll=0):
+    pose = Pose.looking((0, 0, HEIGHT), 0, pitch, roll)
+    return Terrain('', pieces, (FLOOR,), pose)
+
+
+def drop_of(depth, edge=1.7):
+    return (
+        Piece(slab(-3, edge, 0, 0, ALL), GROUND),
+        Piece(slab(edge, 12, -depth, -depth, ALL), DROP, depth),
+    )
+
+
+def box_at(ahead, size, centre=0.0):
+    length, width, height = size
+    place = ahead + length / 2, centre, height / 2
+    return Piece(box((length, width, height), np.eye(3), place), OBSTACLE, height)
+
+
+def found(terrain, height=HEIGHT, seed=0, **parameters):
+    """What is found of a scene, with up off by 1 degree per axis, and the truth."""
+    frame = simulate_terrain(terrain, Kinect(), CAMERA, seed)
+    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
+    config = Config(
+        **dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True)),
+        sensor_height=height,
+        **parameters,
+    )
+    image = RangeImage.from_depth(frame.depth, CAMERA)
+    return image, Segmenter(config).segment(image), frame
+
+
+def share(result, frame, true, called):
+    """Of the pixels of a class, away from its borders and within 3.5 m, those called `called`."""
+    truth = cv2.erode((frame.terrain == true).astype(np.uint8), np.ones((7, 7))) > 0
+    truth &= (frame.crossing if true == DROP else frame.depth / 1000) < 3.5
+    assert truth.sum() > 100
+    return (result.terrain[truth] == called).mean()
+
+
+@pytest.mark.parametrize('height', [HEIGHT + 0.01, 0.0])
+@pytest.mark.parametrize('depth', [0.08, 0.15, 0.5])
+def test_below_a_drop_is_no_ground(depth, height):
+    _, result, frame = found(scene(*drop_of(depth)), height)
+    assert share(result, frame, GROUND, GROUND) > 0.99
+    assert share(result, frame, DROP, GROUND) < 0.001
+    assert share(result, frame, DROP, DROP) > 0.98
+    deep = result.height[(frame.terrain == DROP) & (frame.crossing < 2.5)]
+    assert np.median(deep) == pytest.approx(-depth, abs=0.03)
+
+
+def test_a_mirage_in_the_floor_is_a_drop():
+    mirror = Piece(slab(1.5, 2.3, 1e-6, 1e-6, (-0.5, 0.5)), DROP, 1.0, 'mirror')
+    ceiling = Piece(box((20, 20, 1), np.eye(3), (0, 0, 2.9)), OBSTACLE, 2.4)
+    wall = Piece(box((1, 20, 8), np.eye(3), (5.5, 0, 0)), OBSTACLE, 4.0)
+    _, result, frame = found(scene(mirror, Piece(FLOOR, GROUND), ceiling, wall))
+    assert share(result, frame, GROUND, GROUND) > 0.99
+    assert share(result, frame, DROP, DROP) > 0.98
+
+
+def test_a_table_in_front_is_no_floor():
+    table = Piece(box((0.5, 1.6, 0.03), np.eye(3), (1.05, 0, 0.5)), OBSTACLE, 0.5)
+    _, result, frame = found(scene(Piece(FLOOR, GROUND), table))
+    assert share(result, frame, GROUND, GROUND) > 0.98
+    assert share(result, frame, OBSTACLE, OBSTACLE) > 0.98
+
+
+def test_a_whole_object_is_an_obstacle_and_has_its_height():
+    boxes = box_at(1.6, (0.3, 0.5, 0.08), -0.4), box_at(1.8, (0.3, 0.4, 0.4), 0.4)
+    _, result, frame = found(scene(*boxes, Piece(FLOOR, GROUND)))
+    assert share(result, frame, OBSTACLE, OBSTACLE) > 0.97
+    assert share(result, frame, GROUND, GROUND) > 0.99
+    known = np.isfinite(frame.height) & (frame.depth < 3000)
+    error = (result.height - frame.height)[known]
+    assert np.median(np.abs(error)) < 0.01 and np.quantile(np.abs(error), 0.95) < 0.04
+    assert not np.isfinite(result.height[frame.depth == 0]).any()
+
+
+@pytest.mark.parametrize(('degrees', 'class_'), [(9, GROUND), (20, OBSTACLE)])
+def test_ramps_are_ground_as_long_as_they_are_not_steep(degrees, class_):
+    top = 2 * np.tan(np.radians(degrees))
+    ramp = Piece(slab(1.5, 3.5, 0, top, ALL), class_, top)
+    floor = Piece(slab(-3, 1.5, 0, 0, ALL), GROUND)
+    _, result, frame = found(scene(floor, ramp))
+    assert share(result, frame, class_, class_) > 0.97
+    steeper, _, _ = found(scene(floor, ramp), ground_slope=25.0)[1:], None, None
+    assert (steeper[0].terrain == GROUND).sum() > 0.97 * (frame.depth > 0).sum()
+
+
+@pytest.mark.parametrize('roll', [0, 90, 180, -90])
+def test_the_camera_may_be_rolled(roll):
+    _, result, frame = found(scene(*drop_of(0.15, 1.4), pitch=35, roll=roll))
+    assert share(result, frame, GROUND, GROUND) > 0.98
+    assert share(result, frame, DROP, GROUND) < 0.002
+
+
+def test_clouds_of_any_sensor():
+    image, result, frame = found(scene(*drop_of(0.15)))
+    cloud = RangeImage.from_points(image.points)
+    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(scene().up)
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
+    again = Segmenter(config).segment(cloud)
+    assert (again.terrain == result.terrain).mean() > 0.99
+    assert share(again, frame, DROP, GROUND) < 0.001
+
+
+def test_crossings_lie_on_the_ground_continued():
+    terrain = scene(*drop_of(0.3))
+    image, result, _ = found(terrain)
+    points = drops(image, result.ground)
+    world = points[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    near = points[:, 2] < 2.5
+    assert near.sum() > 500
+    assert np.abs(world[near, 2]).max() < 0.05
+    assert world[near, 0].min() > 1.6
+    assert (points[:, 3] < 0).all()
+
+
+def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
+    hidden = (
+        Piece(slab(-3, 1.5, 0, 0, ALL), GROUND),
+        Piece(slab(2.2, 12, 0, 0, ALL), GROUND),
+        Piece(slab(1.5, 2.2, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
+    )
+    terrain = scene(*hidden)
+    image, result, frame = found(terrain)
+    assert (result.terrain[frame.depth == 0] == UNKNOWN).all()
+    points = unseen(image, result.ground)
+    world = points[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    inside = (world[:, 0] > 1.45) & (world[:, 0] < 2.3)
+    assert inside.sum() > 500 and np.isnan(points[:, 3]).all()
+    assert np.abs(world[inside, 2]).max() < 0.05
+    lines = [line @ terrain.pose.rotation.T + terrain.pose.position
+             for line in outlines(image, result.ground)]  # fmt: skip
+    edge = np.concatenate(lines)
+    assert (np.abs(edge[:, 0] - 1.5) < 0.06).sum() > 1
+
+
+def test_a_view_without_floor_has_no_ground():
+    wall = Piece(box((1, 20, 12), np.eye(3), (1.9, 0, 0)), OBSTACLE, 4.0)
+    for height in (HEIGHT, 0.0):
+        _, result, frame = found(scene(wall, Piece(FLOOR, GROUND), pitch=0), height)
+        assert (result.terrain != GROUND).mean() > 0.999
+        assert (result.terrain == OBSTACLE)[frame.depth > 0].mean() > 0.99
+
+
+def test_a_result_can_be_pickled_and_nothing_is_made_unless_asked_for():
+    _, result, _ = found(scene(*drop_of(0.15)))
+    assert 'ground' not in vars(result)
+    again = pickle.loads(pickle.dumps(result))
+    np.testing.assert_array_equal(again.terrain, result.terrain)
+
+
+def test_any_number_of_threads_finds_the_same():
+    terrain = scene(*drop_of(0.15), box_at(1.3, (0.2, 0.4, 0.1)))
+    before = cv2.getNumThreads()
+    try:
+        maps = []
+        for threads in (1, 3):
+            cv2.setNumThreads(threads)
+            _, result, _ = found(terrain)
+            maps.append((result.terrain, result.height))
+    finally:
+        cv2.setNumThreads(before)
+    np.testing.assert_array_equal(maps[0][0], maps[1][0])
+    np.testing.assert_array_equal(maps[0][1], maps[1][1])
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (3, 2), (24, 32)])
+@pytest.mark.parametrize('value', [0, 1000])
+def test_images_of_any_size(shape, value):
+    camera = Camera(shape[1], shape[0], 60.0, 60.0, shape[1] / 2, shape[0] / 2)
+    image = RangeImage.from_depth(np.full(shape, value, np.uint16), camera)
+    for height in (0.0, 1.0):
+        result = Segmenter(Config(sensor_height=height)).segment(image)
+        assert result.terrain.shape == result.height.shape == shape
+        assert value or not result.terrain.any()
+
+
+@pytest.mark.parametrize('kind', KINDS)
+def test_every_kind_of_scene_can_be_made(kind):
+    terrain = terrain_scene(kind, 3)
+    camera = resized(CAMERA, 80, 60)
+    frame, again = (simulate_terrain(terrain, Kinect(), camera, 3) for _ in range(2))
+    for one, other in zip(frame, again, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (frame.terrain[frame.depth == 0] == UNKNOWN).all()
+    up, height = stated(terrain, 3)
+    assert 0.5 < np.degrees(np.arccos(up @ terrain.up)) < 2
+    assert 0.25 < height < 1.65
