@@ -82,7 +82,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
         ramp = (slope > LEVEL) & (slope <= config.ground_slope)
-        for k in np.flatnonzero(ramp):
+        for k in map(int, np.flatnonzero(ramp)):
             foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
             if foot <= config.role_height:
                 found[k] = 'ramp'
