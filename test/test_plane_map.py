@@ -16,7 +16,7 @@ from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sequence import with_roles
+from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -183,3 +183,39 @@ def test_the_same_frames_give_the_same_map():
     for a, b in zip(one, two, strict=True):
         assert np.array_equal(a.covariance, b.covariance)
         assert np.array_equal(a.hull, b.hull)
+
+
+@pytest.mark.parametrize('turn', [0.0, 25.0])
+def test_a_jump_of_the_fixed_frame_does_not_double_the_map(turn):
+    room = kinect_room(4)
+    scene = Scene(room.solids, walk(room.poses[0], 4, 48), room.dark)
+    sequence = SequenceSegmenter(Config(min_pixels=150))
+    jump = Transform(
+        Rotation.from_euler('z', turn, degrees=True).as_matrix(), np.array([0.6, -0.5, 0.0])
+    )
+    sizes = []
+    for k in range(0, 48, 4):
+        view = simulate_kinect(scene, kinect_camera(320, 240), frame=k)
+        pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
+        pose = jump.after(pose) if k >= 24 else pose
+        image = RangeImage.from_depth(view.depth, view.camera)
+        result = sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
+        sizes.append((len(sequence.map), len(result.planes), sequence.map.begun_anew))
+    assert sizes[5][0] > 3 and not sizes[5][2]
+    assert sizes[6][0] == 0 and sizes[6][2] == 'the fixed frame has jumped'
+    assert 3 < sizes[-1][0] <= sizes[5][0] + 2
+
+
+def test_a_looped_recording_begins_the_map_anew():
+    room = kinect_room(4)
+    view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(320, 240))
+    image = RangeImage.from_depth(view.depth, view.camera)
+    sequence = SequenceSegmenter(Config(min_pixels=150))
+    pose = Transform(room.poses[0].rotation, room.poses[0].position)
+    ids = []
+    for _ in range(2):
+        for k in range(4):
+            sequence.segment(image, 10**9 + k * 10**8, pose=pose)
+        ids.append({plane.id for plane in sequence.map.planes})
+    assert len(ids[0]) == len(ids[1]) > 3 and not ids[0] & ids[1]
+    assert sequence.map.begun_anew == 'time has gone back'

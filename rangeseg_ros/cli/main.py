@@ -16,6 +16,7 @@ from rangeseg_ros.cli.errors import in_words
 COMMANDS = {
     'segment': 'Segment depth images into planes.',
     'pack': 'Pack depth images into a rosbag2.',
+    'mount': 'Find how a camera is mounted above the floor.',
     'replay': 'Segment the depth images of recordings.',
     'simulate': 'Simulate range images with ground truth.',
     'evaluate': 'Segment images and compare the results with their truth.',

@@ -48,6 +48,9 @@ class SequenceSegmenter:
     def config(self, config: Config) -> None:
         self._segmenter = Segmenter(config)
         self._tracker.config = config
+        if config.fixed_frame != self.map.config.fixed_frame:
+            self.map.clear('fixed_frame has changed')
+            self._pose = None
         self.map.config = config
 
     def segment(
@@ -73,13 +76,16 @@ class SequenceSegmenter:
         if stamp < self._stamp:
             self._segmenter.reset()
             self._tracker.reset()
-            self.map.clear()
+            self.map.clear('time has gone back')
             self._pose = None
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
         result = self._segmenter.segment(image)
         planes = self._tracker.track(result.labels, result.planes, stamp, motion)
         planes = with_roles(planes, self.config, up)
+        if self._tracker.contradicted:
+            # The fixed frame has jumped: the map would have everything twice.
+            self.map.clear('the fixed frame has jumped')
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey

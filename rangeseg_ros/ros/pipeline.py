@@ -155,7 +155,8 @@ class Pipeline:
         statistics.missing = '; '.join(f'{what} {why}' for what, why in at.missing.items())
         if config.fixed_frame:
             count = len(sequence.map)
-            statistics.sources['map'] = f'{count} planes in {config.fixed_frame}'
+            anew = f', begun anew: {why}' if (why := sequence.map.begun_anew) else ''
+            statistics.sources['map'] = f'{count} planes in {config.fixed_frame}{anew}'
         if statistics.missing:
             self._node.get_logger().warning(statistics.missing, throttle_duration_sec=5.0)
 

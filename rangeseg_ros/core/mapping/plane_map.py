@@ -114,6 +114,11 @@ class _Record:
 class PlaneMap:
     """Planes of a fixed frame, from the planes of frames whose poses are known.
 
+    Attributes
+    ----------
+    begun_anew : str
+        Why the map was begun anew; empty when it was not.
+
     Examples
     --------
     >>> plane_map = PlaneMap(config)
@@ -124,10 +129,12 @@ class PlaneMap:
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
         self._next = 1
+        self.begun_anew = ''
         self.clear()
 
-    def clear(self) -> None:
+    def clear(self, why: str = '') -> None:
         """Begin anew; ids are not given twice."""
+        self.begun_anew = why
         self._records: list[_Record] = []
         self._filters: PlaneFilters | None = None
 

@@ -48,6 +48,8 @@ _NOMINAL, _LONGEST = 1 / 30, 0.5
 # equations are linear in it, and larger changes are rather another plane.
 _SURE_OVERLAP, _SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
 _MOTION_ROUNDS = 3
+# Share of the planes that a motion must explain of those that stay where they were without it.
+_AGREED = 0.5
 
 
 class Tracker:
@@ -71,6 +73,11 @@ class Tracker:
     config : Config, optional
         `track_time`.
 
+    Attributes
+    ----------
+    contradicted : bool
+        Whether the motion that was told of the last frame is not that of the planes.
+
     Examples
     --------
     >>> tracker = Tracker()
@@ -79,6 +86,7 @@ class Tracker:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
+        self.contradicted = False
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
@@ -115,6 +123,7 @@ class Tracker:
         list of Plane
             In the order given, `id` and `surface` set.
         """
+        self.contradicted = False
         if labels.shape != self._shape:
             self.reset()
         elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else _NOMINAL
@@ -125,7 +134,9 @@ class Tracker:
         if motion:
             # Where the frames that tell the motion jump, the planes know better.
             moved = known.moved(*motion)
-            if _sure_pairs(moved, seen, shared).sum() >= _sure_pairs(known, seen, shared).sum():
+            sure = [int(_sure_pairs(tracks, seen, shared).sum()) for tracks in (moved, known)]
+            self.contradicted = sure[0] < _AGREED * sure[1]
+            if not self.contradicted:
                 known = moved
         known = known.moved(*_camera_motion(known, seen, shared, elapsed))
         distance = distances(known, seen)

@@ -1,0 +1,65 @@
+"""`rangeseg mount`: how the camera of a recording is mounted above the floor."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+import numpy as np
+
+from rangeseg_ros.batch.replay import segmented
+from rangeseg_ros.cli import options
+from rangeseg_ros.core.mapping.mount import Mount, mount_of
+from rangeseg_ros.core.mapping.placement import Placement
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.io.bags import DepthBag
+
+
+@click.command()
+@click.argument('recording', type=click.Path(path_type=Path))
+@click.option('--base', default='base_footprint', show_default=True, help='Frame on the floor.')
+@options.params
+@options.exact
+@click.pass_context
+def command(
+    ctx: click.Context, recording: Path, base: str, params_file: Path | None, exact: bool
+) -> None:
+    """Find roll, pitch and height of a camera above the floor.
+
+    The camera stays where it is on its robot, which may drive: the floor is the largest plane
+    facing up that does not move. Prints both angles and the height with their standard deviations,
+    a static_transform_publisher and the origin of a URDF joint. Yaw, and where the camera is over
+    the floor, no floor tells. Where the floor is not sure, says why, and the exit code is 1.
+    """
+    sequence = SequenceSegmenter(options.read_parameters(params_file, exact))
+    still = Placement(pose=Transform.identity())
+    frames, name = 0, ''
+    with DepthBag(recording) as source:
+        for _, frame, _, _ in segmented(source, sequence, lambda frame: still):
+            frames, name = frames + 1, frame.frame_id
+    mount = mount_of(sequence.map.planes, frames)
+    if mount is None:
+        raise click.ClickException(f'{recording}: no plane that faces up in {frames} frames')
+    for line in _told(mount, base, name):
+        click.echo(line)
+    for doubt in mount.doubts:
+        click.echo(f'rangeseg: the floor is not sure: {doubt}', err=True)
+    if mount.doubts:
+        ctx.exit(1)
+
+
+def _told(mount: Mount, base: str, frame: str) -> list[str]:
+    roll, pitch = np.degrees([mount.roll, mount.pitch])
+    sigma = np.degrees(mount.sigma[:2])
+    x, y, z, w = mount.quaternion
+    rpy = ' '.join(f'{angle:.5f}' for angle in mount.rpy)
+    return [
+        f'roll {roll:.2f} +- {sigma[0]:.2f} degrees',
+        f'pitch {pitch:.2f} +- {sigma[1]:.2f} degrees, downwards',
+        f'height {mount.height:.3f} +- {mount.sigma[2]:.3f} m',
+        'ros2 run tf2_ros static_transform_publisher --x 0 --y 0 '
+        f'--z {mount.height:.4f} --qx {x:.6f} --qy {y:.6f} --qz {z:.6f} --qw {w:.6f} '
+        f'--frame-id {base} --child-frame-id {frame}',
+        f'<origin xyz="0 0 {mount.height:.4f}" rpy="{rpy}"/>',
+    ]

@@ -1,0 +1,105 @@
+"""How a camera is mounted above the floor: roll, pitch and height with their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.mapping.plane_map import MapPlane
+
+# Largest angle between up and -y of the camera, so that no wall is taken for the floor.
+_STEEPEST = np.radians(60.0)
+# Share of the area of the floor from which another plane may be the floor as well, and of the
+# frames in which the floor is to be seen.
+_RIVAL, _SEEN = 0.5, 0.5
+# Standard deviation of roll or pitch from which the floor is not sure: a quarter of the
+# role_tolerance by which it is told from other planes.
+_UNSURE = np.radians(2.5)
+
+
+class Mount(NamedTuple):
+    """Where a camera is above the floor, the floor's frame below it with x forward, z up.
+
+    Attributes
+    ----------
+    roll, pitch : float
+        About the optical axis, positive where the camera's right side is lower, and downwards,
+        radians.
+    height : float
+        Metres.
+    sigma : (3,) float64
+        Standard deviations of these three.
+    rotation : (3, 3) float64
+        The floor's frame from the optical one.
+    doubts : list of str
+        Why the floor is not sure.
+    """
+
+    roll: float
+    pitch: float
+    height: float
+    sigma: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    doubts: list[str]
+
+    @property
+    def quaternion(self) -> NDArray[np.float64]:
+        """x, y, z, w of `rotation`."""
+        turn: NDArray[np.float64] = Rotation.from_matrix(self.rotation).as_quat()
+        return turn if turn[3] >= 0 else -turn
+
+    @property
+    def rpy(self) -> NDArray[np.float64]:
+        """Angles about the fixed axes x, y, z, as URDF has them, radians."""
+        angles: NDArray[np.float64] = Rotation.from_matrix(self.rotation).as_euler('xyz')
+        return angles
+
+
+def mount_of(planes: Sequence[MapPlane], frames: int) -> Mount | None:
+    """The mount by the floor among planes that were fused in the frame of the camera.
+
+    The floor is the largest plane that faces up; of a robot that drives on a flat floor, it alone
+    stays where it is.
+
+    Parameters
+    ----------
+    planes : sequence of MapPlane
+        In the optical frame.
+    frames : int
+        Number of frames they are from.
+
+    Returns
+    -------
+    Mount or None
+        None when nothing faces up.
+    """
+    facing = [plane for plane in planes if -plane.normal[1] > np.cos(_STEEPEST)]
+    weight = [plane.area * plane.observations for plane in facing]
+    if not facing:
+        return None
+    order = np.argsort(weight)[::-1]
+    floor = facing[order[0]]
+    up = floor.normal
+    roll, pitch = float(np.arctan2(-up[0], -up[1])), float(np.arcsin(np.clip(-up[2], -1, 1)))
+    level = up[0] ** 2 + up[1] ** 2
+    jacobian = np.zeros((3, 4))
+    jacobian[0, :2] = up[1] / level, -up[0] / level
+    jacobian[1, 2] = -1 / np.sqrt(max(1 - up[2] ** 2, 1e-12))
+    jacobian[2, 3] = 1
+    sigma = np.sqrt(np.diag(jacobian @ floor.covariance @ jacobian.T))
+    forward = np.array([0, 0, 1.0]) - up[2] * up
+    forward /= np.linalg.norm(forward)
+    doubts = []
+    if floor.observations < _SEEN * frames:
+        doubts.append(f'it was found in {floor.observations} of {frames} frames')
+    if len(order) > 1 and weight[order[1]] > _RIVAL * weight[order[0]]:
+        other = facing[order[1]]
+        doubts.append(f'a plane {other.distance:.2f} m below the camera may be the floor as well')
+    if sigma[:2].max() > _UNSURE:
+        doubts.append(f'its direction is known to {np.degrees(sigma[:2].max()):.1f} degrees only')
+    frame = np.stack([forward, np.cross(up, forward), up])
+    return Mount(roll, pitch, floor.distance, sigma, frame, doubts)
