@@ -19,6 +19,7 @@ COMMANDS = {
     'mount': 'Find how a camera is mounted above the floor.',
     'replay': 'Segment the depth images of recordings.',
     'simulate': 'Simulate range images with ground truth.',
+    'calibrate': "Learn a sensor's distortion from the planes it sees.",
     'evaluate': 'Segment images and compare the results with their truth.',
     'compare': 'Compare label images with ground truth.',
     'tracks': 'Measure how well planes keep their ids.',

@@ -1,0 +1,240 @@
+"""Recordings to the sightings of planes, in parts that many processes make and that are kept."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from itertools import islice
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.calibration.calibrate import CalibrationError
+from rangeseg_ros.core.calibration.residuals import products
+from rangeseg_ros.core.calibration.sightings import Sightings, sightings
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.distortion import DistortionMap
+from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+from rangeseg_ros.digest import code_digest
+from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.files import natural_order, replacing
+from rangeseg_ros.io.images import read_depth
+
+IMAGES = ('.png', '.tif', '.tiff')
+PART = 10
+"""Frames that one process takes at a time: what an interruption costs it."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Depth images of a recording: a bag, or a folder of images of one camera.
+
+    Attributes
+    ----------
+    path : Path
+    camera : Camera or None
+        Of a folder; bags know theirs.
+    scale : float or None
+        Metres per unit of a folder's images.
+    depth_topic, camera_topic : str or None
+        Of a bag, see `DepthBag`.
+    """
+
+    path: Path
+    camera: Camera | None = None
+    scale: float | None = None
+    depth_topic: str | None = None
+    camera_topic: str | None = None
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether it is a folder of images."""
+        return self.path.is_dir() and not any(self.path.glob('metadata.yaml'))
+
+    def files(self) -> list[Path]:
+        """Images of a folder in the order of their names."""
+        found = [path for path in self.path.iterdir() if path.suffix.lower() in IMAGES]
+        return sorted(found, key=natural_order)
+
+    def __len__(self) -> int:
+        if self.is_folder:
+            return len(self.files())
+        with self._bag() as bag:
+            return len(bag)
+
+    def images(self, first: int, after: int, step: int = 1) -> Iterator[RangeImage]:
+        """Range images from number `first` to before `after`.
+
+        Raises
+        ------
+        ValueError
+            A frame that is no range image; the message names it.
+        """
+        if self.is_folder:
+            assert self.camera is not None
+            for path in self.files()[first:after:step]:
+                try:
+                    yield RangeImage.from_depth(read_depth(path), self.camera, self.scale)
+                except RangeImageError as error:
+                    raise RangeImageError(f'{path}: {error}') from None
+            return
+        with self._bag() as bag:
+            for frame in islice(bag, first, after, step):
+                yield frame.range_image()
+
+    def state(self) -> str:
+        """What tells the content from another one."""
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
+        return repr([(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files])
+
+    def _bag(self) -> DepthBag:
+        return DepthBag(self.path, self.depth_topic, self.camera_topic)
+
+
+class Seen(NamedTuple):
+    """Sightings of the frames of one part, and what they are of."""
+
+    frames: list[Sightings]
+    shape: tuple[int, int]
+    camera: Camera | None
+
+
+@dataclass(frozen=True)
+class SightingsOfPart:
+    """Planes in some frames of a recording; what was found once is kept in a folder.
+
+    Attributes
+    ----------
+    source : Source
+    config : Config
+    first, after : int
+        Frames.
+    kept : Path
+        Folder.
+    """
+
+    source: Source
+    config: Config
+    first: int
+    after: int
+    kept: Path
+
+    def run(self) -> Seen:
+        """Segment the frames, or read what is kept."""
+        path = self.kept / f'{self._key()}.npz'
+        if path.exists():
+            return _read(path)
+        segmenter = Segmenter(self.config)
+        frames, shape, camera = [], None, None
+        for image in self.source.images(self.first, self.after):
+            if shape not in (None, image.shape):
+                raise CalibrationError(f'{self.source.path}: images of several sizes')
+            shape, camera = image.shape, image.camera
+            frames.append(sightings(segmenter.segment(image).labels, image))
+        if shape is None:
+            raise CalibrationError(f'{self.source.path}: no frames')
+        seen = Seen(frames, shape, camera)
+        _write(path, seen)
+        return seen
+
+    def _key(self) -> str:
+        digest = hashlib.sha256(code_digest())
+        settings = self.source.path.absolute(), self.source, asdict(self.config)
+        digest.update(repr((settings, self.first, self.after, self.source.state())).encode())
+        return digest.hexdigest()[:16]
+
+
+class Residuals(NamedTuple):
+    """What planes leave of one frame, before and after the correction.
+
+    Attributes
+    ----------
+    products : (2, L) float64
+        See `residuals.products`, after the correction.
+    images : (2, H, W) float32
+        Residuals, 1/m, NaN where there is no plane.
+    planes : (int, int)
+        Number of planes.
+    """
+
+    products: NDArray[np.float64]
+    images: NDArray[np.float32]
+    planes: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class ResidualsOfFrame:
+    """Residuals of one frame of a recording.
+
+    Attributes
+    ----------
+    source : Source
+    config : Config
+    frame : int
+    distortion : DistortionMap
+    """
+
+    source: Source
+    config: Config
+    frame: int
+    distortion: DistortionMap
+
+    def run(self) -> Residuals:
+        """Segment the frame without and with the correction."""
+        (image,) = self.source.images(self.frame, self.frame + 1)
+        segmenter, pictures, counts = Segmenter(self.config), [], []
+        for version in (image, self.distortion.corrected(image)):
+            result = segmenter.segment(version)
+            residual = np.full(image.shape, np.nan, np.float32)
+            along = np.where(version.valid, version.rays[..., 2], 1)
+            for plane in result.planes:
+                mask = result.labels == plane.label
+                theta = -plane.normal / plane.distance
+                error = version.inverse[mask] - version.rays[mask] @ theta
+                residual[mask] = error / along[mask]
+            pictures.append(residual)
+            counts.append(len(result.planes))
+        return Residuals(
+            products(result.labels, version), np.stack(pictures), (counts[0], counts[1])
+        )
+
+
+def parts(sources: list[Source], config: Config, kept: Path) -> list[SightingsOfPart]:
+    """Tasks for all frames of the recordings, in their order."""
+    return [
+        SightingsOfPart(source, config, first, min(first + PART, count), kept)
+        for source in sources
+        for count in [len(source)]
+        for first in range(0, count, PART)
+    ]
+
+
+def _write(path: Path, seen: Seen) -> None:
+    arrays = {
+        f'{number}_{name}': value
+        for number, frame in enumerate(seen.frames)
+        for name, value in frame._asdict().items()
+    }
+    camera = json.dumps(None if seen.camera is None else asdict(seen.camera))
+    buffer = io.BytesIO()
+    np.savez(buffer, shape=seen.shape, camera=camera, count=len(seen.frames), **arrays)
+    with replacing(path) as partial:
+        partial.write_bytes(buffer.getvalue())
+
+
+def _read(path: Path) -> Seen:
+    with np.load(path) as stored:
+        frames = [
+            Sightings(*(stored[f'{number}_{name}'] for name in Sightings._fields))
+            for number in range(int(stored['count']))
+        ]
+        height, width = stored['shape']
+        camera = json.loads(str(stored['camera']))
+        return Seen(frames, (int(height), int(width)), camera and Camera(**camera))

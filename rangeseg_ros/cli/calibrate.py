@@ -1,0 +1,177 @@
+"""`rangeseg calibrate`: recordings to the distortion map of their sensor."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import yaml
+
+from rangeseg_ros.batch.calibration import ResidualsOfFrame, Seen, Source, parts
+from rangeseg_ros.cli import options
+from rangeseg_ros.core.calibration.calibrate import Calibration, calibrate
+from rangeseg_ros.core.calibration.residuals import randomness
+from rangeseg_ros.core.calibration.sightings import Sightings, gathered
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.distortion import DistortionError
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.distortion import read_distortion, write_distortion
+from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.params import read_config, read_params
+from rangeseg_ros.report.calibration import Shown, write_calibration
+from rangeseg_ros.tasks import run_all
+
+# Frames that tell the noise, and those of them that the report shows.
+_SAMPLED, _SHOWN = 24, 3
+_HEADER = '# Written by rangeseg calibrate.\n'
+
+
+@click.command()
+@click.argument(
+    'recordings',
+    metavar='RECORDING...',
+    nargs=-1,
+    required=True,
+    type=click.Path(exists=True, path_type=Path),
+)
+@click.option(
+    '--output',
+    type=click.Path(dir_okay=False, path_type=Path),
+    required=True,
+    help='Distortion map to write: TIFF.',
+)
+@click.option(
+    '--params',
+    'params_output',
+    type=click.Path(dir_okay=False, path_type=Path),
+    help='Parameter file to write: the map, and noise and distortion that remain.',
+)
+@click.option(
+    '--camera',
+    'camera_file',
+    type=options.FILE,
+    help='Intrinsics of the images in folders: a ROS camera-calibration YAML file.',
+)
+@options.depth_scale
+@click.option('--depth-topic', help='Depth images of bags.  [default: found by type and name]')
+@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@click.option(
+    '--segment-with',
+    'segment_with',
+    type=options.FILE,
+    help='Parameters of the segmenter, which --params repeats.  [default: those of the package]',
+)
+@click.option(
+    '--jobs',
+    type=click.IntRange(min=1),
+    help='Processes.  [default: as many as cores]',
+)
+def command(
+    recordings: tuple[Path, ...],
+    output: Path,
+    params_output: Path | None,
+    camera_file: Path | None,
+    depth_scale: float | None,
+    depth_topic: str | None,
+    camera_topic: str | None,
+    segment_with: Path | None,
+    jobs: int | None,
+) -> None:
+    """Learn the fixed distortion of a sensor from the planes in RECORDINGs of it.
+
+    Recordings are bags, or folders of depth images in the order of their names, with --camera.
+    Writes the map and, beside it, <stem>_report.html. See docs/calibration.md for how to record.
+
+    An interrupted run goes on where it was when it is started again.
+    """
+    report = output.with_name(f'{output.stem}_report.html')
+    _check_free(output, params_output)
+    camera = read_camera(camera_file) if camera_file else None
+    sources = [Source(path, camera, depth_scale, depth_topic, camera_topic) for path in recordings]
+    for source in sources:
+        if source.is_folder and not source.files():
+            raise click.UsageError(f'{source.path}: neither a bag nor a folder of depth images')
+        if source.is_folder and camera is None:
+            raise click.UsageError(f'{source.path}: a folder of images needs --camera')
+    given: dict[str, Any] = read_params(segment_with) if segment_with else {}
+    # What is learned is the whole distortion, not what another map leaves.
+    given.pop('distortion_map', None)
+    config = replace(read_config(segment_with), distortion_map='')
+    kept = output.with_name(f'.{output.name}.parts')
+    tasks = parts(sources, config, kept)
+    seen = list(options.progress(run_all(tasks, jobs), len(tasks), 'part'))
+    result = calibrate(*_together(seen))
+    _tell(result)
+
+    numbered = [(source, number) for source in sources for number in range(len(source))]
+    chosen = np.linspace(0, len(numbered) - 1, min(_SAMPLED, len(numbered))).round().astype(int)
+    frames = [
+        ResidualsOfFrame(source, config, number, result.distortion)
+        for source, number in (numbered[n] for n in chosen)
+    ]
+    left = list(options.progress(run_all(frames, jobs), len(frames), 'frame'))
+    sensor = randomness(np.sum([each.products for each in left], axis=0))
+    parameters: dict[str, Any] = {**given, 'distortion_map': str(output.absolute())}
+    if sensor:
+        parameters |= {name: float(f'{value:.3g}') for name, value in sensor._asdict().items()}
+        click.echo(
+            f'noise {sensor.noise:.2g} 1/m, correlated over {sensor.noise_correlation:.2g} px, '
+            f'distortion that remains {sensor.distortion:.2g} 1/m'
+        )
+    Config.from_mapping(parameters)
+    write_distortion(output, result.distortion)
+    if params_output:
+        with replacing(params_output) as partial:
+            partial.write_text(_HEADER + yaml.safe_dump(parameters, sort_keys=False))
+    spread = np.linspace(0, len(left) - 1, min(_SHOWN, len(left))).round().astype(int)
+    shown = [Shown(int(chosen[n]), left[n].images, left[n].planes) for n in spread]
+    write_calibration(report, [path.name for path in recordings], result, parameters, shown)
+    shutil.rmtree(kept, ignore_errors=True)
+    click.echo(f'{output}, {report}')
+
+
+def _check_free(output: Path, params_output: Path | None) -> None:
+    """Refuse to overwrite what is none of this command's own."""
+    if output.exists():
+        try:
+            read_distortion(output)
+        except DistortionError:
+            raise click.UsageError(f'{output}: exists already, and is no distortion map') from None
+    if params_output and params_output.exists():
+        with params_output.open('rb') as file:
+            if file.readline() != _HEADER.encode():
+                raise click.UsageError(f'{params_output}: exists already, not overwritten')
+
+
+def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
+    """Sightings of all recordings, the size of their images and their camera."""
+    sizes = {part.shape for part in seen}
+    if len(sizes) > 1:
+        text = ', '.join(f'{width}x{height}' for height, width in sorted(sizes))
+        raise click.UsageError(f'images of several sizes: {text}')
+    if len({part.camera for part in seen}) > 1:
+        raise click.UsageError('recordings of several cameras')
+    frames = [frame for part in seen for frame in part.frames]
+    return gathered(frames), seen[0].shape, seen[0].camera
+
+
+def _tell(result: Calibration) -> None:
+    less = 1 - result.after / result.before
+    click.echo(
+        f'residual of planes on frames left out: {result.before:.5f} to {result.after:.5f} 1/m, '
+        f'{less:.0%} less'
+    )
+    deviation = result.distortion.deviation
+    assert deviation is not None
+    rms, unsure = (
+        float(np.sqrt((image**2).mean())) for image in (result.distortion.offset, deviation)
+    )
+    click.echo(f'distortion {rms:.5f} 1/m, known to {unsure:.5f} 1/m')
+    if result.distortion.slope is not None:
+        click.echo('it depends on the distance: the map has a second coefficient')
+    if rms < unsure or less < 0.01:
+        click.echo('no fixed distortion that stands out: the map will change next to nothing')

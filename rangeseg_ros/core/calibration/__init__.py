@@ -1,0 +1,1 @@
+"""The fixed distortion of a sensor, learned from the planes it sees."""

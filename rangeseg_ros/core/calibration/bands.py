@@ -1,0 +1,36 @@
+"""Vertical bands: steps of the inverse depth at fixed columns, over the whole height.
+
+Sensors that process an image in strips of columns have them, and a smooth field would blur them.
+From a column to the next, the residuals of planes change in the mean over rows and frames by the
+slope of the smooth distortion, which is alike over neighbouring columns, and by the step.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from rangeseg_ros.core.calibration.sightings import Sightings
+
+# Standard deviations beyond which a step is none by chance: 1e-6 in 1000 columns.
+_SIGNIFICANT = 6.0
+# Columns over which the slope of the smooth distortion is alike; many enough that their median
+# takes next to nothing off the noise of one.
+_REACH = 10
+
+
+def column_profile(seen: Sightings) -> NDArray[np.float64]:
+    """Error of each column by the steps at columns left of it, (W,) 1/m, of mean zero.
+
+    Of `seen` the jumps count.
+    """
+    total, count = seen.jumps.sum(axis=0)
+    change = total / np.maximum(count, 1)
+    change -= median_filter(change, 2 * _REACH + 1, mode='nearest')
+    # Columns seen in few rows are as much noisier.
+    noise = change * np.sqrt(count / max(count.max(initial=0), 1))
+    spread = 1.4826 * np.median(np.abs(noise[count > 0])) if count.any() else 0.0
+    steps = np.where(np.abs(noise) > _SIGNIFICANT * max(spread, 1e-12), change, 0.0)
+    profile: NDArray[np.float64] = np.concatenate([[0.0], np.cumsum(steps)])
+    return profile - profile.mean()

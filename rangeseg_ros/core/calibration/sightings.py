@@ -1,0 +1,154 @@
+"""Planes seen in the frames of a recording, as means over the cells of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# Cells across the image: 8 pixels of a VGA image, a fraction of the length of any distortion.
+_ACROSS = 80
+# Cells that a plane must cover: its own three parameters would explain much of fewer.
+_FEWEST = 20
+# Pixels from another region up to which a pixel may be its neighbour's.
+_RIM = 2
+# Standard deviations beyond which a pixel is not the plane's.
+_OUTLIER = 5.0
+
+
+class Sightings(NamedTuple):
+    """Planes seen in frames of one size, P of them, of N cells together.
+
+    Attributes
+    ----------
+    frame : (P,) int
+        Number of the frame.
+    start : (P + 1,) int
+        Where the cells of each plane begin.
+    cell : (N,) int
+        Which cell of the image, row by row.
+    inverse : (N,) float64
+        Mean inverse depth 1/z, 1/m.
+    ray : (N, 3) float64
+        Mean ray, scaled to z = 1.
+    jumps : (F, 2, W - 1) float64
+        Of each frame and pair of neighbouring columns: the sum over the rows of the change of the
+        residual from the left to the right column, 1/m, and the number of rows.
+    """
+
+    frame: NDArray[np.intp]
+    start: NDArray[np.intp]
+    cell: NDArray[np.intp]
+    inverse: NDArray[np.float64]
+    ray: NDArray[np.float64]
+    jumps: NDArray[np.float64]
+
+    def plane(self) -> NDArray[np.intp]:
+        """Plane (N,) that each cell belongs to."""
+        return np.repeat(np.arange(len(self.frame)), np.diff(self.start))
+
+    def of_frames(self, chosen: NDArray[np.bool_]) -> Sightings:
+        """Those of the frames that are chosen, (F,); the frames keep their numbers."""
+        plane = chosen[self.frame]
+        cells = plane[self.plane()]
+        counts = np.diff(self.start)[plane]
+        return Sightings(
+            self.frame[plane],
+            np.concatenate([[0], np.cumsum(counts)]),
+            self.cell[cells],
+            self.inverse[cells],
+            self.ray[cells],
+            self.jumps * chosen[:, None, None],
+        )
+
+
+def cell_size(shape: tuple[int, int]) -> int:
+    """Rows and columns of a cell, pixels."""
+    return max(round(shape[1] / _ACROSS), 2)
+
+
+def cell_grid(shape: tuple[int, int]) -> tuple[int, int]:
+    """Rows and columns of cells in an image (H, W)."""
+    size = cell_size(shape)
+    return -(-shape[0] // size), -(-shape[1] // size)
+
+
+def sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
+    """Planes of one frame.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+        Regions, 0 for no plane.
+    image : RangeImage
+        (H, W); an inverse range along a unit ray is taken as the inverse depth it is.
+    """
+    size, (rows, columns) = cell_size(labels.shape), cell_grid(labels.shape)
+    height, width = labels.shape
+    cells = np.arange(height)[:, None] // size * columns + np.arange(width) // size
+    inner, inverse, rays = plane_pixels(labels, image)
+    residual = np.full(labels.shape, np.nan)
+    found = []
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        mask = inner & (labels == label)
+        if np.count_nonzero(mask) < _FEWEST * size * size:
+            continue
+        error = inverse[mask] - rays[mask] @ fitted(rays[mask], inverse[mask])
+        mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
+        count = np.bincount(cells[mask], minlength=rows * columns)
+        # Where half of a cell is the plane's, its mean stands for the cell.
+        kept = np.flatnonzero(2 * count >= size * size)
+        if len(kept) < _FEWEST:
+            continue
+        own, y, ray = cells[mask], inverse[mask], rays[mask]
+        residual[mask] = y - ray @ fitted(ray, y)
+        sums = [np.bincount(own, part, len(count))[kept] for part in (y, *ray.T)]
+        found.append((kept, np.stack(sums, axis=1) / count[kept, None]))
+    step = np.where(labels[:, 1:] == labels[:, :-1], np.diff(residual, axis=1), np.nan)
+    jumps = np.stack([np.nansum(step, axis=0), np.isfinite(step).sum(axis=0)])
+    means = np.concatenate([np.empty((0, 4)), *(part for _, part in found)])
+    return Sightings(
+        np.zeros(len(found), np.intp),
+        np.concatenate([[0], np.cumsum([len(kept) for kept, _ in found])]).astype(np.intp),
+        np.concatenate([np.empty(0, np.intp), *(kept for kept, _ in found)]),
+        means[:, 0],
+        means[:, 1:],
+        jumps[None].astype(np.float64),
+    )
+
+
+def plane_pixels(
+    labels: NDArray[np.uint16], image: RangeImage
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Pixels of planes without their rims (H, W); inverse depth and rays (H, W, 3) at z = 1."""
+    kernel = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
+    inner = (labels > 0) & image.valid & (image.rays[..., 2] > 0)
+    inner &= cv2.erode(labels, kernel) == cv2.dilate(labels, kernel)
+    along = np.where(inner, image.rays[..., 2], 1).astype(np.float64)
+    inverse, rays = image.inverse.astype(np.float64), image.rays.astype(np.float64)
+    return inner, inverse / along, rays / along[..., None]
+
+
+def fitted(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Least-squares plane theta . ray = inverse depth of pixels (N, 3), (N,)."""
+    theta, *_ = np.linalg.lstsq(rays.T @ rays, rays.T @ inverse, rcond=None)
+    return np.asarray(theta, np.float64)
+
+
+def gathered(frames: Sequence[Sightings]) -> Sightings:
+    """Sightings of several frames, numbered one after the other."""
+    first = np.cumsum([0, *(len(part.jumps) for part in frames)])
+    counts = np.concatenate([np.diff(part.start) for part in frames])
+    return Sightings(
+        np.concatenate([part.frame + at for part, at in zip(frames, first, strict=False)]),
+        np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
+        np.concatenate([part.cell for part in frames]),
+        np.concatenate([part.inverse for part in frames]),
+        np.concatenate([part.ray for part in frames]),
+        np.concatenate([part.jumps for part in frames]),
+    )

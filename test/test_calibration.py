@@ -1,0 +1,164 @@
+"""Learning the distortion of a sensor: against a known field, and what cannot be learned."""
+
+import numpy as np
+import pytest
+from calibration_frames import CAMERA, NOISE, frames, rms, true_map
+
+from rangeseg_ros import RangeImage
+from rangeseg_ros.core.calibration.bands import column_profile
+from rangeseg_ros.core.calibration.calibrate import CalibrationError, calibrate
+from rangeseg_ros.core.calibration.field import solve
+from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
+from rangeseg_ros.core.calibration.sightings import cell_grid, gathered, sightings
+from rangeseg_ros.core.calibration.validation import without_plane
+from rangeseg_ros.simulation.fields import smooth_field
+
+
+def seen(count, error, **options):
+    return gathered([sightings(*frame) for frame in frames(count, error, **options)])
+
+
+@pytest.mark.parametrize('count', [15, 40])
+def test_known_field_is_recovered(count):
+    result = calibrate(seen(count, true_map()), CAMERA.shape, CAMERA)
+    off = rms(result.distortion.offset - true_map())
+    assert off < {15: 0.4, 40: 0.3}[count] * rms(true_map())
+    # As uncertain as it says, within what five blocks tell.
+    assert 0.3 < off / rms(result.distortion.deviation) < 3
+    assert result.after < 0.85 * result.before
+    assert result.distortion.slope is None and result.gain > 0.9
+
+
+def test_gauge_is_the_plane_over_what_was_seen():
+    def bottom_unseen(frame):
+        labels, image = frame
+        labels[45:] = 0
+        return labels, image
+
+    cells = gathered([sightings(*bottom_unseen(f)) for f in frames(20, true_map())])
+    offset = calibrate(cells, CAMERA.shape).distortion.offset.astype(float)
+    known = np.zeros(CAMERA.shape, bool)
+    known[:45] = True
+    assert not offset[46:].any()
+    v, u = np.nonzero(offset != 0)
+    terms = np.stack([u, v, np.ones(len(u))], axis=1)
+    plane, *_ = np.linalg.lstsq(terms, offset[v, u], rcond=None)
+    assert np.abs(terms @ plane).max() < 1e-6
+
+
+def test_bands_are_resolved_to_the_column():
+    step = np.where(np.arange(80) > 35, 0.002, 0.0) - 0.002 * np.arange(80) / 80
+    banded = true_map() + step
+    cells = seen(40, banded)
+    profile = column_profile(cells)
+    steps = np.diff(profile)
+    assert np.argmax(np.abs(steps)) == 35
+    assert steps[35] == pytest.approx(0.002, rel=0.15)
+    assert np.abs(np.delete(steps, 35)).max() < 0.0006
+    offset = calibrate(cells, CAMERA.shape).distortion.offset
+    change = np.diff(offset.mean(axis=0))
+    assert np.argmax(change) == 35 and change[35] > 0.0016
+
+
+def test_second_coefficient_where_the_range_is_offset():
+    offset = true_map(0.01)
+
+    def range_offset(inverse):
+        return inverse**2 * offset
+
+    result = calibrate(seen(40, range_offset), CAMERA.shape)
+    distortion = result.distortion
+    assert distortion.slope is not None
+    for inverse in (0.45, 0.6, 0.9):
+        error = distortion.offset + distortion.slope * (inverse - distortion.reference)
+        truth = inverse**2 * offset
+        known = np.ones(CAMERA.shape, bool)
+        off = without_plane(error - truth, known)
+        # A slope that is the same everywhere scales all planes and stays free.
+        assert rms(off) < 0.35 * rms(truth)
+
+
+def test_sensor_without_distortion_gets_a_field_below_its_uncertainty():
+    distortion = calibrate(seen(30, 0.0), CAMERA.shape).distortion
+    assert rms(distortion.offset) < max(rms(distortion.deviation), 2e-5)
+    assert rms(distortion.offset) < 0.1 * NOISE
+
+
+def test_joint_solution_is_that_of_dense_least_squares():
+    cells = seen(6, true_map(), noise=0.0)
+    grid = cell_grid(CAMERA.shape)
+    size, weight = grid[0] * grid[1], np.random.default_rng(0).uniform(0.5, 1, len(cells.cell))
+    found = solve(cells, np.ones((1, len(weight))), weight, grid, 1.0)[0]
+    planes = len(cells.frame)
+    design = np.zeros((len(weight), size + 3 * planes))
+    rows = np.arange(len(weight))
+    design[rows, cells.cell] = 1
+    for axis in range(3):
+        design[rows, size + 3 * cells.plane() + axis] = cells.ray[:, axis]
+    u, v = (np.eye(n)[1:] - np.eye(n)[:-1] for n in grid[::-1])
+    smooth = np.vstack([np.kron(np.eye(grid[0]), u), np.kron(v, np.eye(grid[1]))])
+    smooth = np.hstack([smooth, np.zeros((len(smooth), 3 * planes))])
+    root = np.sqrt(weight)[:, None]
+    solution, *_ = np.linalg.lstsq(
+        np.vstack([root * design, smooth]),
+        np.concatenate([root[:, 0] * cells.inverse, np.zeros(len(smooth))]),
+        rcond=1e-10,
+    )
+    known = np.ones(grid, bool)
+    expected = without_plane(solution[:size].reshape(grid), known)
+    assert without_plane(found.reshape(grid), known) == pytest.approx(
+        expected, abs=0.02 * rms(expected)
+    )
+
+
+def test_noise_and_what_remains_are_measured():
+    random = np.random.default_rng(1)
+    labels = np.ones(CAMERA.shape, np.uint16)
+    sums = np.zeros((2, len(LAGS)))
+    for _ in range(30):
+        error = 0.0005 * random.standard_normal(CAMERA.shape)
+        error += 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
+        depth = (1 / (CAMERA.rays.astype(float) @ [0.1, 0.1, 0.6] + error)).astype(np.float32)
+        sums += products(labels, RangeImage.from_depth(depth, CAMERA))
+    found = randomness(sums)
+    assert found.noise == pytest.approx(np.hypot(0.0005, 0.001), rel=0.05)
+    assert found.white_noise == pytest.approx(0.2, abs=0.05)
+    assert found.noise_correlation == pytest.approx(2.0, rel=0.15)
+    assert found.distortion < 0.0003
+    assert randomness(np.zeros((2, len(LAGS)))) is None
+
+
+@pytest.mark.parametrize(
+    ('options', 'words'),
+    [
+        ({'count': 6}, 'too few planes'),
+        ({'count': 20, 'depths': (1.99, 2.0)}, 'too few ranges'),
+    ],
+)
+def test_recordings_that_do_not_hold_it_are_refused_with_advice(options, words):
+    cells = seen(options.pop('count'), true_map(), **options)
+    if words == 'too few ranges':
+        # Head-on, so that slant does not make distances.
+        cells = cells._replace(inverse=np.full_like(cells.inverse, 0.5))
+    with pytest.raises(CalibrationError, match=f'{words}.*record walls'):
+        calibrate(cells, CAMERA.shape)
+
+
+def test_views_of_one_corner_are_refused():
+    def corner(frame):
+        labels, image = frame
+        labels[20:] = 0
+        return labels, image
+
+    cells = gathered([sightings(*corner(f)) for f in frames(20, true_map())])
+    with pytest.raises(CalibrationError, match='too few positions: planes cover'):
+        calibrate(cells, CAMERA.shape)
+
+
+def test_clouds_are_seen_as_depth_images_are():
+    labels, image = next(frames(1, true_map()))
+    cloud = RangeImage.from_points(image.points)
+    one, other = sightings(labels, image), sightings(labels, cloud)
+    assert np.array_equal(one.cell, other.cell)
+    assert other.inverse == pytest.approx(one.inverse, rel=1e-5)
+    assert other.ray == pytest.approx(one.ray, abs=1e-5)
