@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import warnings
 from importlib import import_module
@@ -60,6 +61,8 @@ def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     interrupts.watch()
+    # Errors are told here, in one line.
+    os.environ.setdefault('OPENCV_LOG_LEVEL', 'SILENT')
     warnings.showwarning = _warn
     try:
         # Without its standalone mode click returns the code that a command exits with.

@@ -75,7 +75,7 @@ def command(
     without: list[str] = []
     with DepthBagWriter(output, camera) as bag:
         for index, path in enumerate(options.progress(paths, len(paths), 'image')):
-            depth = read_depth(path)
+            depth = read_depth(path, camera.shape)
             if depth.dtype != np.uint16:
                 depth = np.float32(depth_scale or 1) * depth.astype(np.float32)
             elif depth_scale not in (None, 0.001):

@@ -67,7 +67,7 @@ def command(
     options.check_new(outputs, inputs, overwrite)
     for path in options.progress(depth, len(depth), 'image'):
         try:
-            image = RangeImage.from_depth(read_depth(path), camera, depth_scale)
+            image = RangeImage.from_depth(read_depth(path, camera.shape), camera, depth_scale)
             image = corrected(image, segmenter.config)
         except (RangeImageError, DistortionError) as error:
             raise click.ClickException(f'{path}: {error}') from None

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import numbers
+import reprlib
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
+
+import numpy as np
 
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
 PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
@@ -367,6 +371,11 @@ RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 
 
+def known_name(name: object) -> bool:
+    """Whether a parameter is, or was, called so."""
+    return name in RENAMED or any(name == option_field.name for option_field in fields(Config))
+
+
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
     result = {name: value for name, value in mapping.items() if name not in RENAMED}
@@ -386,12 +395,14 @@ def _checked(option_field: Any, value: Any) -> Any:
     name, kind = option_field.name, type(option_field.default)
     low, high = option_field.metadata['low'], option_field.metadata['high']
     choices = option_field.metadata['choices']
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ConfigError(f'parameter {name} must be of type {kind.__name__}, not {value!r}')
+    shown = reprlib.repr(value)
+    # Numbers of numpy are numbers; True is none.
+    kinds: dict[type, Any] = {int: numbers.Integral, float: numbers.Real, bool: (bool, np.bool_)}
+    accepted = kinds.get(kind, kind)
+    if not isinstance(value, accepted) or (kind is not bool and isinstance(value, bool)):
+        raise ConfigError(f'parameter {name} must be of type {kind.__name__}, not {shown}')
     if choices and value not in choices:
-        raise ConfigError(f'parameter {name} must be one of {", ".join(choices)}, not {value!r}')
+        raise ConfigError(f'parameter {name} must be one of {", ".join(choices)}, not {shown}')
     if low is not None and not low <= value <= high:
-        raise ConfigError(f'parameter {name} must be in [{low:g}, {high:g}], not {value!r}')
-    return value
+        raise ConfigError(f'parameter {name} must be in [{low:g}, {high:g}], not {shown}')
+    return kind(value)

@@ -10,6 +10,7 @@ import yaml
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
 
 def read_camera(path: Path, raw: bool = False) -> Camera:
@@ -27,11 +28,9 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
         A missing or unreadable file, or one without valid intrinsics.
     """
     try:
-        calibration = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise CameraError(f'{path}: {error.strerror}') from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise CameraError(f'{path}: not a YAML file') from None
+        calibration = read_yaml(path)
+    except YamlError as error:
+        raise CameraError(str(error)) from None
     if not isinstance(calibration, dict):
         raise CameraError(f'{path}: not a camera calibration')
     try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import warnings
 from pathlib import Path
 
 import cv2
@@ -9,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.io.files import replacing
+from rangeseg_ros.messages.images import png_is_whole, png_shape
 
 
 class ImageFileError(ValueError):
     """A file that is no image of the kind asked for."""
 
 
-def read_depth(path: Path) -> NDArray:
+def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     """Read a depth image: 16-bit PNG or TIFF, or floating-point TIFF.
+
+    Parameters
+    ----------
+    path : Path
+    shape : (int, int), optional
+        (H, W) that the image must have; one of another size is not decoded.
 
     Returns
     -------
@@ -25,9 +34,15 @@ def read_depth(path: Path) -> NDArray:
     Raises
     ------
     ImageFileError
-        A missing or unreadable file, several channels, or another type such as 8 bits.
+        A missing or unreadable file, several channels, another type such as 8 bits, or another
+        size.
+
+    Warns
+    -----
+    UserWarning
+        A TIFF of several pages, of which the first is read.
     """
-    image = _read(path)
+    image = _read(path, shape)
     if image.ndim != 2:
         raise ImageFileError(
             f'{path}: depth image must have one channel, not {image.shape[2]} (colour?)'
@@ -75,15 +90,57 @@ def write_image(path: Path, image: NDArray) -> None:
         partial.write_bytes(data.tobytes())
 
 
-def _read(path: Path) -> NDArray:
+def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise ImageFileError(f'{path}: not a regular file')
+        data = path.read_bytes()
     except OSError as error:
         raise ImageFileError(f'{path}: {error.strerror}') from None
+    size, pages = png_shape(data), 1
+    # What is damaged is told from its frame, of which the libraries would complain in many lines.
+    whole = size is not None and png_is_whole(data)
+    if size is None:
+        size, pages = tiff_shape(data)
+        whole = size is not None
+    if size and shape and size != shape:
+        raise ImageFileError(
+            f'{path}: image is {size[1]}x{size[0]}, not {shape[1]}x{shape[0]} as its camera'
+        )
     try:
-        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+        pixels = np.frombuffer(data, np.uint8)
+        image = cv2.imdecode(pixels, cv2.IMREAD_UNCHANGED) if whole else None
     except cv2.error:
         image = None
     if image is None:
-        raise ImageFileError(f'{path}: not a readable image')
+        raise ImageFileError(f'{path}: not a readable image (PNG or TIFF)')
+    if pages > 1:
+        warnings.warn(f'{path}: only the first of {pages} pages is read', stacklevel=3)
     return image
+
+
+def tiff_shape(data: bytes) -> tuple[tuple[int, int] | None, int]:
+    """(H, W) of the first page of a TIFF or BigTIFF, and the number of pages; None for others."""
+    order = {b'II': '<', b'MM': '>'}.get(data[:2])
+    try:
+        if not order or struct.unpack_from(f'{order}H', data, 2)[0] not in (42, 43):
+            return None, 0
+        big = struct.unpack_from(f'{order}H', data, 2)[0] == 43
+        pointer, count, entry = ('Q', 'Q', 20) if big else ('I', 'H', 12)
+        (start,) = struct.unpack_from(order + pointer, data, 8 if big else 4)
+        shape, starts = None, set()
+        while start and start not in starts:
+            starts.add(start)
+            (entries,) = struct.unpack_from(order + count, data, start)
+            first = start + struct.calcsize(count)
+            if shape is None:
+                tags = {}
+                for at in range(first, first + entries * entry, entry):
+                    tag, kind = struct.unpack_from(f'{order}HH', data, at)
+                    code = {3: 'H', 4: 'I', 16: 'Q'}.get(kind, 'H')
+                    tags[tag] = struct.unpack_from(order + code, data, at + (12 if big else 8))[0]
+                shape = tags[257], tags[256]
+            (start,) = struct.unpack_from(order + pointer, data, first + entries * entry)
+    except (struct.error, KeyError):
+        return None, 0
+    return shape, len(starts)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import yaml
-
-from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.config import Config, ConfigError, known_name
+from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
 NODE = 'segment_planes'
 # Parameters that the node has beyond those of the segmenter; nested ones by their first part.
@@ -23,35 +24,66 @@ def read_params(path: Path) -> dict[str, Any]:
     ----------
     path : Path
         Names and values, or a ROS parameter file: of that, the sections of the node
-        `segment_planes` in any namespace and of the wildcard `/**`, without `NODE_ONLY`.
+        `segment_planes` in any namespace and of the wildcards `/**` and `/*`, without `NODE_ONLY`.
+        A section of a wildcard may be for other nodes as well.
 
     Raises
     ------
     ConfigError
         A missing or unreadable file, or one without parameters.
+
+    Warns
+    -----
+    UserWarning
+        A section of a wildcard has names that are none of the segmenter's: they are left out.
     """
     try:
-        content = yaml.safe_load(path.read_text())
-    except OSError as error:
-        raise ConfigError(f'{path}: {error.strerror}') from None
-    except (UnicodeDecodeError, yaml.YAMLError):
-        raise ConfigError(f'{path}: not a YAML file') from None
+        content = read_yaml(path)
+    except YamlError as error:
+        raise ConfigError(str(error)) from None
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ConfigError(f'{path}: not a mapping of parameter names to values')
-    sections = {name: part for name, part in content.items() if isinstance(part, dict)}
-    if not sections:
+    content = _without_node_only(content)
+    if not any(isinstance(part, dict) for part in content.values()):
         return content
     merged: dict[str, Any] = {}
-    for name, section in sections.items():
-        if str(name).rpartition('/')[2] in (NODE, '**'):
-            merged.update(section.get('ros__parameters') or {})
-    if not merged:
+    found = False
+    for node, section in _sections(path, content):
+        if node not in (NODE, '*', '**'):
+            continue
+        found = True
+        own = _without_node_only(section)
+        if node != NODE:
+            foreign = sorted(str(name) for name in own if not known_name(name))
+            if foreign:
+                warnings.warn(f'{path}: left out {", ".join(foreign)}', stacklevel=2)
+            own = {name: value for name, value in own.items() if known_name(name)}
+        merged.update(own)
+    if not found:
         raise ConfigError(f'{path}: no ros__parameters of {NODE}')
+    return merged
+
+
+def _sections(path: Path, content: dict[Any, Any]) -> Iterator[tuple[str, dict[Any, Any]]]:
+    """Last part of the name of each node, which namespaces may surround, and its parameters."""
+    for name, part in content.items():
+        if not isinstance(part, dict):
+            raise ConfigError(f'{path}: {name} is no section with ros__parameters')
+        if 'ros__parameters' not in part:
+            yield from _sections(path, part)
+            continue
+        section = part['ros__parameters']
+        if not isinstance(section, dict | type(None)):
+            raise ConfigError(f'{path}: ros__parameters of {name} is no mapping')
+        yield str(name).rpartition('/')[2], section or {}
+
+
+def _without_node_only(section: dict[Any, Any]) -> dict[Any, Any]:
     return {
         name: value
-        for name, value in merged.items()
+        for name, value in section.items()
         if str(name).partition('.')[0] not in NODE_ONLY
     }
 

@@ -37,6 +37,8 @@ def read_pcd(path: Path) -> dict[str, NDArray]:
         return _parse(data)
     except PcdError as error:
         raise PcdError(f'{path}: {error}') from None
+    except (ValueError, OverflowError, MemoryError):
+        raise PcdError(f'{path}: malformed or far too large') from None
 
 
 def _parse(data: bytes) -> dict[str, NDArray]:
@@ -117,6 +119,8 @@ def _records(body: bytes, dtype: np.dtype, points: int) -> NDArray:
 
 def _ascii(body: bytes, dtype: np.dtype, points: int) -> NDArray:
     lines = body.split(b'\n')[:points]
+    if len(lines) < points:
+        raise PcdError(f'malformed or truncated: expected {points} lines of numbers')
     records = np.zeros(points, dtype)
     widths = [int(np.prod(dtype[name].shape)) for name in dtype.names or ()]
     try:

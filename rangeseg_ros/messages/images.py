@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from typing import Any
+from zlib import crc32
 
 import cv2
 import numpy as np
@@ -145,7 +146,8 @@ def decode_compressed(
             f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
         )
     try:
-        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if size and _fits(png, size) else None
+        whole = size is not None and png_is_whole(png.tobytes())
+        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if whole else None
     except cv2.error:
         image = None
     if image is None:
@@ -171,16 +173,21 @@ def png_shape(data: bytes) -> tuple[int, int] | None:
     return height, width
 
 
-def _fits(png: NDArray[np.uint8], size: tuple[int, int]) -> bool:
-    """Whether a PNG can hold what it promises: OpenCV would take gigabytes for a damaged length.
+def png_is_whole(data: bytes) -> bool:
+    """Whether a PNG has all its parts with their checksums, and can hold the pixels it promises.
 
-    Its chunks must lie within it, and deflate packs no more than 1032 bytes into one.
+    OpenCV would take gigabytes for a damaged length, and libpng complain on stderr.
     """
     at = 8
-    while at + 12 <= len(png):
-        if png[at + 4 : at + 8].tobytes() == b'IEND':
-            return 2 * size[0] * size[1] <= 1032 * len(png)
-        at += 12 + int(png[at : at + 4].view('>u4')[0])
+    while at + 12 <= len(data):
+        end = at + 12 + int.from_bytes(data[at : at + 4], 'big')
+        if crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], 'big'):
+            return False
+        if data[at + 4 : at + 8] == b'IEND':
+            height, width = png_shape(data) or (0, 0)
+            # Deflate packs no more than 1032 bytes into one; a pixel has a bit or more.
+            return height * width <= 8 * 1032 * len(data)
+        at = end
     return False
 
 

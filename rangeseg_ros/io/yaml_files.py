@@ -1,0 +1,61 @@
+"""YAML files that people write: small, and not made to be read for ever."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+_LARGEST = 2**20
+"""Bytes; of calibrations and parameters a thousand times what they have."""
+
+
+class YamlError(ValueError):
+    """A file that cannot be read as YAML."""
+
+
+def read_yaml(path: Path) -> Any:
+    """Content of a YAML file.
+
+    Raises
+    ------
+    YamlError
+        A missing file or one that cannot be read; no YAML; one that is too large, also by its
+        aliases, too deep or endless.
+    """
+    try:
+        size = path.stat().st_size
+        if not path.is_file():
+            raise YamlError(f'{path}: not a regular file')
+        if size > _LARGEST:
+            raise YamlError(f'{path}: too large for such a file')
+        content = yaml.safe_load(path.read_text())
+        if _size(content, {}) > _LARGEST:
+            raise YamlError(f'{path}: too large for such a file')
+    except OSError as error:
+        raise YamlError(f'{path}: {error.strerror}') from None
+    except RecursionError:
+        raise YamlError(f'{path}: nested too deeply') from None
+    except YamlError:
+        raise
+    # Not of YAML alone: dates and numbers raise errors of Python.
+    except (ValueError, OverflowError, yaml.YAMLError):
+        raise YamlError(f'{path}: not a YAML file') from None
+    return content
+
+
+def _size(content: Any, known: dict[int, int | None]) -> int:
+    """Number of values, those behind aliases as often as they are named."""
+    if not isinstance(content, dict | list | tuple | set):
+        return 1
+    key = id(content)
+    if key in known:
+        size = known[key]
+        if size is None:  # it holds itself
+            raise RecursionError
+        return size
+    known[key] = None
+    parts = [*content, *content.values()] if isinstance(content, dict) else content
+    known[key] = size = 1 + sum(_size(part, known) for part in parts)
+    return size
