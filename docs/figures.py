@@ -124,9 +124,7 @@ def stages(image, config):
     surface, _ = surfaces(moments, links, size, least // 2)
     pictures['surfaces'] = over(image, surface, size)
 
-    labelling = method.segment(
-        bridges, image.inverse, fine, grid, sensor, config, lambda stage: None
-    )
+    labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)
     labels = labelling.labels
     pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
     regions = labelling.flat(plane_regions(labels, labels > 0, grid, config.noise_regions, least))

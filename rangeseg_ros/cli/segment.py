@@ -39,6 +39,11 @@ from rangeseg_ros.io.images import read_depth
     help='Also write <stem>_normals.tiff: the reconstructed normals, float32, red, green and blue '
     'are x, y and z towards the sensor, NaN where there is no plane.',
 )
+@click.option(
+    '--sensor',
+    is_flag=True,
+    help='Also print the errors of the sensor as every image shows them.',
+)
 def command(
     depth: tuple[Path, ...],
     camera_file: Path,
@@ -49,6 +54,7 @@ def command(
     overwrite: bool,
     exact: bool,
     normals: bool,
+    sensor: bool,
 ) -> None:
     """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
 
@@ -76,3 +82,5 @@ def command(
         write_frame(output, path.stem, image, result, files)
         found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
         click.echo(f'{path}: {found}')
+        if sensor:
+            click.echo(f'{path}: {result.sensor}')

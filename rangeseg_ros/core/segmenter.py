@@ -187,7 +187,7 @@ class Segmenter:
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, labelling = method(whole, image.inverse, blocks, grid, sensor, watch)
+        regions, labelling = method(whole, blocks, grid, sensor, watch)
         if config.method == 'planes':
             regions, fits = by_planes.united(regions, image, sensor, grid)
         else:
@@ -209,7 +209,6 @@ class Segmenter:
     def _by_planes(
         self,
         image: RangeImage,
-        measured: NDArray[np.float32],
         blocks: Blocks,
         grid: Grid,
         sensor: SensorModel,
@@ -218,7 +217,7 @@ class Segmenter:
         """Regions and the labelling they are made from, by planes as labels."""
         config = self.config
         least = least_pixels(config.min_pixels, image.shape)
-        labelling = by_planes.segment(image, measured, blocks, grid, sensor, config, watch.lap)
+        labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
         regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
         regions = labelling.flat(regions)
@@ -228,7 +227,6 @@ class Segmenter:
     def _by_normals(
         self,
         image: RangeImage,
-        measured: NDArray[np.float32],
         blocks: Blocks,
         grid: Grid,
         sensor: SensorModel,

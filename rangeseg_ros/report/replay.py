@@ -11,6 +11,7 @@ import numpy as np
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.drawing import normals_picture
 from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import Picture, as_jpeg, common, spread, stage_table, write_page
@@ -45,6 +46,7 @@ class ReplayReport:
         self._pictures: list[Picture] = []
         self._normals: list[tuple[str, int]] = []
         self._stride = 1
+        self._sensors: list[SensorModel] = []
 
     @property
     def frames(self) -> int:
@@ -63,6 +65,7 @@ class ReplayReport:
                 self._normals, self._stride = self._normals[::2], 2 * self._stride
         self._stamps.append(stamp)
         self._timings.append(result.timings)
+        self._sensors.append(result.sensor)
         if not result.planes:
             self.reasons[result.reason] += 1
 
@@ -87,6 +90,9 @@ class ReplayReport:
             name=self.name,
             damage=damage,
             frames=self.frames,
+            sensor=str(SensorModel(*np.median(self._sensors, axis=0).tolist()))
+            if self._sensors
+            else '',
             **self.figures(),
             pictures=spread(self._pictures),
             normals=self._normals,

@@ -106,6 +106,8 @@ class FrameStatistics:
         Number of planes in the last frame.
     reason : str
         Why there is none.
+    sensor : str
+        Errors of the sensor as the last frame shows them.
     times : FrameTimes or None
         Of the last frame.
     """
@@ -122,6 +124,7 @@ class FrameStatistics:
         self.missing = ''
         self.planes = 0
         self.reason = ''
+        self.sensor = ''
         self.times: FrameTimes | None = None
         self._unanswered: float | None = None
 
@@ -167,6 +170,7 @@ class FrameStatistics:
             **{f'{what} from': source for what, source in self.sources.items()},
             'planes': str(self.planes),
             'reason for no planes': self.reason,
+            'sensor': self.sensor,
         }
         if self.times:
             values.update(self.times.values(1000 * stall_timeout))

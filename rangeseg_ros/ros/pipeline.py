@@ -205,6 +205,7 @@ class Pipeline:
         )
         statistics.planes = len(found.planes)
         statistics.reason = found.reason
+        statistics.sensor = str(found.sensor)
         statistics.answered(statistics.published)
 
     def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:

@@ -66,7 +66,6 @@ class Labelling:
 
 def segment(
     image: RangeImage,
-    measured: NDArray[np.float32],
     blocks: Blocks,
     grid: Grid,
     sensor: SensorModel,
@@ -79,8 +78,6 @@ def segment(
     ----------
     image : RangeImage
         (H, W), holes bridged.
-    measured : (H, W) float32
-        Inverse ranges without what was bridged.
     blocks : Blocks
         Of 4 x 4 pixels, without what was bridged.
     grid : Grid
@@ -96,7 +93,8 @@ def segment(
     if size == 2 * BLOCK:
         blocks = Blocks.planes(quads(blocks.moments), image.rays, size)
     elif size != BLOCK:
-        blocks = Blocks.planes(block_moments(measured, image.rays, size), image.rays, size)
+        # With what was bridged: a row of three pixels alone determines no plane.
+        blocks = Blocks.planes(block_moments(image.inverse, image.rays, size), image.rays, size)
     # Of a block of holes, a quarter measured will do.
     whole = whole_blocks(image.inverse, grid, size)
     whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)

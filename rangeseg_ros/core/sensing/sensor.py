@@ -71,6 +71,28 @@ class SensorModel(NamedTuple):
             config.pixel_noise,
         )
 
+    def __str__(self) -> str:
+        """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ...
+
+        Correlated over as many pixels as the correlation along a line sums to.
+        """
+        said = [
+            f'{name} {value:.2g} {unit}'
+            for name, value, unit in (
+                ('noise', self.noise, '1/m'),
+                ('range noise', self.range_noise, 'm'),
+                ('distortion', self.distortion, '1/m'),
+                ('range distortion', self.range_distortion, 'm'),
+                ('steps of', self.quantum, '1/m'),
+                ('steps of', self.range_quantum, 'm'),
+            )
+            if value > 0
+        ]
+        over = 2 * np.sqrt(np.pi) * self.correlation
+        if self.white < 0.5 and over > 1:
+            said.insert(1, f'correlated over {over:.0f} px')
+        return ', '.join(said)
+
     @property
     def patch(self) -> float:
         """Pixels that count as one measurement of the labelling, which compares neighbours.
