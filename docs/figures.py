@@ -26,7 +26,7 @@ from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.sensing.blocks import Blocks, quads
 from rangeseg_ros.core.sensing.bridges import bridged
 from rangeseg_ros.core.sensing.grid import weights
-from rangeseg_ros.core.sensing.jump_edges import jump_edges, pixels_beside
+from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
@@ -58,12 +58,11 @@ def main():
 def normals(image):
     """Observed normals and jump edges above, those of method normals and planes below."""
     config = Config(method='normals')
-    jumps = jump_edges(image, config)
-    observed = observed_normals(image, weights(image, jumps), config)
-    edges = np.repeat(255 * pixels_beside(jumps).astype(np.uint8)[..., None], 3, axis=2)
-    found = [Segmenter(Config(method=name)).segment(image).normals for name in METHODS]
+    results = [Segmenter(Config(method=name)).segment(image) for name in METHODS]
+    observed = observed_normals(image, weights(image, results[0].jumps), config)
+    edges = np.repeat(255 * results[0].edges.astype(np.uint8)[..., None], 3, axis=2)
     above = [normals_picture(observed), edges]
-    below = [normals_picture(one) for one in found]
+    below = [normals_picture(result.normals) for result in results]
     return np.vstack([np.hstack([fitted(one) for one in row]) for row in (above, below)])
 
 
