@@ -126,7 +126,7 @@ def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):
     cv2.imwrite(str(tmp_path / 'large.tiff'), np.zeros((300, 400), np.uint16))
     monkeypatch.setattr(cv2, 'imdecode', None)
     for name, size in (('large.png', '20000x20000'), ('large.tiff', '400x300')):
-        with pytest.raises(ImageFileError, match=f'{size}, not 64x48'):
+        with pytest.raises(ImageFileError, match=f'is {size}, its camera 64x48'):
             read_depth(tmp_path / name, (48, 64))
 
 

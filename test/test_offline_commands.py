@@ -205,7 +205,7 @@ def test_bad_input_of_pack(folder, run):
     assert 'empty: no .png' in refused('empty')
     assert '--rate' in refused('depth', '--rate', 0)
     write_image(folder / 'depth/11.png', np.zeros((48, 65), np.uint16))
-    assert 'depth/11.png: depth image must be' in refused('depth')
+    assert 'depth/11.png: depth image is 65x48, its camera 64x48' in refused('depth')
     (folder / 'depth/11.png').unlink()
     (folder / 'bag').mkdir()
     code, _, error = run('pack', 'depth', '--camera', 'camera.yaml', '--output', 'bag')

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import Recording
 
 pytest.importorskip('rclpy')
 
@@ -117,3 +118,14 @@ time.sleep(0.5)
     assert camera.returncode == 0
     values = {value.key: value.value for value in status.values}
     assert values['messages lost by the middleware'] == '0'
+
+
+def test_topics_that_ros_refuses_are_left_out(tmp_path, run):
+    pytest.importorskip('rclpy')
+    recording = Recording()
+    recording.add_camera(1, topic='/a b')
+    recording.add_camera(2, topic='/fine')
+    recording.write(tmp_path / 'bag')
+    code, output, _ = run('play', tmp_path / 'bag', '--delay', '0')
+    assert code == 0 and "'/a b' is no topic of ROS 2, left out" in output
+    assert run('play', tmp_path / 'bag', '--delay', 'nan')[0] == 2

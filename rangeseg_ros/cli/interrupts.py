@@ -14,6 +14,8 @@ def watch() -> None:
     These end the command as errors do: what was begun is put away. Who ignores any of them still
     does.
     """
+    global _received
+    _received = 0
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _on_signal)

@@ -18,7 +18,7 @@ from rangeseg_ros.cli import options
 @click.argument('bag', type=click.Path(exists=True, path_type=Path))
 @click.option(
     '--rate',
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.Finite(min=0, min_open=True),
     default=1.0,
     show_default=True,
     help='Speed: 2 plays twice as fast as recorded.',
@@ -27,7 +27,7 @@ from rangeseg_ros.cli import options
 @click.option('--wait', is_flag=True, help='Start only when every topic has a subscriber.')
 @click.option(
     '--delay',
-    type=click.FloatRange(min=0),
+    type=options.Finite(min=0),
     default=1.0,
     show_default=True,
     help='Seconds before the first message, for subscribers to find the topics.',
@@ -77,6 +77,8 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float) -> Non
 
 def _publishers(node: Any, connections: list[Connection]) -> dict[str, Any]:
     """Publishers of the topics whose message classes are installed."""
+    from rclpy.exceptions import InvalidNamespaceException, InvalidTopicNameException
+
     from rangeseg_ros.messages.make import message_class
 
     publishers = {}
@@ -87,9 +89,12 @@ def _publishers(node: Any, connections: list[Connection]) -> dict[str, Any]:
             click.echo(f'{connection.topic}: {connection.msgtype} is not installed, left out')
             continue
         if connection.topic not in publishers:
-            publishers[connection.topic] = node.create_publisher(
-                kind, connection.topic, _qos(connection)
-            )
+            try:
+                publishers[connection.topic] = node.create_publisher(
+                    kind, connection.topic, _qos(connection)
+                )
+            except (InvalidTopicNameException, InvalidNamespaceException):
+                click.echo(f'{connection.topic!r} is no topic of ROS 2, left out')
     return publishers
 
 

@@ -34,7 +34,7 @@ from rangeseg_ros.tasks import run_all
     '--factor',
     'factors',
     multiple=True,
-    type=click.FloatRange(min=0, min_open=True),
+    type=options.Finite(min=0, min_open=True),
     default=(0.5, 0.71, 1.41, 2.0),
     show_default=True,
     help='What the constants are multiplied with.',

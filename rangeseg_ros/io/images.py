@@ -105,7 +105,7 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
         whole = size is not None
     if size and shape and size != shape:
         raise ImageFileError(
-            f'{path}: image is {size[1]}x{size[0]}, not {shape[1]}x{shape[0]} as its camera'
+            f'{path}: depth image is {size[1]}x{size[0]}, its camera {shape[1]}x{shape[0]}'
         )
     try:
         pixels = np.frombuffer(data, np.uint8)
