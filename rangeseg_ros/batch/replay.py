@@ -216,7 +216,7 @@ def segmented(
                 continue
             image = corrected(image, sequence.config)
             at = place(frame)
-            result = sequence.segment(image, frame.stamp, at.up, at.pose)
+            result = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
             yield done + source.lost.total(), frame, image, result
             done += 1
     except DamagedBagError as error:

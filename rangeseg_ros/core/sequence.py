@@ -59,6 +59,7 @@ class SequenceSegmenter:
         stamp: int,
         up: ArrayLike | None = None,
         pose: Transform | None = None,
+        height: float | None = None,
     ) -> Segmentation:
         """Label the next frame; ids and roles of its planes are set.
 
@@ -72,6 +73,8 @@ class SequenceSegmenter:
             Direction in the frame of the image, the configured one when not given.
         pose : Transform, optional
             Fixed frame from the frame of the image: the planes then count for `map`.
+        height : float, optional
+            Of the sensor above the ground, metres, where the parameter `sensor_height` is 0.
         """
         if stamp < self._stamp:
             self._segmenter.reset()
@@ -91,6 +94,8 @@ class SequenceSegmenter:
         survey = result.survey
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=unit(up))
+        if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
+            survey = replace(survey, sensor_height=height)
         return replace(result, planes=planes, survey=survey)
 
 

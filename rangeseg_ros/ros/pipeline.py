@@ -137,7 +137,7 @@ class Pipeline:
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(sequence.config, frame)
-        found = sequence.segment(image, frame.stamp, at.up, at.pose)
+        found = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
         self._tell(sequence, at)
         ticks.append(time.perf_counter())
         doing()

@@ -1,0 +1,83 @@
+"""Where a camera is: frames first, then the accelerometer, then the parameters."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.mapping.placement import moved_planes, placed
+from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+PITCH = Rotation.from_euler('y', 30, degrees=True)
+MOUNT = Transform((PITCH * Rotation.from_matrix(OPTICAL_IN_BODY)).as_matrix(), np.array([0, 0, 1]))
+UP = (0, -np.cos(np.radians(30)), -np.sin(np.radians(30)))
+
+
+def known(**frames):
+    def lookup(target, source):
+        if (target, source) not in frames.get('pairs', {}):
+            raise TransformError(f'frame {target!r} is not known', may_come=True)
+        return frames['pairs'][target, source]
+
+    return lookup
+
+
+def test_up_and_height_come_from_the_gravity_frame():
+    lookup = known(pairs={('base_footprint', 'camera'): MOUNT})
+    found = placed(Config(gravity_frame='base_footprint'), 'camera', lookup)
+    np.testing.assert_allclose(found.up, UP, atol=1e-12)
+    assert found.height == 1 and found.sources == {'up': 'base_footprint'}
+    assert not found.missing and not found.may_come
+
+
+def test_the_accelerometer_takes_its_place_and_then_the_parameters():
+    config = Config(gravity_frame='base_footprint', fixed_frame='odom')
+    turned = Transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.ones(3))
+    lookup = known(pairs={('camera', 'imu'): turned})
+    found = placed(config, 'camera', lookup, ('imu', np.array([0, 9.8, 0])))
+    np.testing.assert_allclose(found.up, (-9.8, 0, 0), atol=1e-12)
+    assert found.sources['up'].startswith('imu in imu; no base_footprint')
+    assert found.may_come and found.height is None and found.pose is None
+    assert set(found.missing) == {'up', 'fixed frame'}
+    # In the frame of the images no transform is needed; in an unknown one, parameters hold.
+    assert placed(Config(), 'camera', known(), ('camera', np.ones(3))).up is not None
+    found = placed(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
+    assert found.up is None and not found.may_come
+    assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
+
+
+def test_planes_of_another_frame_are_the_same_planes():
+    labels = np.ones(CAMERA.shape, np.uint16)
+    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
+    image = RangeImage(CAMERA.rays, inverse, CAMERA)
+    planes = fit_planes(labels, image, SensorModel.from_config(Config()))
+    (plane,), (moved,) = planes, moved_planes(planes, MOUNT)
+    points = plane.hull @ MOUNT.rotation.T + MOUNT.shift
+    np.testing.assert_allclose(moved.hull, points, atol=1e-12)
+    np.testing.assert_allclose(moved.hull @ moved.normal + moved.distance, 0, atol=1e-6)
+    np.testing.assert_allclose(moved.hull @ moved.normal, -moved.distance, atol=1e-6)
+    lever = np.append(plane.centroid, 1)
+    there = np.append(moved.centroid, 1)
+    assert there @ moved.covariance @ there == pytest.approx(lever @ plane.covariance @ lever)
+    frame = Rotation.from_quat(moved.orientation).as_matrix()
+    np.testing.assert_allclose(frame[:, 2], moved.normal, atol=1e-9)
+    back = moved_planes([moved], MOUNT.inverse())[0]
+    np.testing.assert_allclose(back.normal, plane.normal, atol=1e-12)
+    assert back.distance == pytest.approx(plane.distance)
+
+
+@pytest.mark.parametrize(('parameter', 'expected'), [(0.0, 1.0), (0.9, 0.9)])
+def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
+    down = -CAMERA.rays @ np.array(UP)
+    depth = np.where(down > 0.1, 1 / np.maximum(down, 0.1), 0).astype(np.float32)
+    sequence = SequenceSegmenter(Config(sensor_height=parameter))
+    image = RangeImage.from_depth(depth, CAMERA)
+    result = sequence.segment(image, 10**9, UP, height=1.0)
+    assert result.survey.sensor_height == expected
