@@ -178,7 +178,10 @@ class Segmenter:
         if config.sensor_model == 'measured':
             sensor = measured_sensor(image, blocks, sensor)
         watch.lap('noise')
-        steps, slopes = jump_steps(blocks, sensor)
+        # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
+        # a surface seen at a grazing angle costs it less than one too few.
+        grazing = sensor.pixel_noise if config.method == 'planes' else 0.0
+        steps, slopes = jump_steps(blocks, sensor._replace(pixel_noise=grazing))
         if config.edge_step > 0:
             steps = np.full_like(steps, config.edge_step)
         # What was measured tells the planes; where they end is told with small holes bridged.
