@@ -46,6 +46,7 @@ setup(
         (share, ['package.xml']),
         (f'{share}/launch', glob('launch/*.py')),
         (f'{share}/params', glob('params/*')),
+        (f'{share}/rviz', glob('rviz/*')),
         # `ros2 run` looks here. colcon puts the console scripts here as well, by setup.cfg; pip
         # does not.
         (f'lib/{package_name}', glob('scripts/*')),

@@ -169,7 +169,7 @@ class Bench:
     def spin(self, seconds):
         self.until(lambda: False, seconds, required=False)
 
-    def until(self, condition, timeout=60.0, required=True):
+    def until(self, condition, timeout=180.0, required=True):
         """Spin until the condition holds; its value."""
         end = time.monotonic() + timeout
         while not (value := condition()) and time.monotonic() < end:

@@ -1,8 +1,14 @@
 """Faults the node must survive, over real DDS: the next good frame is segmented."""
 
+import os
+import re
+import signal
+import subprocess
 import sys
 import time
 from array import array
+from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,12 +17,14 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
+from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 
+NODE = [sys.executable, '-m', 'rangeseg_ros.ros.node']
 LOST = 'messages lost by the middleware'
 
 
@@ -227,6 +235,74 @@ def test_losses_while_sizes_change_cost_no_memory():
         assert bench.log().count('said once') == 1
 
 
+def test_camera_info_of_another_stamp_is_not_that_of_the_image(bench):
+    """Zoom: the image comes 20 ms before its camera_info, which differs from the one before."""
+    for focal in (100.0, 200.0, 100.0):
+        image = bench.image()
+        bench.depth.publish(image)
+        bench.spin(0.02)
+        k = [focal, 0.0, 79.5, 0.0, focal, 59.5, 0.0, 0.0, 1.0]
+        bench.camera_info.publish(bench.info(k=k, header=image.header))
+        bench.labels_of(image)
+    status = bench.status(lambda status: values_of(status)['camera_info'])
+    assert values_of(status)['camera_info'] == 'of the stamp of the image'
+
+
+@pytest.mark.slow
+def test_sizes_from_small_to_12_megapixels_whose_memory_comes_back(bench):
+    def resident():
+        pages = Path(f'/proc/{bench.process.pid}/statm').read_text().split()[1]
+        return int(pages) * os.sysconf('SC_PAGE_SIZE') / 2**20
+
+    def segment(width, height):
+        camera = kinect_camera(width, height)
+        labels = bench.segment(bench.image(corner_depth(camera)), bench.info(camera))
+        assert labels.shape == (height, width) and labels.any()
+
+    for size in ((32, 24), (320, 240)):
+        segment(*size)
+    before = resident()
+    segment(4096, 3072)
+    for _ in range(3):
+        segment(320, 240)
+    assert resident() < before + 100
+
+
+def test_an_empty_cloud_is_refused_in_words(node):
+    assert node.set_parameters(input='points')[0].successful
+    node.in_use()
+    with node.listening('labels'), node.camera_on('/depth/points', kind=PointCloud2):
+        node.depth.publish(PointCloud2(header=node.header()))
+        error_about(node, 'cloud is empty (0x0)')
+    assert node.set_parameters(input='image')[0].successful
+    node.in_use()
+
+
+def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
+    arguments = '-p', 'stall_timeout:=0.5'
+    topics = f'/first{DEPTH}', f'/first{INFO}'
+    with (
+        Bench(*arguments, namespace='first') as bench,
+        bench.listening('labels'),
+        bench.camera_on(*topics),
+    ):
+
+        def told():
+            bench.camera_info.publish(bench.info())
+            bench.depth.publish(bench.image())
+            bench.spin(0.1)
+            reports = bench.received['diagnostics']
+            status = reports[-1].status[0] if reports else DiagnosticStatus()
+            return status.level == DiagnosticStatus.ERROR and (
+                re.match(r'no output for .* s: compiling kernels, \d+ of', status.message)
+            )
+
+        bench.until(told)
+        assert 'compiling kernels' in bench.log()
+        assert f'will subscribe to {topics[0]} and {topics[1]}' in bench.log()
+
+
 @pytest.mark.parametrize('presses', [1, 2])
 def test_interrupted_during_a_computation(presses):
     slow = '-p', 'method:=normals', '-p', 'exact:=true'
@@ -243,9 +319,52 @@ def test_interrupted_during_a_computation(presses):
             assert bench.process.wait(timeout=20) == 0
 
 
-def test_bad_parameter_at_the_start_ends_with_one_line():
-    bench = Bench('-p', 'method:=magic', namespace='wrong')
-    assert bench.process.wait(timeout=20) == 2
-    assert bench.log().strip().count('\n') == 0 and 'method' in bench.log()
-    with pytest.raises(AssertionError, match='exit code 2'):
-        bench.close()
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['--ros-args', '-p', 'method:=magic'], 'method'),
+        (['--ros-args', '-p', 'min_pixel:=3'], "is 'min_pixels' meant?"),
+        (['--ros-args', '-p', 'min_pixels:=many'], 'INTEGER'),
+        (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
+        (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
+        (['--ros-args', '--magic'], '--magic'),
+        (['--method', 'normals'], '--method'),
+    ],
+)
+def test_bad_arguments_end_with_one_line(arguments, words):
+    run = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 2, run.stderr
+    assert run.stderr.strip().count('\n') == 0 and words in run.stderr
+
+
+def test_parameters_of_other_nodes_in_a_shared_file_are_warned_of(tmp_path):
+    shared = tmp_path / 'shared.yaml'
+    shared.write_text('/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n')
+    with Bench('--params-file', os.fspath(shared), namespace='shared') as bench:
+        bench.until(lambda: 'will subscribe' in bench.log())
+        assert "unknown parameter 'of_another'" in bench.log()
+
+
+def test_help_names_every_parameter():
+    run = subprocess.run([*NODE, '--help'], capture_output=True, text=True, timeout=60)
+    assert run.returncode == 0 and not run.stderr
+    assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
+
+
+@pytest.mark.parametrize('delay', [0.3, 0.7, 1.5])
+@pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
+def test_interrupted_at_the_start(command, delay, tmp_path):
+    code = f'from rangeseg_ros.start import {command}; {command}()'
+    arguments = ['bench', '--repeat', '99'] if command == 'rangeseg' else []
+    process = subprocess.Popen(
+        [sys.executable, '-c', code, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': os.fspath(Path(__file__).parents[1])},
+    )
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors

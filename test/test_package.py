@@ -72,7 +72,7 @@ def test_everything_is_installed_where_ros_looks(setup_arguments):
         'lib/rangeseg_ros/rangeseg',
         'lib/rangeseg_ros/segment_planes',
     }
-    for folder in ('launch', 'params'):
+    for folder in ('launch', 'params', 'rviz'):
         for path in (ROOT / folder).iterdir():
             if path.is_file():
                 assert f'share/rangeseg_ros/{folder}/{path.name}' in installed

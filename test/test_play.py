@@ -75,6 +75,22 @@ def test_rate_and_loop(tmp_path):
     assert len(infos) >= 24
 
 
+def test_the_clock_of_the_recording(tmp_path):
+    """Two images a second apart, ten times as fast: /clock runs from one to the other."""
+    record(tmp_path / 'bag', kinect_camera(16, 12), 2, 1.0)
+    with Bench() as bench:
+        from rosgraph_msgs.msg import Clock
+
+        times = []
+        bench.node.create_subscription(
+            Clock, '/clock', lambda m: times.append(m.clock.sec + 1e-9 * m.clock.nanosec), 10
+        )
+        player = subprocess.Popen([*RANGESEG, 'play', tmp_path / 'bag', '--rate', '10', '--clock'])
+        bench.until(lambda: player.poll() is not None)
+        bench.until(lambda: times and times[-1] == 2.0)
+    assert times == sorted(times) and times[0] >= 1.0 and len(times) > 2
+
+
 @pytest.mark.parametrize(
     'name, content, words',
     [('missing', None, 'missing'), ('empty', b'', 'not a readable'), ('x.mcap', b'abc', 'x.mcap')],

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,10 @@ from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
 from rangeseg_ros.cli import options
+
+CLOCK = '/clock'
+CLOCK_PERIOD = 0.025
+"""Seconds between two times on /clock, as `ros2 bag play` has it."""
 
 
 @click.command()
@@ -32,7 +36,12 @@ from rangeseg_ros.cli import options
     show_default=True,
     help='Seconds before the first message, for subscribers to find the topics.',
 )
-def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float) -> None:
+@click.option(
+    '--clock',
+    is_flag=True,
+    help='Publish the time of the recording on /clock, for nodes with use_sim_time.',
+)
+def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock: bool) -> None:
     """Publish the messages of a rosbag2 on their topics, timed as they were recorded.
 
     Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort.
@@ -57,12 +66,13 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float) -> Non
         publishers = _publishers(node, reader.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
+        tell = _clock(node) if clock and CLOCK not in publishers else _silent
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
             time.sleep(0.05)
         time.sleep(delay)
         while True:
             for topic, data in options.progress(
-                _timed(reader, publishers, rate), reader.message_count, 'message'
+                _timed(reader, publishers, rate, tell), reader.message_count, 'message'
             ):
                 publishers[topic].publish(data)
             if not loop:
@@ -112,11 +122,35 @@ def _qos(connection: Connection) -> Any:
     )
 
 
-def _timed(reader: Reader, topics: Collection[str], rate: float) -> Iterator[tuple[str, bytes]]:
-    """Topics and contents of the messages, each when it is due."""
+def _clock(node: Any) -> Callable[[int], None]:
+    """Publishes a time in nanoseconds."""
+    from rosgraph_msgs.msg import Clock
+
+    publisher = node.create_publisher(Clock, CLOCK, 1)
+    message = Clock()
+
+    def tell(now: int) -> None:
+        message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+        publisher.publish(message)
+
+    return tell
+
+
+def _silent(now: int) -> None:
+    pass
+
+
+def _timed(
+    reader: Reader, topics: Collection[str], rate: float, tell: Callable[[int], None]
+) -> Iterator[tuple[str, bytes]]:
+    """Topics and contents of the messages, each when it is due; `tell` gets the time meanwhile."""
     start = time.monotonic()
     wanted = [connection for connection in reader.connections if connection.topic in topics]
     for connection, stamp, data in reader.messages(wanted):
         due = start + (stamp - reader.start_time) / 1e9 / rate
-        time.sleep(max(0.0, due - time.monotonic()))
+        while (left := due - time.monotonic()) > CLOCK_PERIOD:
+            tell(stamp - round(left * rate * 1e9))
+            time.sleep(CLOCK_PERIOD)
+        time.sleep(max(0.0, left))
+        tell(stamp)
         yield connection.topic, bytes(data)

@@ -57,7 +57,7 @@ def camera_from_message(info: Any, raw: bool | None = None) -> Camera:
     )
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=1)
 def _camera(*fields: Any) -> Camera:
     return Camera.from_matrices(*fields)
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.utilities import get_rmw_implementation_identifier
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.counting import Losses
@@ -30,13 +30,6 @@ PROFILE_HINT = (
     f'{PROFILE_VARIABLE} to share/rangeseg_ros/params/fastdds_large_images.xml for publisher, '
     'node and listeners of images'
 )
-
-
-class Intrinsics(NamedTuple):
-    """What a camera_info says, and the frame it is in."""
-
-    camera: Camera
-    frame: str
 
 
 class DepthInput:
@@ -78,7 +71,7 @@ class DepthInput:
         self._node = node
         self._accept = accept
         self._waiting: tuple[Any, int] | None = None
-        self._cameras: StampPairing[Intrinsics | CameraError] = StampPairing()
+        self._cameras: StampPairing[CameraInfo] = StampPairing()
         self._largest = 0
         self.pairing = ''
         self.problem = ''
@@ -154,13 +147,7 @@ class DepthInput:
         self._largest = max(self._largest, len(message.data))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
-        camera: Intrinsics | CameraError
-        try:
-            camera = Intrinsics(camera_from_message(info, self._raw), info.header.frame_id)
-        except CameraError as error:
-            camera = error
-            self._warn(f'unusable camera_info on {self._info_topic()}: {error}')
-        self._cameras.add(_nanoseconds(info.header.stamp), camera)
+        self._cameras.add(_nanoseconds(info.header.stamp), info)
         self._hand_on()
 
     def _hand_on(self) -> None:
@@ -173,10 +160,12 @@ class DepthInput:
             if not self._cameras.by_stamp:
                 self._warn(f'no camera_info on {self._info_topic()} yet')
             return
-        if isinstance(found.item, CameraError):
-            self._warn(f'unusable camera_info on {self._info_topic()}: {found.item}')
+        try:
+            camera = camera_from_message(found.item, self._raw)
+        except CameraError as error:
+            self._warn(f'unusable camera_info on {self._info_topic()}: {error}')
             return
-        camera, frame = found.item
+        frame = found.item.header.frame_id
         # The size of a compressed image is known once it is decoded; the core checks it then.
         if hasattr(message, 'height') and (message.height, message.width) != camera.shape:
             self._warn(

@@ -15,6 +15,7 @@ from rclpy.publisher import Publisher
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.plane_map import MapPlane
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -79,6 +80,7 @@ class Pipeline:
         self.locator = Locator(node, self._frames.look_again)
         # Every result is published: the segmentation waits rather than replace one.
         self._results: HandOver[Result] = HandOver()
+        self._pixels = 0
         self._threads = [
             Thread(target=self._segment_all, name='segmentation', daemon=True),
             Thread(target=self._publish_all, name='publication', daemon=True),
@@ -135,6 +137,9 @@ class Pipeline:
         start = self._node.get_clock().now().nanoseconds
         image = corrected(frame.range_image(), sequence.config)
         ticks.append(time.perf_counter())
+        if image.inverse.size < self._pixels:
+            give_back_memory()
+        self._pixels = image.inverse.size
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(sequence.config, frame)
         found = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
@@ -176,6 +181,7 @@ class Pipeline:
                 self._publish(result)
             except Exception as error:
                 self._fail(error)
+            del result
 
     def _publish(self, result: Result) -> None:
         frame, image, found, start, ticks = result[:5]

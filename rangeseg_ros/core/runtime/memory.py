@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import ctypes
+import os
+
 import numpy as np
 
 # What glibc's malloc learns from at most.
@@ -16,3 +19,11 @@ def keep_freed_memory() -> None:
     given back a large one. With another malloc nothing happens.
     """
     np.empty(_BLOCK, np.uint8)
+
+
+def give_back_memory() -> None:
+    """Have malloc give all freed memory back to the system, after frames that were larger."""
+    # glibc's; None is the program itself with what it is linked to.
+    trim = getattr(ctypes.CDLL(None), 'malloc_trim', None) if os.name == 'posix' else None
+    if trim:
+        trim(0)
