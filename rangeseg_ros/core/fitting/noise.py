@@ -96,8 +96,8 @@ class Errors(NamedTuple):
         terms, shown = [], []
         cells, slopes = _cells(squared, slope)
         for cell in cells:
-            fourth, tilt = float(np.median(squared[cell])) ** 2, float(np.median(slope[cell]))
-            value = float(np.quantile(variance[cell], quantile))
+            fourth, tilt = _ranked(squared[cell], 0.5) ** 2, _ranked(slope[cell], 0.5)
+            value = _ranked(variance[cell], quantile)
             other = known.constant + known.quartic * fourth + known.tilt * tilt
             lowest = FLOOR + least.constant + least.quartic * fourth + least.tilt * tilt
             shown.append(max(value - other, lowest))
@@ -265,6 +265,12 @@ def _expected(freedom: NDArray[np.float64]) -> float:
     return float(chi2.ppf(_QUANTILE, typical)) / typical
 
 
+def _ranked(values: NDArray[np.float64], quantile: float) -> float:
+    """One of N values that so many lie below: np.quantile takes ten times as long for a few."""
+    rank = int(quantile * (len(values) - 1))
+    return float(np.partition(values, rank)[rank])
+
+
 def _mean_ratio(
     ratio: NDArray[np.float64],
     squared: NDArray[np.float64],
@@ -273,7 +279,7 @@ def _mean_ratio(
 ) -> float:
     """Mean over sets of like blocks of a quantile of what they show of what was expected."""
     cells, _ = _cells(squared, slope)
-    return float(np.mean([np.quantile(ratio[cell], quantile) for cell in cells]))
+    return float(np.mean([_ranked(ratio[cell], quantile) for cell in cells]))
 
 
 def _likeliest(
@@ -335,7 +341,7 @@ def _quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
 
 def _common_step(steps: NDArray[np.float64]) -> tuple[float, float]:
     """The step of which the smaller ones of these are multiples, and how clearly they are."""
-    small = float(np.quantile(steps, _SMALLEST))
+    small = _ranked(steps, _SMALLEST)
     # What was rounded twice is off by a little.
     near = np.abs(steps - small) < 0.2 * small
     beside = np.count_nonzero(steps < 1.8 * small) - np.count_nonzero(near)
