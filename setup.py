@@ -25,7 +25,7 @@ setup(
     license='GPL-3.0-or-later',
     keywords=['ROS', 'depth image', 'range image', 'plane segmentation', 'graph cuts'],
     classifiers=[
-        'Development Status :: 4 - Beta',
+        'Development Status :: 5 - Production/Stable',
         'Environment :: Console',
         'Intended Audience :: Developers',
         'Intended Audience :: Science/Research',

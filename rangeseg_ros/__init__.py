@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.io.distortion import corrected
     from rangeseg_ros.messages.clouds import planes_from_message
 
-__version__ = '0.1.0'
+__version__ = '1.0.0'
 
 __all__ = [
     'ROLES',
