@@ -11,7 +11,7 @@ from pathlib import Path
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
-from rangeseg_ros.batch.result_folder import PICTURES, ResultFolder
+from rangeseg_ros.batch.result_folder import LEADING, PICTURES, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
@@ -125,7 +125,7 @@ class Replay:
         with (
             results_folder.begun(),
             replacing(results_folder.bag) as partial,
-            PlaneTable(self.folder / 'planes.csv', ('frame', 'stamp')) as table,
+            PlaneTable(self.folder / 'planes.csv', LEADING) as table,
             self._open() as source,
             ResultBag(partial, self.topics) as bag,
             ExitStack() as stack,

@@ -7,7 +7,7 @@ import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
@@ -15,6 +15,7 @@ from zlib import crc32
 from rangeseg_ros.batch.frame_files import FRAME_FILES
 from rangeseg_ros.batch.result_bag import read_record
 from rangeseg_ros.io.bags import BagError
+from rangeseg_ros.io.planes import columns
 from rangeseg_ros.io.recordings import Recording
 
 BAG = 'bag'
@@ -22,7 +23,10 @@ BAG = 'bag'
 PICTURES = ('labels', 'overlay')
 """Which of `FRAME_FILES` every frame has."""
 MARK = '.rangeseg_replay'
-"""Name of a file that is there, and locked, while the results are incomplete."""
+"""Name of a file that is there, and locked, while a replay is at work."""
+
+LEADING = ('frame', 'stamp')
+"""First columns of the table of planes."""
 
 _ENDINGS = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
 _OWN = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|planes\.csv|map\.(csv|ply)|report\.html')
@@ -60,7 +64,7 @@ class ResultFolder:
 
     @contextmanager
     def begun(self) -> Iterator[None]:
-        """Clear the folder, and mark it until the results are complete.
+        """Clear the folder, and mark it while a replay is at work.
 
         Raises
         ------
@@ -74,9 +78,11 @@ class ResultFolder:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise BagError(f'{self.path}: another replay writes there') from None
-            self._clear()
-            yield
-            mark.unlink()
+            try:
+                self._clear()
+                yield
+            finally:
+                mark.unlink()
 
     def digest(self) -> str:
         """Of the names and contents of all results but the bag; of the report, its name alone.
@@ -107,6 +113,11 @@ class ResultFolder:
     def _interrupted(self) -> bool:
         if not self.path.is_dir():
             return False
+        # The table is begun before anything else.
+        with suppress(OSError), (self.path / 'planes.csv').open('rb') as table:
+            header = ','.join([*LEADING, *columns()]).encode()
+            if table.read(len(header) + 1) == header + b'\n':
+                return True
         return any(p.name == MARK or _PARTIAL.fullmatch(p.name) for p in self.path.iterdir())
 
     def _clear(self) -> None:
