@@ -45,7 +45,15 @@ def test_figures_of_given_frames_and_cached_exact_energies(frames, tmp_path):
     assert result.exit_code == 0
     figures = json.loads(path.read_text())
     assert (figures['frames'], figures['width'], figures['method']) == (2, 96, 'normals')
-    assert [*figures['stages']] == ['image', 'edges', 'normals', 'labels', 'regions', 'planes']
+    assert [*figures['stages']] == [
+        'image',
+        'noise',
+        'edges',
+        'normals',
+        'labels',
+        'regions',
+        'planes',
+    ]
     for stage in (*figures['stages'].values(), figures['total']):
         assert 0 <= stage['median_ms'] <= stage['p95_ms']
     assert figures['total']['p95_ms'] >= max(s['median_ms'] for s in figures['stages'].values())
