@@ -6,11 +6,11 @@ import sys
 import pytest
 from hypothesis import settings
 
-# Systems of a few equations: threads of the linear algebra only wait for each other, for minutes on
-# a busy machine. Must be set before NumPy is imported, here and in the processes tests start.
+# Systems of a few equations: threads of the linear algebra only wait for each other, for minutes
+# on a busy machine. To be set before NumPy is imported, here and in the processes tests start.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
-from rangeseg_ros.cli.main import main  # noqa: E402
+from rangeseg_ros.cli.main import main
 
 # The same examples on every run, and no timed tests: machines are busy.
 settings.register_profile('rangeseg', deadline=None, derandomize=True)
