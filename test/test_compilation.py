@@ -98,6 +98,6 @@ def test_without_processes_it_is_compiled_all_the_same(monkeypatch):
 
 
 def test_needs_follow_choices_and_switches_but_not_sizes():
-    assert needs(Config()) == needs(Config(min_pixels=7, noise=0.5))
+    assert needs(Config(min_pixels=9)) == needs(Config(min_pixels=7, noise=0.5))
     for other in (Config(method='normals'), Config(exact=True), Config(refits=2)):
         assert needs(other) != needs(Config())

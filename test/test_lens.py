@@ -118,10 +118,11 @@ def test_planes_behind_a_lens(model, method):
         np.testing.assert_allclose(end(plane.hull, axis=0), end(points, axis=0), atol=0.05)
     offsets = (points - plane.centre) @ Rotation.from_quat(plane.orientation).as_matrix()
     np.testing.assert_allclose(np.ptp(offsets[:, :2], axis=0), plane.extents, atol=1e-4)
-    # A pinhole of the same matrix bends it.
+    # A pinhole of the same matrix bends it: parts of it are planes at best, each off by more.
     bent = RangeImage.from_depth(depth, lens(''))
     planes = Segmenter(Config(method=method)).segment(bent).planes
-    assert not planes or planes[0].normal @ normal < 1 - 1e-4
+    assert all(bent_plane.normal @ normal < 1 - 1e-6 for bent_plane in planes)
+    assert len(planes) != 1 or planes[0].normal @ normal < 1 - 1e-4
 
 
 def test_pixels_without_a_ray_are_not_measured():

@@ -84,7 +84,8 @@ def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench
     # From the next frame on the wall is too small, and one frame later it is not.
     small = int(min(plane['count'] for plane in before.values()))
     larger = max(before, key=lambda role: before[role]['count'])
-    assert bench.set_parameters(min_pixels=small + 1)[0].successful
+    # By more than the few pixels that the labelling wins or loses with the parameter.
+    assert bench.set_parameters(min_pixels=int(1.2 * small))[0].successful
     between, _ = planes_of(bench, room(bench.camera))
     assert {role: plane['id'] for role, plane in between.items()} == {larger: before[larger]['id']}
     assert bench.set_parameters(min_pixels=500)[0].successful

@@ -71,7 +71,7 @@ def annotated_frames():
 
 @pytest.mark.skipif(not annotated_frames(), reason='needs the annotated frames')
 def test_accuracy_on_real_frames(tmp_path):
-    """At least that of the best peer: 0.933, 0.911, 1.07 and 0.51 of what is curved."""
+    """More than the best peer: 0.933, 0.911 and 0.51 of what is curved; it cuts fewer, 1.07."""
     scores = []
     for truth in annotated_frames():
         depth = read_depth(truth.with_name('depth.png'))
@@ -87,10 +87,10 @@ def test_accuracy_on_real_frames(tmp_path):
         return np.mean([score[name] for score in scores if score[name] is not None])
 
     assert len(scores) >= 6
-    assert mean('iou') >= 0.933
-    assert mean('correct80') >= 0.911
-    assert mean('segments') <= 1.1
-    assert mean('curved_as_plane') <= 0.51
+    assert mean('iou') >= 0.962
+    assert mean('correct80') >= 0.96
+    assert mean('segments') <= 1.12
+    assert mean('curved_as_plane') <= 0.3
 
 
 def small_fingerprint():

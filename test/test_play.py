@@ -76,7 +76,7 @@ def test_rate_and_loop(tmp_path):
 
 
 def test_the_clock_of_the_recording(tmp_path):
-    """Two images a second apart, ten times as fast: /clock runs from one to the other."""
+    """Two images a second apart, twice as fast: /clock runs from one to the other."""
     record(tmp_path / 'bag', kinect_camera(16, 12), 2, 1.0)
     with Bench() as bench:
         from rosgraph_msgs.msg import Clock
@@ -85,10 +85,10 @@ def test_the_clock_of_the_recording(tmp_path):
         bench.node.create_subscription(
             Clock, '/clock', lambda m: times.append(m.clock.sec + 1e-9 * m.clock.nanosec), 10
         )
-        player = subprocess.Popen([*RANGESEG, 'play', tmp_path / 'bag', '--rate', '10', '--clock'])
+        player = subprocess.Popen([*RANGESEG, 'play', tmp_path / 'bag', '--rate', '2', '--clock'])
         bench.until(lambda: player.poll() is not None)
-        bench.until(lambda: times and times[-1] == 2.0)
-    assert times == sorted(times) and times[0] >= 1.0 and len(times) > 2
+        bench.spin(0.5)
+    assert times == sorted(times) and times[0] >= 1.0 and times[-1] == 2.0 and len(times) > 5
 
 
 @pytest.mark.parametrize(

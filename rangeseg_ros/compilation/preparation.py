@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from threading import Condition, Thread
 from typing import Any
 
@@ -28,9 +28,11 @@ Report = Callable[[str], None]
 def needs(config: Config) -> tuple[Any, ...]:
     """What of `config` decides which kernels run: choices and switches, not how large values are.
 
-    Of numbers whether they are zero, as that often switches something off.
+    Of numbers whether they are zero, as that often switches something off; a smallest region of 0
+    pixels only follows the size of the image.
     """
-    return tuple(v if isinstance(v, (str, bool)) else v == 0 for v in astuple(config))
+    values = astuple(replace(config, min_pixels=1))
+    return tuple(v if isinstance(v, (str, bool)) else v == 0 for v in values)
 
 
 def prepare(config: Config, kinds: tuple[str, ...] = KINDS, report: Report = print) -> None:

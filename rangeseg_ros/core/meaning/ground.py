@@ -151,7 +151,9 @@ def _terrain(
     verdict[level] = GROUND
     said = np.where(ground, GROUND, verdict[surface]).astype(np.int8)
     error = _CERTAIN * noise * cells.error[..., None]
-    foot = _feet(cell_heights(cells, field, size), steep, error[..., 0], steps.least, turned)
+    # What rises less than is never excused is no foot, however precise the sensor.
+    rise = np.maximum(error[..., 0], (1 - _EXCUSED) * least)
+    foot = _feet(cell_heights(cells, field, size), steep, rise, steps.least, turned)
     said[foot] = OBSTACLE
     doubt = np.minimum(error[..., -1], _EXCUSED * least).astype(np.float32)
     classes = np.zeros(image.shape, np.uint8)
