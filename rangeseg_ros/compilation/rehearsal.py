@@ -24,8 +24,13 @@ CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
 
 def rehearse(config: Config, kinds: tuple[str, ...] = KINDS) -> None:
     """Segment small frames of each of `kinds` as `config` says, and make every output of them."""
-    # The room has a few hundred pixels per plane.
-    config = replace(config, min_pixels=min(config.min_pixels, 50))
+    # The room has a few hundred pixels per plane. Few directions, once round: exact solutions with
+    # all of them take minutes, and run the same kernels.
+    few = 25 if config.directions == 'regular' else 17
+    count = min(config.direction_count, few)
+    config = replace(
+        config, min_pixels=min(config.min_pixels, 50), direction_count=count, cycles=1
+    )
     for kind in kinds:
         sequence = SequenceSegmenter(config)
         for number, image in enumerate(_frames(kind)):
