@@ -237,6 +237,8 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
 
 
 def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
+    # Those of the test before may still be waiting for their kernels.
+    bench.in_use()
     assert bench.set_parameters(min_pixels=160 * 120)[0].successful
     assert not bench.segment().any()
     status = bench.status(lambda status: status.message.startswith('no planes'))
@@ -246,6 +248,7 @@ def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
 
 
 def test_bad_parameters_are_refused_with_the_reason(bench, expected):
+    bench.in_use()
     (result,) = bench.set_parameters(method='magic')
     assert not result.successful and 'method' in result.reason and 'planes' in result.reason
     (result,) = bench.set_parameters(smoothness=-1.0)
