@@ -358,7 +358,7 @@ def test_help_names_every_parameter():
 @pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
 def test_interrupted_at_the_start(command, delay, tmp_path):
     code = f'from rangeseg_ros.start import {command}; {command}()'
-    arguments = ['bench', '--repeat', '99'] if command == 'rangeseg' else []
+    arguments = ['bench', '--rounds', '99'] if command == 'rangeseg' else []
     process = subprocess.Popen(
         [sys.executable, '-c', code, *arguments],
         stdout=subprocess.PIPE,
