@@ -230,8 +230,8 @@ def test_losses_while_sizes_change_cost_no_memory():
                     bench.spin(0.05)
             values = values_of(bench.status(lambda status: status.level == DiagnosticStatus.WARN))
             assert bench.stream().any()
-        # Fast DDS makes one or two of them in most runs, not in all.
-        assert int(values['loss reports of impossible size']) >= 0
+        # Fast DDS reports impossible losses in most runs, not in all: either way no more are
+        # counted than there were frames.
         assert 0 < int(values[LOST]) < 48
         assert bench.log().count('said once') == 1
 

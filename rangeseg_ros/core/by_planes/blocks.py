@@ -24,15 +24,13 @@ Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 def block_size(shape: tuple[int, int]) -> int:
-    """Rows and columns of the blocks of an image: 4 pixels up to twice VGA, 8 above.
+    """Rows and columns of the blocks: 3 pixels below half of VGA, 4 up to twice VGA, 8 above.
 
-    Blocks of 4 pixels find faces 10 pixels wide; a larger image shows the same face larger, and
-    a smaller one, below half of VGA, smaller.
+    Blocks of 4 pixels find faces 10 pixels wide; a larger image shows the same face larger, a
+    smaller one smaller.
     """
-    import os
-
     if shape[0] * shape[1] < VGA / 2:
-        return int(os.environ.get('BS', 3))
+        return 3
     return 4 if shape[0] * shape[1] <= 2 * VGA else 8
 
 
