@@ -371,3 +371,12 @@ def test_interrupted_at_the_start(command, delay, tmp_path):
     process.send_signal(signal.SIGINT)
     _, errors = process.communicate(timeout=60)
     assert 'Traceback' not in errors and process.returncode in (0, 130), errors
+
+
+def test_interrupted_as_it_begins_to_spin():
+    process = subprocess.Popen(NODE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr
+    assert 'will subscribe' in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors

@@ -30,8 +30,11 @@ def main() -> None:
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
 
     def answer(value: Any) -> None:
-        pickle.dump(value, answers)
-        answers.flush()
+        try:
+            pickle.dump(value, answers)
+            answers.flush()
+        except BrokenPipeError:
+            os._exit(0)  # the parent has ended
 
     cv2.setNumThreads(1)
     _share_work()

@@ -17,9 +17,11 @@ from rclpy.exceptions import (
     InvalidNodeNameException,
     ParameterException,
 )
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.messages.make import message_class
@@ -167,27 +169,33 @@ def _refuse(error: Exception) -> NoReturn:
 
 def main() -> None:
     """Run the node until it is told to stop; bad arguments end it with one line, exit code 2."""
-    # rclpy's own handler ends the spinning. Without this, Python's would raise KeyboardInterrupt
-    # on top, wherever the code is, and again on every further Ctrl-C.
-    signal.signal(signal.SIGINT, lambda number, stack: None)
+    started = False
+
+    def on_interrupt(number: int, stack: object) -> None:
+        # Half-made objects of rclpy complain loudly of a context that is gone. A node that spins
+        # is ended by rclpy's own handler, and Python's, which would raise KeyboardInterrupt
+        # wherever the code is, again on every further Ctrl-C, stays out of it.
+        if not started:
+            os._exit(130)
+
+    signal.signal(signal.SIGINT, on_interrupt)
     finished = True
     try:
         check_arguments(sys.argv)
-        rclpy.init()
+        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     except (ConfigError, RuntimeError) as error:
         _refuse(error)
     try:
         node = SegmentPlanes()
     except (ConfigError, ParameterException, *_BAD_NAMES) as error:
         _refuse(error)
-    except Exception:
-        if rclpy.ok():
-            raise
-        return  # told to stop meanwhile
+    executor = SingleThreadedExecutor()
     # What the core warns of, such as a lens that is left out: once each.
     warnings.showwarning = lambda message, *where: node.get_logger().warning(str(message))
+    install_signal_handlers()
+    started = True
     try:
-        rclpy.spin(node)
+        rclpy.spin(node, executor)
     except Exception:
         # The signal ends the context between any two steps of rclpy.
         if rclpy.ok():
