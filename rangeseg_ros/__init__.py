@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.segmenter import Segmentation, Segmenter
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
-    from rangeseg_ros.io.distortion import corrected
+    from rangeseg_ros.io.corrections import corrected
     from rangeseg_ros.messages.clouds import planes_from_message
 
 __version__ = '1.0.0'
@@ -39,7 +39,7 @@ _HOMES = {
     'core.segmenter': ('Segmentation', 'Segmenter'),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
-    'io.distortion': ('corrected',),
+    'io.corrections': ('corrected',),
     'messages.clouds': ('planes_from_message',),
 }
 

@@ -24,6 +24,7 @@ from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import natural_order, replacing
 from rangeseg_ros.io.images import read_depth
 
@@ -137,6 +138,7 @@ class SightingsOfPart:
             if shape not in (None, image.shape):
                 raise CalibrationError(f'{self.source.path}: images of several sizes')
             shape, camera = image.shape, image.camera
+            image = corrected(image, self.config)
             frames.append(sightings(segmenter.segment(image).labels, image))
         if shape is None:
             raise CalibrationError(f'{self.source.path}: no frames')
@@ -148,6 +150,8 @@ class SightingsOfPart:
         digest = hashlib.sha256(code_digest())
         settings = self.source.path.absolute(), self.source, asdict(self.config)
         digest.update(repr((settings, self.first, self.after, self.source.state())).encode())
+        for path in correction_files(self.config):
+            digest.update(path.read_bytes())
         return digest.hexdigest()[:16]
 
 
@@ -189,6 +193,7 @@ class ResidualsOfFrame:
     def run(self) -> Residuals:
         """Segment the frame without and with the correction."""
         (image,) = self.source.images(self.frame, self.frame + 1)
+        image = corrected(image, self.config)
         segmenter, pictures, counts = Segmenter(self.config), [], []
         for version in (image, self.distortion.corrected(image)):
             result = segmenter.segment(version)

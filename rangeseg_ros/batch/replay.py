@@ -21,7 +21,7 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
@@ -182,8 +182,8 @@ class Replay:
         digest = hashlib.sha256(code_digest())
         settings = replace(self, recording=Path(), folder=Path(), overwrite=False)
         digest.update(repr(settings).encode())
-        if self.config.distortion_map:
-            digest.update(Path(self.config.distortion_map).read_bytes())
+        for path in correction_files(self.config):
+            digest.update(path.read_bytes())
         parts = [self.recording]
         if self.recording.is_dir():
             parts = [path for path in self.recording.iterdir() if path.suffix in _SUFFIXES]

@@ -15,7 +15,7 @@ from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth
 
 

@@ -44,8 +44,8 @@ def _frames(kind: str) -> Iterator[RangeImage]:
     for noise in (0.001, 0.001, 0.03):
         image = RangeImage.from_depth(_room(noise), CAMERA)
         image = image if kind == 'image' else RangeImage.from_points(image.points)
-        # Maps of distortion are for images of another size.
-        yield replace(image, corrected=True)
+        # Maps of distortion and masks are for images of another size.
+        yield replace(image, corrected=True, body=np.zeros(image.shape, np.bool_))
 
 
 def _room(noise: float) -> NDArray[np.uint16]:

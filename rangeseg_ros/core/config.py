@@ -208,11 +208,16 @@ class Config:
         low=0.0,
         high=10.0,
     )
-    # What is known of one sensor: its fixed distortion.
+    # What is known of one sensor: its fixed distortion, and what always stands in its way.
     distortion_map: str = option(
         '',
         'file of the fixed distortion of the sensor, as rangeseg calibrate writes it; subtracted '
         'from the inverse depth before anything else, so that distortion is what remains',
+    )
+    mask: str = option(
+        '',
+        "PNG of the size of the images, not 0 where they show the robot's own body: that is "
+        'neither segmented nor terrain',
     )
     track_time: float = option(
         3.0,

@@ -164,13 +164,16 @@ class Segmenter:
         Raises
         ------
         RangeImageError
-            There is a `distortion_map`, and nobody has subtracted it: the core reads no files.
+            There is a `distortion_map` or a `mask`, and nobody has applied it: the core reads no
+            files.
         """
         config, watch = self.config, Stopwatch()
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
                 'distortion_map is not subtracted yet: segment corrected(image, config)'
             )
+        if config.mask and image.body is None:
+            raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
         blocks = Blocks.of(image)

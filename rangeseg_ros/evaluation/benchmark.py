@@ -22,7 +22,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
 

@@ -17,7 +17,7 @@ from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.segcomp.files import (
@@ -151,9 +151,7 @@ class Task:
         """Digest of everything the measurement depends on: code, parameters, files."""
         digest = hashlib.sha256(code_digest())
         digest.update(repr((asdict(self.config), self.case)).encode())
-        files = [self.case.image, self.case.truth]
-        if self.config.distortion_map:
-            files.append(Path(self.config.distortion_map))
+        files = [self.case.image, self.case.truth, *correction_files(self.config)]
         for path in files:
             digest.update(path.read_bytes())
         return digest.hexdigest()[:16]

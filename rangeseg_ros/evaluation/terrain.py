@@ -18,6 +18,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.label_files import EvaluationError, read_label_image
 from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image
 
 REACH = {'realsense': 2.5}
@@ -107,7 +108,7 @@ class TerrainTask:
             read_depth(self.folder / part / f'{name}.tiff') for part in ('size', 'crossing')
         )
         image = RangeImage.from_depth(depth, read_camera(self.folder / 'camera.yaml'))
-        found = Segmenter(self.config).segment(image).terrain
+        found = Segmenter(self.config).segment(corrected(image, self.config)).terrain
         metres = np.where(truth == DROP, crossing, depth / 1000)
         judged = (truth > UNKNOWN) & (metres <= reach) & ~_near_borders(truth)
         pixels = np.zeros((4, 4), np.int64)

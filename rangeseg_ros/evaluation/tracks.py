@@ -22,7 +22,7 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.overlap import Overlap
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 

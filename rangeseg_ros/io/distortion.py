@@ -17,28 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageSequence, TiffImagePlugin
 
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.files import replacing
 
 KIND = 'rangeseg_ros distortion map'
 _DESCRIPTION = 270
-
-
-def corrected(image: RangeImage, config: Config) -> RangeImage:
-    """`image` without the distortion of the map that `config` names; itself without one.
-
-    Raises
-    ------
-    DistortionError
-        The map cannot be read, or is of another size or camera.
-    """
-    if not config.distortion_map:
-        return image
-    path = Path(config.distortion_map)
-    return load(path).corrected(image)
 
 
 def load(path: Path) -> DistortionMap:

@@ -74,6 +74,26 @@ def read_labels(path: Path) -> NDArray[np.uint16]:
     return image.astype(np.uint16, copy=False)
 
 
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Read a mask: an image of any type and number of channels.
+
+    Returns
+    -------
+    (H, W) bool
+        True where a channel is not 0; of four channels, the last one is opacity.
+
+    Raises
+    ------
+    ImageFileError
+        A missing or unreadable file.
+    """
+    image = _read(path)
+    if image.ndim == 2:
+        return image != 0
+    mask: NDArray[np.bool_] = (image[..., :3] != 0).any(axis=2)
+    return mask & (image[..., 3] != 0) if image.shape[2] == 4 else mask
+
+
 def write_image(path: Path, image: NDArray) -> None:
     """Write a PNG or TIFF, by the suffix of `path`.
 

@@ -19,7 +19,7 @@ from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.distortion import corrected
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target

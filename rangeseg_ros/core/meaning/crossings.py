@@ -52,16 +52,15 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
     """Crossings (N, 4) of rays without a measurement, as `crossings`.
 
     As far as ground is seen and not nearer: no sensor sees below its own nearest or farthest
-    range. Single pixels do not count: sensors miss some everywhere. None for clouds, which do not
-    tell the rays of what they have not measured.
+    range. Not where the robot's own body is in the way. Single pixels do not count: sensors miss
+    some everywhere. None for clouds, which do not tell the rays of what they have not measured.
     """
     seen = terrain.classes == GROUND
-    missing = cv2.morphologyEx(
-        (~image.valid).astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)
-    )
+    missing = ~image.valid if image.body is None else ~(image.valid | image.body)
+    opened = cv2.morphologyEx(missing.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     if image.camera is None or not seen.any():
         return np.zeros((0, 4), np.float32)
-    found = crossings(image, terrain, missing > 0)
+    found = crossings(image, terrain, opened > 0)
     nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
     depth = found[:, 2]
     return found[(depth >= nearest) & (depth <= farthest)]

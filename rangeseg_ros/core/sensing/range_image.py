@@ -44,12 +44,15 @@ class RangeImage:
         None for organised clouds.
     corrected : bool
         Whether the sensor's fixed distortion has been subtracted.
+    body : (H, W) bool or None
+        Pixels that show the robot itself, which are not measured; None where no mask tells.
     """
 
     rays: NDArray[np.float32]
     inverse: NDArray[np.float32]
     camera: Camera | None = None
     corrected: bool = False
+    body: NDArray[np.bool_] | None = None
 
     @classmethod
     def from_depth(
@@ -152,6 +155,26 @@ class RangeImage:
         noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
         with np.errstate(divide='ignore'):
             return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
+
+    def without(self, body: NDArray[np.bool_]) -> RangeImage:
+        """Copy without the measurements of the robot's own body.
+
+        Parameters
+        ----------
+        body : (H, W) bool
+            True where the image shows it.
+
+        Raises
+        ------
+        RangeImageError
+            The image has another size.
+        """
+        if body.shape != self.shape:
+            raise RangeImageError(
+                f'the mask is {body.shape[1]}x{body.shape[0]}, '
+                f'the image {self.shape[1]}x{self.shape[0]}'
+            )
+        return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
     @property
     def shape(self) -> tuple[int, int]:
