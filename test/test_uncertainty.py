@@ -160,3 +160,16 @@ def test_covariance_tells_the_errors_of_the_simulated_kinect():
         QUANTUM,
     )
     assert value == pytest.approx(1, abs=0.2)
+
+
+def test_no_variance_is_negative():
+    """Three pixels nearly in a line as a fish-eye's corner sees them: A^-1 magnifies rounding."""
+    camera = Camera(32, 63, 1.0, 0.3, 15.5, 31.0, 0.0, 'plumb_bob', (-0.2, 0.05, 0.001, 0, 0))
+    labels = np.zeros(camera.shape, np.uint16)
+    labels[0, 25:28] = 1
+    depth = np.full(camera.shape, 2.5)
+    depth[0, 25:28] = 2.48230966, 2.49894049, 2.48958973
+    image = RangeImage.from_depth(depth, camera)
+    (plane,) = fit_planes(labels, image, SensorModel(0, 0, 0.33, 2, 0.0014, 0, 7))
+    values = np.linalg.eigvalsh(plane.covariance)
+    assert values[0] > -1e-9 * values[-1]

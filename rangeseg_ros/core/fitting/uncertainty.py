@@ -77,7 +77,11 @@ def theta_covariances(
         sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
     )
     middle = _middles(cells, theta, sensor, random, systematic_field(sensor))
-    return inverse @ ((middle + middle.transpose(0, 2, 1)) / 2) @ inverse
+    # By a root of it, so that no rounding that A^-1 magnifies makes a variance negative.
+    values, vectors = np.linalg.eigh(middle)
+    root = inverse @ (vectors * np.sqrt(np.maximum(values, 0))[:, None, :])
+    covariances: NDArray[np.float64] = root @ root.transpose(0, 2, 1)
+    return covariances
 
 
 def plane_jacobians(
