@@ -254,8 +254,8 @@ def attempt_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R |
     """Run tasks on the workers of a Dask cluster, each to its result or `Failure`, in order.
 
     A task whose worker is lost is run again on another one, up to as many times as Dask's
-    `distributed.scheduler.allowed-failures` says. Workers need this package, and the same files
-    under the same names. Whoever reaches a scheduler runs code on its workers.
+    `distributed.scheduler.allowed-failures` says. Workers and scheduler need this package, workers
+    the same files under the same names. Whoever reaches a scheduler runs code on its workers.
 
     Parameters
     ----------

@@ -1,10 +1,12 @@
 """Replays on a Dask cluster."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 
 import pytest
 from replays import record_walls, replay, results
@@ -120,6 +122,60 @@ def test_a_recording_that_kills_every_worker_ends_the_command(tmp_path):
         pytest.raises(OSError, match='Attempted to run task'),
     ):
         list(run_on_cluster([Deadly()], cluster.scheduler_address))
+
+
+@pytest.fixture
+def cluster(tmp_path):
+    """Process of a scheduler that has a worker, and its address."""
+    pytest.importorskip('distributed')
+    told = tmp_path / 'scheduler.json'
+    python = [sys.executable, '-m']
+    # The scheduler reads what it hands out, in the versions of today.
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
+    scheduler = subprocess.Popen(
+        [
+            *(*python, 'distributed.cli.dask_scheduler', '--scheduler-file', told),
+            *('--host', '127.0.0.1', '--port', '0', '--no-dashboard'),
+        ],
+        stderr=subprocess.DEVNULL,
+        env=environment,
+    )
+    worker = subprocess.Popen(
+        [
+            *(*python, 'distributed.cli.dask_worker', '--scheduler-file', told),
+            *('--nworkers', '1', '--nthreads', '1', '--no-dashboard', '--no-nanny'),
+            *('--local-directory', tmp_path, '--death-timeout', '300'),
+        ],
+        stderr=subprocess.DEVNULL,
+        env=environment,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while not told.exists():
+            assert scheduler.poll() is None and time.monotonic() < deadline
+            time.sleep(0.05)
+        yield scheduler, json.loads(told.read_text())['address']
+    finally:
+        for process in (worker, scheduler):
+            process.kill()
+            process.wait()
+
+
+def test_a_scheduler_that_is_lost_during_a_run_ends_the_command_in_one_line(cluster):
+    scheduler, address = cluster
+    with pytest.raises(OSError, match='the scheduler is gone'):
+        list(run_on_cluster([KillsScheduler(scheduler.pid), KillsScheduler(0)], address))
+
+
+@dataclass
+class KillsScheduler:
+    """A task that ends the scheduler, and never itself."""
+
+    scheduler: int
+
+    def run(self):
+        os.kill(self.scheduler, signal.SIGKILL)
+        time.sleep(600)
 
 
 class Deadly:

@@ -6,17 +6,19 @@ import shutil
 import stat
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import depth_images
+from recordings import Recording, depth_images
 from replays import record_walls, results
 
-from rangeseg_ros import Camera
+from rangeseg_ros import Camera, Config
+from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.batch.result_folder import MARK
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.files import NotReplacedError, clear_abandoned, replacing
+from rangeseg_ros.io.files import NotReplacedError, clear_abandoned, replacing, scratch_folder
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
 
@@ -60,6 +62,23 @@ def test_folders_of_killed_processes_are_cleared_and_those_in_use_are_not(tmp_pa
         partial.write_text('')
         clear_abandoned(tmp_path / 'bag')
         assert not left.exists() and partial.exists()
+
+
+def test_scratch_folders_of_killed_processes_are_cleared(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, 'tempdir', os.fspath(tmp_path))
+    program = (
+        'import os; from rangeseg_ros.io.files import scratch_folder\n'
+        'with scratch_folder("frames") as folder:\n'
+        '    (folder / "frame").touch()\n'
+        '    os.kill(os.getpid(), 9)'
+    )
+    environment = {**os.environ, 'TMPDIR': os.fspath(tmp_path)}
+    subprocess.run([sys.executable, '-c', program], check=False, env=environment)
+    (left,) = tmp_path.iterdir()
+    assert (left / 'frame').exists()
+    with scratch_folder('frames') as folder:
+        assert list(tmp_path.iterdir()) == [folder]
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture
@@ -164,6 +183,37 @@ def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
         code, _, error = run('replay', out / 'bag', '--output', out, *more)
         assert code == 2 and 'it is the recording' in error
     assert list((out / 'bag').glob('*.mcap'))
+
+
+def test_a_picture_that_is_removed_meanwhile_costs_nothing_else(walls, run):
+    recording, out = walls
+
+    def removing(frames, total):
+        for index, frame in enumerate(frames):
+            if index == 2:
+                for picture in out.glob('000000_*_overlay.png'):
+                    picture.unlink()
+            yield frame
+
+    outcome = Replay(recording, out, Config()).run(removing)
+    assert (outcome.frames, outcome.damage) == (3, '')
+    assert len(list(out.glob('*_overlay.png'))) == 2 and (out / 'report.html').exists()
+    # The digest is of what is there.
+    assert 'done before' in run('replay', recording, '--output', out)[1]
+
+
+def test_pictures_of_negative_stamps_are_cleared_with_the_others(walls, run):
+    recording, out = walls
+    early = Recording()
+    for stamp in (-5 * 10**9, 10**9):
+        early.add_camera(stamp)
+        early.add_image(stamp, depth_images(1)[0])
+    early.messages = [(10**18 + k, *rest) for k, (_, *rest) in enumerate(early.messages)]
+    early.write(out.parent / 'early')
+    assert run('replay', out.parent / 'early', '--output', out)[0] == 0
+    assert (out / '000000_-5.000000000_labels.png').exists()
+    assert run('replay', recording, '--output', out)[0] == 0
+    assert not list(out.glob('*_-*')) and len(list(out.glob('*_labels.png'))) == 3
 
 
 KILLED = """

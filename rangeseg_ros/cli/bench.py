@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import click
@@ -16,6 +15,7 @@ from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.files import scratch_folder
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.params import read_config
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -92,18 +92,18 @@ def command(
         raise click.UsageError('--scaling is for simulated images, not for DEPTH')
     config = read_config(params_file, **({'method': method} if method else {}))
     progress = partial(options.progress, unit='frame')
-    with TemporaryDirectory() as folder:
+    with scratch_folder('rangeseg_bench') as folder:
         if camera_file:
             frames = benchmark.Frames(depth, read_camera(camera_file), depth_scale)
         else:
-            frames = _simulated(Path(folder), VGA, scenes)
+            frames = _simulated(folder, VGA, scenes)
         figures = benchmark.measure(frames, config, rounds, progress)
         if exact:
             figures['energy_ratio'] = benchmark.energy_ratio(frames, config, cache, progress)
         click.echo(_title(figures))
         click.echo(benchmark.table(figures))
         if scaling:
-            figures['scaling'] = _series(Path(folder), figures, config, scenes, rounds)
+            figures['scaling'] = _series(folder, figures, config, scenes, rounds)
             click.echo()
             click.echo(benchmark.scaling_table(figures['scaling']))
     if json_file:

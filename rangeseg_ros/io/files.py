@@ -10,6 +10,7 @@ import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import gettempdir
 
 
 class NotReplacedError(OSError):
@@ -74,6 +75,19 @@ def temporary_folder(folder: Path) -> Iterator[None]:
             # It may come just here.
             shutil.rmtree(folder, ignore_errors=True)
             raise
+
+
+@contextmanager
+def scratch_folder(name: str) -> Iterator[Path]:
+    """Give a folder in the temporary directory for what is needed until the end of the block.
+
+    Those of this `name` that killed processes have left are removed.
+    """
+    path = Path(gettempdir(), name)
+    clear_abandoned(path)
+    folder = path.with_name(f'.{os.getpid()}.{name}')
+    with temporary_folder(folder):
+        yield folder
 
 
 def abandoned(folder: Path) -> bool:
