@@ -27,8 +27,10 @@ DISTORTION_PIXELS = 2000.0
 # Systematic variances granted between neighbouring patches, and within a surface (4 standard
 # deviations).
 _BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
-# Pixels of a patch: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
-_PATCH_MINIMUM, _PATCH_LARGEST = 80, 1504
+# Blocks of the smallest patch: one or two hardly determine the direction of a plane.
+_BLOCKS_OF_PATCH = 3
+# Pixels of the largest: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
+_PATCH_LARGEST = 1504
 
 
 def surfaces(
@@ -64,9 +66,7 @@ def surfaces(
     blocks = moments.reshape(-1, SIZE)
     # No patch reaches over the middle, but neither does any reach across a large surface.
     roots = halves(patches, shape[0], moments, *links, enlarged * _PATCH_LARGEST)
-    patch, moments = _renumbered(
-        np.concatenate(roots), blocks, max(enlarged * _PATCH_MINIMUM, 1.5 * block**2)
-    )
+    patch, moments = _renumbered(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumbered(
         _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, least
