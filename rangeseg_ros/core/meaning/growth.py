@@ -16,6 +16,9 @@ from rangeseg_ros.core.meaning.continuity import Steps
 
 ROWS, COLUMNS = 4, 2
 """Cells of a tile, along columns and rows."""
+# Tiles on either side of a tile whose mean must agree: about 20 x 48 pixels together, which is
+# wider than the correlation of a stereo camera's noise.
+_BESIDE = (2, 1)
 # Tiles of a block: the window of a prediction is three blocks high and wide.
 _HIGH = 4
 # Cells that make a prediction: as many as two tiles have.
@@ -93,7 +96,7 @@ def _grow_tile(
     sums: NDArray[np.float64],
     ground: NDArray[np.bool_],
 ) -> None:
-    """Accept the cells of tile (m, n) that agree with the ground around it."""
+    """Accept the cells of tile (m, n) that agree with the ground around it, if their mean does."""
     total = np.zeros(10)
     b = m // _HIGH
     for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
@@ -117,6 +120,17 @@ def _grow_tile(
     if steepness > steps.slope:
         p, q = p * steps.slope / steepness, q * steps.slope / steepness
     place = cells.place
+    # Noise lets single cells of a step through, not the mean of what is not yet ground around.
+    off, count = 0.0, 0
+    first, after = max(m - _BESIDE[0], 0) * ROWS, (m + _BESIDE[0] + 1) * ROWS
+    left, right = max(n - _BESIDE[1], 0) * COLUMNS, (n + _BESIDE[1] + 1) * COLUMNS
+    for i in range(first, min(after, height.shape[0])):
+        for c in range(left, min(right, height.shape[1])):
+            if candidate[i, c] and not ground[i, c]:
+                off += height[i, c] - h - p * (place[i, c, 1] - x) - q * (place[i, c, 2] - y)
+                count += 1
+    if abs(off) > count * steps.least:
+        return
     for i in range(m * ROWS, min((m + 1) * ROWS, height.shape[0])):
         for c in range(n * COLUMNS, min((n + 1) * COLUMNS, height.shape[1])):
             if candidate[i, c] and not ground[i, c]:
