@@ -8,8 +8,10 @@ import pytest
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
-from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.cameras import read_camera, write_camera
+from rangeseg_ros.io.recordings import BagError
 
 STORAGES = tuple(SUFFIXES)
 

@@ -9,7 +9,7 @@ from click.testing import CliRunner
 from rangeseg_ros import Config
 from rangeseg_ros.cli.calibrate import command
 from rangeseg_ros.core.calibration.sightings import sightings
-from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
 from rangeseg_ros.io.images import write_image

@@ -13,8 +13,10 @@ from recordings import SUFFIXES, Recording, depth_images, record
 from rosbags import rosbag1
 
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.io.bags import BagError, DamagedBagError, DepthBag, DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.chunks import ChunkError, ChunkReader
+from rangeseg_ros.io.recordings import BagError
 
 STORAGES = tuple(SUFFIXES)
 START, STEP = 10**18, 33_333_333

@@ -11,7 +11,7 @@ from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera

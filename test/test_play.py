@@ -14,7 +14,7 @@ pytest.importorskip('rclpy')
 import cv2
 from ros_bench import DEPTH, INFO, Bench, corner_depth
 
-from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros

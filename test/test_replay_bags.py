@@ -18,8 +18,9 @@ from rangeseg_ros.batch.replay import Replay, segmented
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.bags import BagError, DepthBag
+from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.images import read_labels
+from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.clouds import planes_from_message
 from rangeseg_ros.messages.outputs import OUTPUTS
 

@@ -18,9 +18,9 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_writer import BagWriter
-from rangeseg_ros.io.bags import BagError
 from rangeseg_ros.io.chunks import Lost
-from rangeseg_ros.io.recordings import Recording, make_rosbags, message_types
+from rangeseg_ros.io.message_types import make_rosbags, message_types
+from rangeseg_ros.io.recordings import BagError, Recording
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.outputs import IN_TARGET, OUTPUTS, in_target
 

@@ -14,9 +14,8 @@ from zlib import crc32
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES
 from rangeseg_ros.batch.result_bag import read_record
-from rangeseg_ros.io.bags import BagError
 from rangeseg_ros.io.planes import columns
-from rangeseg_ros.io.recordings import Recording
+from rangeseg_ros.io.recordings import BagError, Recording
 
 BAG = 'bag'
 """Name of the bag among the results."""

@@ -9,11 +9,12 @@ import numpy as np
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.range_image import NOT_MEASURED
-from rangeseg_ros.io.bags import BagError, DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.poses import PoseFileError, match_poses, read_pose
+from rangeseg_ros.io.recordings import BagError
 
 SUFFIXES = ('.png', '.tif', '.tiff')
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rangeseg_ros.cli import options, simulate_terrain
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.io.bags import DepthBagWriter
+from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.segcomp.files import (

@@ -247,3 +247,21 @@ def rosbag1_fields(header: bytes) -> dict[bytes, bytes]:
         fields[name] = value
         position += 4 + size
     return fields
+
+
+def rosbag1_part(file: BinaryIO) -> bytes:
+    """Next header or data of a ROS 1 bag, whose size comes first."""
+    size = rosbag1_size(file.read(4))
+    return whole(file.read(size), size)
+
+
+def rosbag1_size(data: bytes) -> int:
+    """Size of a part of a ROS 1 bag."""
+    return int(struct.unpack('<I', whole(data, 4))[0])
+
+
+def whole(data: bytes, size: int) -> bytes:
+    """Return `data`; EOFError when it is shorter than that."""
+    if len(data) < size:
+        raise EOFError('file ends within a record')
+    return data

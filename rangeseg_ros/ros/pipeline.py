@@ -80,7 +80,6 @@ class Pipeline:
         self.locator = Locator(node, self._frames.look_again)
         # Every result is published: the segmentation waits rather than replace one.
         self._results: HandOver[Result] = HandOver()
-        self._pixels = 0
         self._threads = [
             Thread(target=self._segment_all, name='segmentation', daemon=True),
             Thread(target=self._publish_all, name='publication', daemon=True),
@@ -137,9 +136,6 @@ class Pipeline:
         start = self._node.get_clock().now().nanoseconds
         image = corrected(frame.range_image(), sequence.config)
         ticks.append(time.perf_counter())
-        if image.inverse.size < self._pixels:
-            give_back_memory()
-        self._pixels = image.inverse.size
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(sequence.config, frame)
         found = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
@@ -176,12 +172,18 @@ class Pipeline:
         return sequence.map.planes
 
     def _publish_all(self) -> None:
+        before = 0
         while result := self._results.take():
+            size = result.image.inverse.size
             try:
                 self._publish(result)
             except Exception as error:
                 self._fail(error)
             del result
+            # Now, as nothing holds the larger frame any more.
+            if size < before:
+                give_back_memory()
+            before = size
 
     def _publish(self, result: Result) -> None:
         frame, image, found, start, ticks = result[:5]
