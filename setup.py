@@ -85,6 +85,7 @@ setup(
             'ros-jazzy-sensor-msgs',
             'ros-jazzy-geometry-msgs',
             'ros-jazzy-std-msgs',
+            'ros-jazzy-nav-msgs',
             'ros-jazzy-shape-msgs',
             'ros-jazzy-visualization-msgs',
             'ros-jazzy-diagnostic-msgs',

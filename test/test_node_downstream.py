@@ -18,6 +18,7 @@ from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.messages.clouds import points_from_message
+from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
 
@@ -171,13 +172,15 @@ def test_node_and_replay_say_the_same_of_a_recording(tmp_path):
         recording.add_camera(stamp)
         recording.add_image(stamp, depth)
     recording.write(tmp_path / 'recording')
-    Replay(tmp_path / 'recording', tmp_path, Config(), topics=tuple(OUTPUTS)).run()
+    config = Config(odometry=True)
+    Replay(tmp_path / 'recording', tmp_path, config, topics=tuple(OUTPUTS)).run()
+    kinds = {name: output.kind for name, output in OUTPUTS.items()} | {'odometry': ODOMETRY}
     with rosbag2.Reader(tmp_path / 'bag') as bag:
         written = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
 
     with (
-        Bench(namespace='robot', camera=camera) as bench,
-        bench.listening(*OUTPUTS),
+        Bench('-p', 'odometry:=true', namespace='robot', camera=camera) as bench,
+        bench.listening(*kinds),
         bench.camera_on(f'/robot{DEPTH}', f'/robot{INFO}'),
     ):
         for stamp, depth in frames:
@@ -185,11 +188,11 @@ def test_node_and_replay_say_the_same_of_a_recording(tmp_path):
             image.header.frame_id = 'optical'
             image.header.stamp.sec, image.header.stamp.nanosec = divmod(stamp, 10**9)
             bench.segment(image)
-        bench.until(lambda: all(len(bench.received[name]) == len(frames) for name in OUTPUTS))
-    for name, output in OUTPUTS.items():
+        bench.until(lambda: all(len(bench.received[name]) == len(frames) for name in kinds))
+    for name, kind in kinds.items():
         published = [
             # Fast CDR leaves the bytes between aligned fields undefined: write them again.
-            bytes(ROS2.serialize_cdr(ROS2.deserialize_cdr(sent, output.kind), output.kind))
+            bytes(ROS2.serialize_cdr(ROS2.deserialize_cdr(sent, kind), kind))
             for sent in map(serialize_message, bench.received[name])
         ]
         replayed = [data for topic, data in written if topic == f'/segment_planes/{name}']
@@ -197,6 +200,10 @@ def test_node_and_replay_say_the_same_of_a_recording(tmp_path):
     # Of something: planes, one of them the floor.
     assert min(len(planes_from_message(cloud)) for cloud in bench.received['planes']) == 2
     assert min(cloud.width for cloud in bench.received['ground']) > 500
+    # The wall comes nearer: the camera goes forward, which is x of the odometry.
+    last = bench.received['odometry'][-1]
+    assert (last.header.frame_id, last.child_frame_id) == ('odom', 'optical')
+    assert last.pose.pose.position.x == pytest.approx(0.03, abs=0.01)
 
 
 @contextmanager

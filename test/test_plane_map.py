@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
-from rangeseg_ros.core.mapping import plane_filter
-from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, PoseNoise, observations
+from rangeseg_ros.core.mapping.observations import LASTING, RESIDUE, PoseNoise, observations
+from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -31,7 +31,7 @@ def observed(random, pose, truth, root, lasting):
     """A plane that errs by a pattern (what lasts) and by what is new, as the filter has it."""
     normal = pose.rotation.T @ truth[:3]
     distance = truth[3] + truth[:3] @ pose.shift
-    share = plane_filter._LASTING
+    share = LASTING
     error = np.sqrt(share) * lasting + np.sqrt(1 - share) * random.standard_normal(3)
     theta = -normal / distance + root @ error
     distance = 1 / np.linalg.norm(theta)
@@ -41,7 +41,7 @@ def observed(random, pose, truth, root, lasting):
     return SimpleNamespace(
         normal=normal,
         distance=distance,
-        covariance=jacobian @ root @ root.T @ jacobian.T / plane_filter._RESIDUE,
+        covariance=jacobian @ root @ root.T @ jacobian.T / RESIDUE,
         centroid=centroid - (normal @ centroid + distance) * normal,
         confidence=1.0,
         rms=0.0,

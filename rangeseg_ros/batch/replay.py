@@ -15,6 +15,7 @@ from rangeseg_ros.batch.result_folder import LEADING, PICTURES, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -25,6 +26,7 @@ from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
+from rangeseg_ros.io.poses import write_trajectory
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -127,11 +129,12 @@ class Replay:
             replacing(results_folder.bag) as partial,
             PlaneTable(self.folder / 'planes.csv', LEADING) as table,
             self._open() as source,
-            ResultBag(partial, self.topics) as bag,
+            ResultBag(partial, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
             report = ReplayReport(str(self.recording.name), self.config)
             sequence = SequenceSegmenter(self.config)
+            trajectory: list[tuple[int, Transform]] = []
             located = stack.enter_context(Locator(self.recording, self.config))
 
             def results() -> Iterator[Timed]:
@@ -144,7 +147,9 @@ class Replay:
                     report.add(frame.stamp, result, files['overlay'])
                     motion = located.last.target
                     target = (self.config.target_frame, motion) if motion else None
-                    yield from bag.messages(frame, image, result, target)
+                    if sequence.motion:
+                        trajectory.append((frame.stamp, sequence.motion.pose))
+                    yield from bag.messages(frame, image, result, target, sequence.motion)
 
             streams = [results()]
             if self.copy:
@@ -152,7 +157,9 @@ class Replay:
                 streams.append(bag.copies(originals))
             bag.write(*streams)
             planes = sequence.map.planes
-            if self.config.fixed_frame:
+            if self.config.odometry:
+                write_trajectory(self.folder / 'trajectory.txt', trajectory)
+            if self.config.map_frame:
                 write_map(self.folder / 'map.csv', planes)
                 shades = colours([plane.id for plane in planes])
                 write_mesh(self.folder / 'map.ply', planes, shades)

@@ -14,6 +14,7 @@ import yaml
 from rosbags.interfaces import Connection, MessageDefinitionFormat
 from rosbags.typesys import Stores
 
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -22,6 +23,7 @@ from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.message_types import make_rosbags, message_types
 from rangeseg_ros.io.recordings import BagError, Recording
 from rangeseg_ros.messages.frames import DepthFrame
+from rangeseg_ros.messages.motion import ODOMETRY, odometry_message
 from rangeseg_ros.messages.outputs import IN_TARGET, OUTPUTS, in_target
 
 NAMESPACE = '/segment_planes'
@@ -42,6 +44,8 @@ class ResultBag:
         Directory to make.
     topics : iterable of str
         Which of `OUTPUTS`, by name.
+    odometry : bool
+        Whether the motion of the camera is among them.
 
     Attributes
     ----------
@@ -49,19 +53,22 @@ class ResultBag:
         Topic and reason of messages that could not be copied -> how many.
     """
 
-    def __init__(self, path: Path, topics: Iterable[str]) -> None:
+    def __init__(self, path: Path, topics: Iterable[str], odometry: bool = False) -> None:
         self._store = message_types(Stores.ROS2_JAZZY)
         # Labels shrink to a hundredth.
         self._writer = BagWriter(path, compressed=True)
         self._names = tuple(topics)
+        self._kinds = {name: OUTPUTS[name].kind for name in self._names}
+        if odometry:
+            self._kinds['odometry'] = ODOMETRY
         self.lost: Counter[str] = Counter()
         self._topics: dict[str, Connection] = {}
 
     def __enter__(self) -> ResultBag:
         self._writer.open()
-        for name in self._names:
+        for name, kind in self._kinds.items():
             self._topics[name] = self._writer.add_connection(
-                f'{NAMESPACE}/{name}', OUTPUTS[name].kind, typestore=self._store
+                f'{NAMESPACE}/{name}', kind, typestore=self._store
             )
         return self
 
@@ -83,20 +90,28 @@ class ResultBag:
         image: RangeImage,
         result: Segmentation,
         target: tuple[str, Transform] | None = None,
+        motion: Motion | None = None,
     ) -> Iterator[Timed]:
         """What is published of `result`, at the time of the frame's recording.
 
-        `target` is the frame of planes and markers, and the motion to it.
+        `target` is the frame of planes and markers, and the motion to it; `motion` that of the
+        camera, where it is followed.
         """
         sec, nanosec = divmod(frame.stamp, 10**9)
         stamp = make_rosbags('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
         header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id=frame.frame_id)
         here = header, result
         there = in_target(make_rosbags, header, result, *target) if target else here
-        for name, connection in self._topics.items():
+        for name in self._names:
+            connection = self._topics[name]
             head, shown = there if name in IN_TARGET else here
             message = OUTPUTS[name].message(make_rosbags, head, image, shown)
             data = self._store.serialize_cdr(message, connection.msgtype)
+            yield frame.time, connection, bytes(data)
+        if motion:
+            connection = self._topics['odometry']
+            message = odometry_message(make_rosbags, header, motion)
+            data = self._store.serialize_cdr(message, ODOMETRY)
             yield frame.time, connection, bytes(data)
 
     def copies(self, source: Recording) -> Iterator[Timed]:

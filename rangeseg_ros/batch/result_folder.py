@@ -28,7 +28,9 @@ LEADING = ('frame', 'stamp')
 """First columns of the table of planes."""
 
 _ENDINGS = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
-_OWN = re.compile(rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|planes\.csv|map\.(csv|ply)|report\.html')
+_OWN = re.compile(
+    rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|planes\.csv|map\.(csv|ply)|report\.html|trajectory\.txt'
+)
 _PARTIAL = re.compile(rf'\.\d+\.({_OWN.pattern}|{BAG})')
 
 

@@ -85,6 +85,7 @@ def command(
       planes.csv                    a row for each plane and frame
       bag                           what the node would publish (mcap)
       map.csv, map.ply              the map of planes: a row each, and a mesh
+      trajectory.txt                the camera's motion, with the parameter odometry (TUM)
       report.html                   pictures, planes over time, times
 
     Several recordings have index.html beside their folders, which leads to their reports.
@@ -165,7 +166,7 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():
         click.echo(f'{count} frames without the {problem}')
-    mapped = f', {outcome.mapped} planes in the map' if task.config.fixed_frame else ''
+    mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
     already = ', done before' if outcome.found_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')
     if outcome.damage:

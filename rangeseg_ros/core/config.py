@@ -288,6 +288,15 @@ class Config:
         low=0.001,
         high=10.0,
     )
+    odometry: bool = option(
+        False,
+        "the camera's own motion from the planes in sight: ~/odometry, and, without fixed_frame, "
+        'the map of planes',
+    )
+    odometry_frame: str = option(
+        'odom',
+        "frame of ~/odometry: x forward and z up, at the camera's first place",
+    )
     # The ground.
     sensor_height: float = option(
         0.0,
@@ -320,8 +329,15 @@ class Config:
             raise ConfigError('parameter warm_start is for method normals, without exact')
         if self.moves == 'swap' and not (self.exact and self.method == 'normals'):
             raise ConfigError('parameter moves: swap is for method normals with exact')
+        if self.odometry and not self.odometry_frame:
+            raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:
             raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
+
+    @property
+    def map_frame(self) -> str:
+        """Frame of the map of planes; empty when there is none."""
+        return self.fixed_frame or (self.odometry_frame if self.odometry else '')
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.observations import views
+from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.roles import roles, unit
@@ -24,7 +27,9 @@ class SequenceSegmenter:
     Attributes
     ----------
     map : PlaneMap
-        Of the frames whose pose was given.
+        Of the frames whose pose was given, or else found by the odometry.
+    motion : Motion or None
+        Of the camera up to the last frame, with the parameter `odometry`.
 
     Examples
     --------
@@ -36,6 +41,8 @@ class SequenceSegmenter:
         self._segmenter = Segmenter(config)
         self._tracker = Tracker(config)
         self.map = PlaneMap(config)
+        self.motion: Motion | None = None
+        self._odometry = PlaneOdometry(self.config.odometry_frame)
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -48,9 +55,12 @@ class SequenceSegmenter:
     def config(self, config: Config) -> None:
         self._segmenter = Segmenter(config)
         self._tracker.config = config
-        if config.fixed_frame != self.map.config.fixed_frame:
-            self.map.clear('fixed_frame has changed')
+        before = self.map.config
+        if config.map_frame != before.map_frame:
+            self.map.clear('its frame has changed')
             self._pose = None
+        if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
+            self._odometry, self.motion = PlaneOdometry(config.odometry_frame), None
         self.map.config = config
 
     def segment(
@@ -89,6 +99,10 @@ class SequenceSegmenter:
         if self._tracker.contradicted:
             # The fixed frame has jumped: the map would have everything twice.
             self.map.clear('the fixed frame has jumped')
+        if self.config.odometry:
+            self._follow(result.labels, planes, stamp, up)
+            if not self.config.fixed_frame and self.motion:
+                pose = self.motion.pose
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
@@ -97,6 +111,17 @@ class SequenceSegmenter:
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
         return replace(result, planes=planes, survey=survey)
+
+    def _follow(
+        self, labels: NDArray[np.uint16], planes: list[Plane], stamp: int, up: ArrayLike | None
+    ) -> None:
+        """Find where the camera is now."""
+        config = self.config
+        towards = (config.up_x, config.up_y, config.up_z) if up is None else up
+        seen = views(labels, planes, config.distortion_length)
+        self.motion = self._odometry.add(planes, seen, stamp, unit(towards))
+        if not self.motion.held and len(self.map) and not config.fixed_frame:
+            self.map.clear('no plane held the camera')
 
 
 def with_roles(

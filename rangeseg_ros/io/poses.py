@@ -1,14 +1,15 @@
-"""Poses of cameras in text files: 4x4 matrices, one file for each image."""
+"""Poses of cameras in text files: 4x4 matrices, one for each image, and trajectories."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.mapping.transforms import Transform, TransformError, quaternion
+from rangeseg_ros.io.files import replacing
 
 
 class PoseFileError(ValueError):
@@ -78,3 +79,19 @@ def _number(path: Path) -> int | None:
     """Last number in a name."""
     numbers = re.findall(r'\d+', path.stem)
     return int(numbers[-1]) if numbers else None
+
+
+def write_trajectory(path: Path, poses: Sequence[tuple[int, Transform]]) -> None:
+    """Write stamps (nanoseconds) and poses as the TUM RGB-D benchmark has them.
+
+    A row each of seconds, x, y, z (metres) and the quaternion x, y, z, w.
+    """
+    rows = [
+        f'{stamp // 10**9}.{stamp % 10**9:09d} '
+        + ' '.join(f'{value:.9g}' for value in (*pose.shift, *quaternion(pose.rotation)))
+        for stamp, pose in poses
+    ]
+    with replacing(path) as partial:
+        partial.write_text(
+            '# timestamp tx ty tz qx qy qz qw\n' + ''.join(f'{row}\n' for row in rows)
+        )

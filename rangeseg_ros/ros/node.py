@@ -25,6 +25,7 @@ from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
 from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.messages.make import message_class
+from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.arguments import check_arguments, check_parameters
 from rangeseg_ros.ros.depth_input import DepthInput, input_topics
@@ -79,6 +80,13 @@ class SegmentPlanes(Node):
             )
             for name, (kind, _) in MAP_OUTPUTS.items()
         }
+        self._odometry = self.create_publisher(
+            message_class(ODOMETRY),
+            '~/odometry',
+            QoSProfile(depth=5),
+            event_callbacks=events,
+            qos_overriding_options=overriding,
+        )
         self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -87,7 +95,7 @@ class SegmentPlanes(Node):
         self._changed = self.create_guard_condition(self._configure)
         self._settings = Settings(config, self._on_compiling, self._changed.trigger)
         self._pipeline = Pipeline(
-            self, self._outputs, self._settings, self._statistics, self._maps
+            self, self._outputs, self._settings, self._statistics, self._maps, self._odometry
         )
         self.get_logger().info(self._waits_for())
 
@@ -123,7 +131,7 @@ class SegmentPlanes(Node):
 
     def _follow_demand(self) -> None:
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
-        publishers = [*self._outputs.values(), *self._maps.values()]
+        publishers = [*self._outputs.values(), *self._maps.values(), self._odometry]
         listeners = sum(publisher.get_subscription_count() for publisher in publishers)
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.plane_map import MapPlane
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -22,6 +23,7 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy
+from rangeseg_ros.messages.motion import odometry_message
 from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.latest import HandOver
@@ -43,6 +45,7 @@ class Result(NamedTuple):
     ticks: list[float]
     target: tuple[str, Transform] | None = None
     map: list[MapPlane] | None = None
+    motion: Motion | None = None
 
 
 class Pipeline:
@@ -55,6 +58,7 @@ class Pipeline:
         By the names of `OUTPUTS` and `MAP_OUTPUTS`; what nobody subscribes to is not made.
     settings : Settings
     statistics : FrameStatistics
+    odometry_publisher : rclpy.publisher.Publisher
 
     Attributes
     ----------
@@ -69,12 +73,14 @@ class Pipeline:
         settings: Settings,
         statistics: FrameStatistics,
         map_publishers: Mapping[str, Publisher],
+        odometry_publisher: Publisher,
     ) -> None:
         self._node = node
         self._publishers = publishers
         self._settings = settings
         self._statistics = statistics
         self._map_publishers = map_publishers
+        self._odometry_publisher = odometry_publisher
         self._map_time = 0.0
         self._frames: WaitingRoom[DepthFrame] = WaitingRoom(self._delay)
         self.locator = Locator(node, self._frames.look_again)
@@ -144,7 +150,7 @@ class Pipeline:
         doing()
         target = (sequence.config.target_frame, at.target) if at.target else None
         planes = self._map_to_send(sequence)
-        return Result(frame, image, found, start, ticks, target, planes)
+        return Result(frame, image, found, start, ticks, target, planes, sequence.motion)
 
     def _delay(self, frame: DepthFrame, waited: float) -> float:
         return self.locator.delay(self._settings.wanted, frame, waited)
@@ -154,10 +160,12 @@ class Pipeline:
         statistics, config = self._statistics, sequence.config
         statistics.sources = dict(at.sources)
         statistics.missing = '; '.join(f'{what} {why}' for what, why in at.missing.items())
-        if config.fixed_frame:
+        if config.map_frame:
             count = len(sequence.map)
             anew = f', begun anew: {why}' if (why := sequence.map.begun_anew) else ''
-            statistics.sources['map'] = f'{count} planes in {config.fixed_frame}{anew}'
+            statistics.sources['map'] = f'{count} planes in {config.map_frame}{anew}'
+        if sequence.motion:
+            statistics.sources['odometry'] = f'{sequence.motion.held} planes'
         if statistics.missing:
             self._node.get_logger().warning(statistics.missing, throttle_duration_sec=5.0)
 
@@ -166,7 +174,7 @@ class Pipeline:
         config = sequence.config
         listeners = sum(p.get_subscription_count() for p in self._map_publishers.values())
         now = time.monotonic()
-        if not config.fixed_frame or not listeners or now - self._map_time < _MAP_INTERVAL:
+        if not config.map_frame or not listeners or now - self._map_time < _MAP_INTERVAL:
             return None
         self._map_time = now
         return sequence.map.planes
@@ -196,6 +204,9 @@ class Pipeline:
                 doing(f'publishing {name}')
                 header, shown = there if name in IN_TARGET else here
                 publisher.publish(output.message(make_rclpy, header, image, shown))
+        if result.motion and self._odometry_publisher.get_subscription_count():
+            message = odometry_message(make_rclpy, frame.message.header, result.motion)
+            self._odometry_publisher.publish(message)
         if result.map is not None:
             doing('publishing the map')
             self._publish_map(result.map, frame.message.header.stamp)
@@ -217,8 +228,8 @@ class Pipeline:
         statistics.answered(statistics.published)
 
     def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:
-        fixed = self._settings.wanted.fixed_frame
-        header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id=fixed)
+        frame = self._settings.wanted.map_frame
+        header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
         for name, (_, message) in MAP_OUTPUTS.items():
             self._map_publishers[name].publish(message(make_rclpy, header, planes))
 

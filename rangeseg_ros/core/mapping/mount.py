@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.core.mapping.transforms import quaternion
 
 # Largest angle between up and -y of the camera, so that no wall is taken for the floor.
 _STEEPEST = np.radians(60.0)
@@ -49,8 +50,7 @@ class Mount(NamedTuple):
     @property
     def quaternion(self) -> NDArray[np.float64]:
         """x, y, z, w of `rotation`."""
-        turn: NDArray[np.float64] = Rotation.from_matrix(self.rotation).as_quat()
-        return turn if turn[3] >= 0 else -turn
+        return quaternion(self.rotation)
 
     @property
     def rpy(self) -> NDArray[np.float64]:

@@ -15,12 +15,13 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.evidence import Evidence
 from rangeseg_ros.core.mapping.map_outlines import MapOutline, polygon_of, rings, shape_of, united
-from rangeseg_ros.core.mapping.plane_filter import (
+from rangeseg_ros.core.mapping.observations import (
     Observations,
-    PlaneFilters,
     PoseNoise,
     observations,
+    views,
 )
+from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
 from rangeseg_ros.core.mapping.sightings import THERE, sightings
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -28,8 +29,6 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
 _GATE = 16.27
-# Samples along a side of a cell of the image, see `views`.
-_SAMPLES = 16
 # Observations that make a plane of the map, and their least share of the frames in which rays
 # ended where it is: what is found less often is what clutter looks like now and then.
 _CONFIRMED, _REGULAR = 3, 0.25
@@ -166,9 +165,8 @@ class PlaneMap:
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         if planes:
-            seen = observations(
-                planes, views(labels, planes, 2 * config.distortion_length), pose, noise
-            )
+            view = views(labels, planes, config.distortion_length)
+            seen = observations(planes, view, pose, noise)
             match = self._associate(planes, seen)
             self._fuse(planes, seen, match, pose, stamp)
             self._merge(stamp, pose.shift)
@@ -369,31 +367,3 @@ class PlaneMap:
             first_stamp=record.first,
             last_stamp=record.last,
         )
-
-
-def views(labels: NDArray[np.uint16], planes: Sequence[Plane], cell: float) -> NDArray[np.float64]:
-    """Where in the image planes are: pixels in each square cell, as unit vectors.
-
-    Parameters
-    ----------
-    labels : (H, W) uint16
-    planes : sequence of Plane
-    cell : float
-        Side of the cells, pixels.
-
-    Returns
-    -------
-    (M, C) float64
-    """
-    step = max(int(cell // _SAMPLES), 1)
-    coarse = labels[::step, ::step]
-    side = max(int(cell / step), 1)
-    rows, columns = (np.arange(size) // side for size in coarse.shape)
-    number = np.zeros(65536, np.intp)
-    number[[plane.label for plane in planes]] = np.arange(1, len(planes) + 1)
-    count = int(rows[-1] + 1) * int(columns[-1] + 1)
-    place = number[coarse] * count + rows[:, None] * (columns[-1] + 1) + columns
-    pixels = np.bincount(place.ravel(), minlength=count * (len(planes) + 1))
-    found = pixels.reshape(-1, count)[1:].astype(np.float64)
-    length: NDArray[np.float64] = np.linalg.norm(found, axis=1, keepdims=True)
-    return found / np.maximum(length, 1)

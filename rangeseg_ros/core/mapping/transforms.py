@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 CACHE_TIME = 10 * 10**9
 """Nanoseconds that the past of a frame is kept, as by default in tf2."""
@@ -288,6 +289,12 @@ def slerp(
     mixed = np.sin((1 - share) * angle) * first + np.sin(share * angle) * second
     unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
     return unit
+
+
+def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Unit quaternion x, y, z, w, with w >= 0, of a rotation (3, 3)."""
+    turn: NDArray[np.float64] = Rotation.from_matrix(rotation).as_quat()
+    return turn if turn[3] >= 0 else -turn
 
 
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,0 +1,193 @@
+"""Odometry from planes: true motions, what planes leave open, no jumps, files and messages."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recordings import Recording
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.batch.replay import Replay
+from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.mapping.observations import views
+from rangeseg_ros.core.mapping.odometry import PlaneOdometry
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.io.recordings import make_rosbags
+from rangeseg_ros.messages.motion import odometry_message
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.solids import half_space
+
+CAMERA = kinect_camera(160, 120)
+CONFIG = Config()
+SENSOR = SensorModel.from_config(CONFIG)
+STEP = 4
+"""Frames of a walk, at 30 Hz, from one that is seen to the next."""
+
+
+def planes_of(scene, k, seed):
+    """Labels and planes of true faces, their numbers as ids."""
+    view = simulate_kinect(scene, CAMERA, frame=k, seed=seed, sensor_seed=seed)
+    image = RangeImage.from_depth(view.depth, CAMERA)
+    faces = {plane.label: plane.face for plane in view.planes}
+    planes = fit_planes(view.labels, image, SENSOR)
+    found = [replace(p, id=faces[p.label] + 1) for p in planes if p.count > 100]
+    return view.labels, found
+
+
+def followed(scene, frames, seed=0):
+    """Motions of the camera, and its true poses in the frame of the odometry."""
+    odometry, first = PlaneOdometry('odom'), scene.poses[frames[0]]
+    motions, truths = [], []
+    for k in frames:
+        labels, planes = planes_of(scene, k, seed)
+        view = views(labels, planes, CONFIG.distortion_length)
+        up = first.rotation[2]
+        motions.append(odometry.add(planes, view, 10**9 + k * 10**9 // 30, up))
+        level = motions[0].pose.rotation @ first.rotation.T
+        pose = scene.poses[k]
+        truths.append((level @ pose.rotation, level @ (pose.position - first.position)))
+    return motions, truths
+
+
+def errors_of(motion, truth):
+    """Shift (3,) and turn (3,) that a pose is off."""
+    turn = Rotation.from_matrix(truth[0] @ motion.pose.rotation.T).as_rotvec()
+    return np.concatenate([truth[1] - motion.pose.shift, turn])
+
+
+def test_walks_are_followed_and_the_error_is_known():
+    values, shifts, turns = [], [], []
+    for seed in range(4):
+        room = kinect_room(seed)
+        scene = Scene(room.solids, walk(room.poses[0], seed, 33), room.dark)
+        motions, truths = followed(scene, range(0, 33, STEP), seed)
+        error = errors_of(motions[-1], truths[-1])
+        values.append(error @ np.linalg.solve(motions[-1].covariance, error) / 6)
+        shifts.append(np.linalg.norm(error[:3]))
+        turns.append(np.linalg.norm(error[3:]))
+        moved = truths[-1][1] - truths[-2][1]
+        speed = truths[-1][0] @ motions[-1].velocity[:3]
+        assert speed == pytest.approx(moved / (STEP / 30), abs=0.15)
+    assert np.median(shifts) < 0.02 and np.median(turns) < np.radians(0.8)
+    assert 0.1 < np.mean(values) < 2.0
+
+
+@pytest.mark.parametrize('walls', [1, 2])
+def test_what_planes_do_not_hold_is_known_less_and_less(walls):
+    solids = [half_space((-1, 0, 0), (2.5, 0, 0)), half_space((0, -1, 0), (0, 1.0, 0))][:walls]
+    # Sliding up, which is along both walls.
+    poses = [Pose.looking((0, 0, 1 + 0.004 * k), 10, 0, 0) for k in range(60)]
+    motions, truths = followed(Scene(tuple(solids), tuple(poses)), range(60))
+    wide = [np.sqrt(np.diag(motion.covariance)) for motion in motions]
+    forward, left, up, roll, pitch, yaw = wide[-1]
+    assert up > 0.3 and up > 1.3 * wide[30][2] > 1.6 * wide[15][2]
+    # Of the axes of the odometry, x is ten degrees off the first wall's normal.
+    normal = truths[0][0] @ poses[0].rotation.T @ np.array([1.0, 0, 0])
+    along = np.sqrt(normal @ motions[-1].covariance[:3, :3] @ normal)
+    about = np.sqrt(normal @ motions[-1].covariance[3:, 3:] @ normal)
+    assert along < 0.03 and pitch < np.radians(20)
+    if walls == 1:
+        assert left > 0.3 and about > np.radians(20) and yaw < np.radians(10)
+    else:
+        assert max(forward, left) < 0.05 and max(roll, pitch, yaw) < np.radians(2)
+    error = errors_of(motions[-1], truths[-1])
+    assert error @ np.linalg.solve(motions[-1].covariance, error) < 22  # 0.999 of six
+
+
+def test_other_planes_under_known_ids_do_not_make_it_jump():
+    room = kinect_room(1)
+    scene = Scene(room.solids, room.poses)
+    labels, planes = planes_of(scene, 0, 1)
+    view, odometry, pose = views(labels, planes, CONFIG.distortion_length), None, None
+    for k in range(24):
+        # All exchange their ids, come under new ones, or are not there.
+        ids = [p.id for p in planes]
+        if k == 8:
+            ids = ids[1:] + ids[:1]
+        named = [replace(p, id=i + 100 * (k == 12)) for p, i in zip(planes, ids, strict=True)]
+        shown = 0 if 16 <= k < 20 else len(named)
+        odometry = odometry or PlaneOdometry('odom')
+        motion = odometry.add(named[:shown], view[:shown], 10**9 + k * 10**9 // 30, (0, -1, 0))
+        if k == 20:
+            assert motion.held == 0
+        if pose:
+            off = pose.inverse().after(motion.pose)
+            assert np.linalg.norm(off.shift) < 0.01
+            assert Rotation.from_matrix(off.rotation).magnitude() < np.radians(1)
+        pose = motion.pose
+    assert np.linalg.eigvalsh(motion.covariance).min() > 0
+
+
+def test_z_is_up_and_x_forward_whatever_the_camera_sees():
+    for up in ((0, -1, 0), (0, -0.8, -0.6), (0.1, 0.7, 0.2), (0, 0, 1), (0, 0, -1)):
+        motion = PlaneOdometry('odom').add([], np.zeros((0, 4)), 0, up)
+        turn = motion.pose.rotation
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(turn @ up / np.linalg.norm(up), (0, 0, 1), atol=1e-12)
+        assert turn[0, 2] >= -1e-12 and abs(turn[1, 2]) < 1e-12
+
+
+def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
+    scene = Scene(kinect_room(2).solids, kinect_room(2).poses)
+    labels, planes = planes_of(scene, 0, 2)
+    view, odometry = views(labels, planes, CONFIG.distortion_length), PlaneOdometry('odom')
+    for stamp in (0, 0, 10**9, 10**9, 5 * 10**8, 10**12, 10**18, -5):
+        motion = odometry.add(planes, view, stamp, (0, -1, 0))
+        assert np.linalg.norm(motion.pose.shift) < 0.01
+        assert np.isfinite(motion.covariance).all()
+        assert np.linalg.eigvalsh(motion.covariance).min() > -1e-12
+
+
+def test_the_message_has_pose_and_twist_in_their_frames():
+    labels, planes = planes_of(Scene(kinect_room(2).solids, kinect_room(2).poses), 0, 2)
+    view = views(labels, planes, CONFIG.distortion_length)
+    motion = PlaneOdometry('odom').add(planes, view, 10**9, (0, -1, 0))
+    stamp = make_rosbags('builtin_interfaces/msg/Time', sec=1, nanosec=2)
+    header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id='camera')
+    message = odometry_message(make_rosbags, header, motion)
+    assert message.header.frame_id == 'odom' and message.header.stamp == stamp
+    assert message.child_frame_id == 'camera'
+    turn = message.pose.pose.orientation
+    found = Rotation.from_quat([turn.x, turn.y, turn.z, turn.w]).as_matrix()
+    np.testing.assert_allclose(found, motion.pose.rotation, atol=1e-12)
+    covariance = message.twist.covariance.reshape(6, 6)
+    # Metres per second come first.
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.repeat([0.9, np.pi / 3], 3))
+
+
+def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
+    room, camera = kinect_room(4), Camera(160, 120, 130.0, 130.0, 79.5, 59.5)
+    scene = Scene(room.solids, walk(room.poses[0], 4, 20), room.dark)
+    matrix = np.array([130, 0, 79.5, 0, 130, 59.5, 0, 0, 1])
+    recording = Recording()
+    config = Config(odometry=True, min_pixels=60)
+    sequence = SequenceSegmenter(config)
+    stamps = [10**9 + k * 10**9 // 30 for k in range(0, 20, STEP)]
+    for k, stamp in zip(range(0, 20, STEP), stamps, strict=True):
+        view = simulate_kinect(scene, camera, frame=k, seed=4)
+        depth = np.round(1000 * view.depth).astype(np.uint16)
+        recording.add_camera(stamp, 160, 120, k=matrix, p=np.insert(matrix, (3, 6, 9), 0.0))
+        recording.add_image(stamp, depth)
+        sequence.segment(RangeImage.from_depth(depth, camera), stamp)
+    recording.write(tmp_path / 'recording')
+    outcome = Replay(tmp_path / 'recording', tmp_path / 'out', config).run()
+    assert outcome.mapped == len(sequence.map) >= 1 and not outcome.unlocated
+    assert (tmp_path / 'out' / 'map.csv').exists()
+    rows = np.loadtxt(tmp_path / 'out' / 'trajectory.txt')
+    np.testing.assert_allclose(rows[:, 0], np.array(stamps) * 1e-9, atol=1e-9)
+    np.testing.assert_allclose(rows[0, 1:4], 0)
+    np.testing.assert_allclose(rows[-1, 1:4], sequence.motion.pose.shift, atol=1e-8)
+    turn = Rotation.from_quat(rows[-1, 4:]).as_matrix()
+    np.testing.assert_allclose(turn, sequence.motion.pose.rotation, atol=1e-8)
+    # Another frame: a map of its own, and the odometry begins at its origin.
+    sequence.config = replace(config, odometry_frame='start')
+    assert not len(sequence.map) and sequence.map.begun_anew == 'its frame has changed'
+    assert sequence.motion is None
+    with pytest.raises(ConfigError, match='odometry_frame'):
+        Config(odometry=True, odometry_frame='')
