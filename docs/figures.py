@@ -21,7 +21,8 @@ from rangeseg_ros.core.by_planes import method
 from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.patches import patches
 from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, surfaces
-from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
+from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.sensing.blocks import Blocks, quads
 from rangeseg_ros.core.sensing.bridges import bridged

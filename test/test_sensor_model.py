@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
+from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -15,7 +15,8 @@ from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, described
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.noise import jump_steps, measured_sensor
+from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions

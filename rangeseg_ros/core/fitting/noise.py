@@ -13,54 +13,46 @@ only blocks whose four parts are flat themselves are compared, scale by scale.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from functools import cache
+from typing import NamedTuple
 
-import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.optimize import nnls
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
+from rangeseg_ros.core.fitting.alike import Sets, alike, quantiles
+from rangeseg_ros.core.fitting.quantisation import quantisation
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quad_sums, quads
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     FLOOR,
     SensorModel,
     correlated_residuals,
-    random_variance,
 )
 
-# Bins of the inverse range with enough blocks for a quantile each: the error of a quantile of 40
-# blocks of 13 degrees of freedom is 7 % of a standard deviation.
-_BINS, _SLOPES, _PER_BIN = 8, 3, 40
 # Most blocks lie on planes, but edges and curvature only ever add to the residuals.
 _QUANTILE = 0.4
 # Blocks of a scale that weigh as much as what is known beforehand.
 _PRIOR = 12
-# Chi-squared of 13 and of 9 degrees of freedom over their mean, quantile 0.999: rougher blocks are
-# no part of a plane.
-_ROUGH, _BENT = 2.7, 3.1
-# Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
-# one.
-_ROWS, _SMALLEST = 40, 0.1
-# Steps of one quantum for each that is neither one nor two.
-_CLEAR = 4.0
+ROUGH = 2.7
+"""Chi-squared of 13 degrees of freedom over its mean, quantile 0.999: what is rougher is no part
+of a plane."""
+# The same with 9 degrees of freedom, of what one plane through four blocks leaves.
+_BENT = 3.1
+# Blocks of a scale that are looked at, about: a quantile of two hundred in each of `alike`'s sets
+# is off by 3 % of a standard deviation, and the mean of these by less than 1 %.
+_MOST = 4800
 # Share of the pixels of the fullest block that a block needs to count.
 _SHARE = 0.5
 # Rounds of least squares that settle the weights.
 _ROUNDS = 5
-# Steps that are no jump, as share of the range: that of a Kinect is 2 % at 8 m.
-_COARSEST = 0.05
-# Pairs of neighbours that rounding makes the same, for each that it does not, at least.
-_SAME = 0.05
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
 # Median of chi-squared of 9 degrees of freedom over its mean.
 _MEDIAN = 0.927
-# Square of a slope that no surface has, 1/m^2.
-_STEEPEST = 1e12
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
@@ -76,42 +68,77 @@ class Errors(NamedTuple):
         """Variances where the squares of inverse range and slope are these."""
         return FLOOR + self.constant + self.quartic * squared**2 + self.tilt * slope
 
+    def times(self, factor: float) -> Errors:
+        """So many times the variance."""
+        return Errors(factor * self.constant, factor * self.quartic, factor * self.tilt)
+
+
+class _Scale(NamedTuple):
+    """Blocks of a scale that count, as many as it takes.
+
+    Attributes
+    ----------
+    place : (N,) int
+        Their numbers among all blocks of the scale.
+    squared, slope : (N,) float64
+        As of `Blocks`.
+    sets : Sets
+        Of these N.
+    """
+
+    place: NDArray[np.intp]
+    squared: NDArray[np.float64]
+    slope: NDArray[np.float64]
+    sets: Sets
+
     @classmethod
-    def explaining(
-        cls,
+    def of(cls, blocks: Blocks, used: NDArray[np.bool_]) -> _Scale:
+        place = np.flatnonzero(used)
+        place = place[:: max(len(place) // _MOST, 1)]
+        squared, slope = blocks.squared.ravel()[place], blocks.slope.ravel()[place]
+        return cls(place, squared, slope, alike(squared, slope))
+
+    def variance_ratio(
+        self, blocks: Blocks, level: NDArray[np.float64] | float
+    ) -> NDArray[np.float64]:
+        """Mean square residuals (N,) of what the quantile of those of a variance `level` is."""
+        freedom = np.maximum(blocks.moments[..., COUNT].ravel()[self.place] - 3, 1)
+        ratio = (blocks.residual / level).ravel()[self.place]
+        return ratio / (freedom * _share(float(np.median(freedom))))
+
+    def mean(self, ratio: NDArray[np.float64], quantile: float) -> float:
+        """Mean over the sets of a quantile of what their blocks show of what was expected."""
+        return float(np.mean(quantiles(ratio, self.sets, quantile)))
+
+    def errors(
+        self,
         variance: NDArray[np.float64],
-        squared: NDArray[np.float64],
-        slope: NDArray[np.float64],
         quantile: float,
         kinds: tuple[int, ...],
         least: Errors,
         known: Errors,
-    ) -> Errors | None:
-        """What explains the `variance` of most of N blocks; None where they are too few.
+    ) -> Errors:
+        """What explains the `variance` of most blocks.
 
         At `least` so much there is, and of this so much is `known` and not asked for.
         """
-        if len(variance) < _PRIOR:
-            return None
-        terms, shown = [], []
-        cells, slopes = _cells(squared, slope)
-        for cell in cells:
-            fourth, tilt = _ranked(squared[cell], 0.5) ** 2, _ranked(slope[cell], 0.5)
-            value = _ranked(variance[cell], quantile)
-            other = known.constant + known.quartic * fourth + known.tilt * tilt
-            lowest = FLOOR + least.constant + least.quartic * fourth + least.tilt * tilt
-            shown.append(max(value - other, lowest))
-            terms.append((1.0, fourth, tilt))
+        squared, tilt = (quantiles(term, self.sets, 0.5) for term in (self.squared, self.slope))
+        shown = quantiles(variance, self.sets, quantile)
+        # `known` adds no floor to that of `least`.
+        shown = np.maximum(shown - (known.at(squared, tilt) - FLOOR), least.at(squared, tilt))
         # What faces the sensor first: noise makes slopes of its own, that would explain it.
-        table, level = np.array(terms), np.array(shown)
-        facing, values = table[::slopes], level[::slopes]
+        facing = slice(None, None, self.sets.slopes)
+        terms = np.ones(len(squared)), squared**2
         # A sensor errs in disparity or in range: of both together a few blocks tell nothing.
-        likeliest = [(*_likeliest(facing[:, kind], values), kind) for kind in kinds]
+        nothing = np.zeros(len(shown))
+        likeliest = [
+            (*_likeliest(terms[kind][facing], shown[facing], nothing[facing]), kind)
+            for kind in kinds
+        ]
         factor, _, kind = min(likeliest, key=lambda found: found[1])
         constant, quartic = (factor, 0.0) if kind == 0 else (0.0, factor)
-        straight = constant + quartic * table[:, 1]
-        tilt, _ = _likeliest(table[:, 2], level, straight)
-        return cls(constant, quartic, tilt)
+        straight, _ = _likeliest(tilt, shown, constant + quartic * terms[1])
+        return Errors(constant, quartic, straight)
 
 
 def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
@@ -125,7 +152,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     prior : SensorModel
         Taken as far as the image says too little.
     """
-    quantum, range_quantum = _quantisation(image.inverse)
+    quantum, range_quantum = quantisation(image.inverse)
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
@@ -134,62 +161,56 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     coarse = Blocks.planes(quads(blocks.moments), image.rays, 2 * BLOCK)
     count = coarse.moments[..., COUNT]
     used = count >= _SHARE * count.max(initial=0)
-    freedom = np.maximum(count - 3, 1)
-    variance = coarse.residual[used] / freedom[used] / _expected(freedom[used])
-    none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
-    noise = Errors.explaining(
-        variance, coarse.squared[used], coarse.slope[used], _QUANTILE, (0, 1), rounded, none
-    )
-    if noise is None:
+    if np.count_nonzero(used) < _PRIOR:
         return prior
+    scale = _Scale.of(coarse, used)
+    none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
+    variance = scale.variance_ratio(coarse, 1.0)
+    noise = scale.errors(variance, _QUANTILE, (0, 1), rounded, none)
     level = noise.at(coarse.squared, coarse.slope).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: blocks.squared.shape[0], : blocks.squared.shape[1]]
     count = blocks.moments[..., COUNT]
-    freedom = np.maximum(count - 3, 1)
-    moments, residual = blocks.moments, blocks.residual
     # Six pixels leave three degrees of freedom.
-    flat = (count >= 6) & (residual < _ROUGH * level * freedom)
+    flat = (count >= 6) & (blocks.residual < ROUGH * level * np.maximum(count - 3, 1))
     if not flat.any():
         return prior
-    ratio = (residual / level / freedom)[flat] / _expected(freedom[flat])
-    within = [_mean_ratio(ratio, blocks.squared[flat], blocks.slope[flat], _QUANTILE)]
+    scale = _Scale.of(blocks, flat)
+    within = [scale.mean(scale.variance_ratio(blocks, level), _QUANTILE)]
     between = 1.0
     distortion = none
     # What is new in every pixel shows in the smallest blocks.
-    shown = Errors(*(within[0] * np.array(noise)).tolist())
+    shown = noise.times(within[0])
     # Lasers err in range alone.
     kinds = (0, 1) if noise.quartic > 0 else (0,)
-    side = BLOCK
+    side, parts = BLOCK, blocks
     while True:
-        whole = _quad_sums(flat.astype(np.int8)) == 4
-        parts = Blocks.planes(quads(moments), image.rays, 2 * side)
-        level = _quad_sums(level) / 4
-        excess = np.maximum(parts.residual - _quad_sums(residual), 0) / (9 * _MEDIAN)
-        bending = Errors.explaining(
-            excess[whole], parts.squared[whole], parts.slope[whole], 0.5, kinds, none, shown
-        )
-        if bending is None:
+        whole = quad_sums(flat.astype(np.float64)) == 4
+        if np.count_nonzero(whole) < _PRIOR:
             break
-        freedom = parts.moments[..., COUNT][whole] - 3
-        ratio = (parts.residual / level)[whole] / freedom / _expected(freedom)
-        alike = parts.squared[whole], parts.slope[whole]
-        within.append(_mean_ratio(ratio, *alike, _QUANTILE))
+        apart, level = quad_sums(parts.residual), quad_sums(level) / 4
+        parts = (
+            coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
+        )
+        scale = _Scale.of(parts, whole)
+        excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
+        bending = scale.errors(excess.ravel()[scale.place], 0.5, kinds, none, shown)
+        within.append(scale.mean(scale.variance_ratio(parts, level), _QUANTILE))
         if side == BLOCK:
-            between = _mean_ratio((excess / level)[whole], *alike, 0.5)
+            between = scale.mean((excess / level).ravel()[scale.place], 0.5)
         # M(s) = v + D^2 s^2 / 8.
-        smooth = Errors(*(8 / side**2 * np.array(bending)).tolist())
+        smooth = bending.times(8 / side**2)
         expected = shown.at(parts.squared, parts.slope) + bending.at(parts.squared, parts.slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
-            float(np.median(errors.at(parts.squared[whole], parts.slope[whole])))
+            float(np.median(errors.at(scale.squared, scale.slope)))
             for errors in (distortion, smooth)
         ]
         if typical[1] > typical[0]:
             distortion = smooth
-        moments, residual, side = parts.moments, parts.residual, 2 * side
+        side = 2 * side
     if len(within) == 1:
         return prior
-    total, white, width = _random(np.array(within[:3]), between)
+    total, white, width = _random(within, between)
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
         noise=max(float(np.sqrt(noise.constant * total)), rounding),
@@ -205,87 +226,17 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     )
 
 
-def jump_steps(
-    blocks: Blocks, sensor: SensorModel
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Smallest step of the inverse range that is a jump, and the slope of the surface.
-
-    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times
-    the variance of `agreement` for white and correlated noise alike (0.67 to 0.76), and five
-    standard deviations are no noise. Rounding alone makes steps of one quantum, and of two
-    where noise adds to it.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        (rows, columns).
-    sensor : SensorModel
-
-    Returns
-    -------
-    steps : (rows, columns) float32
-        1/m.
-    slopes : (rows, columns) float32
-        Change of the inverse range from pixel to pixel, 1/m; where a block is not flat, that of
-        the flattest beside it.
-    """
-    factor = 25 * 0.72 * sensor.agreement
-    level = random_variance(sensor, blocks.squared)
-    # The slope of a block that a jump crosses is the jump's: its neighbours' then.
-    count = blocks.moments[..., COUNT]
-    bounded = level + sensor.pixel_noise**2 * blocks.slope
-    flat = (count > 3) & (blocks.residual < _ROUGH * bounded * np.maximum(count - 3, 1))
-    slope = np.where(flat, blocks.slope, _STEEPEST).astype(np.float32)
-    least = cv2.erode(slope, np.ones((3, 3), np.uint8))
-    slope = np.where(flat, slope, np.where(least < _STEEPEST, least, 0))
-    rounding = np.maximum(sensor.quantum, sensor.range_quantum * blocks.squared)
-    steps = np.sqrt(factor * (level + sensor.pixel_noise**2 * slope))
-    steps = np.maximum(steps, 2.2 * rounding)
-    return steps.astype(np.float32), np.sqrt(slope, dtype=np.float32)
+@cache
+def _share(freedom: float) -> float:
+    """Quantile of chi-squared of so many degrees of freedom over its mean."""
+    return 2 * float(gammaincinv(freedom / 2, _QUANTILE)) / freedom
 
 
-def _cells(
-    squared: NDArray[np.float64], slope: NDArray[np.float64]
-) -> tuple[list[NDArray[np.intp]], int]:
-    """Indices of N blocks alike in range and slope, and how many such sets there are of a range.
-
-    Of each range, those that face the sensor come first.
-    """
-    slopes = _SLOPES if len(squared) >= _SLOPES * _PER_BIN else 1
-    bins = min(_BINS, max(len(squared) // (slopes * _PER_BIN), 1))
-    cells = []
-    for part in np.array_split(np.argsort(squared, kind='stable'), bins):
-        cells += np.array_split(part[np.argsort(slope[part], kind='stable')], slopes)
-    return cells, slopes
-
-
-def _expected(freedom: NDArray[np.float64]) -> float:
-    """What the quantile of variances of so many degrees of freedom has of their mean."""
-    typical = float(np.median(freedom))
-    return float(chi2.ppf(_QUANTILE, typical)) / typical
-
-
-def _ranked(values: NDArray[np.float64], quantile: float) -> float:
-    """One of N values that so many lie below: np.quantile takes ten times as long for a few."""
-    rank = int(quantile * (len(values) - 1))
-    return float(np.partition(values, rank)[rank])
-
-
-def _mean_ratio(
-    ratio: NDArray[np.float64],
-    squared: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    quantile: float,
-) -> float:
-    """Mean over sets of like blocks of a quantile of what they show of what was expected."""
-    cells, _ = _cells(squared, slope)
-    return float(np.mean([_ranked(ratio[cell], quantile) for cell in cells]))
-
-
+@njit(cache=True)
 def _likeliest(
     term: NDArray[np.float64],
     variances: NDArray[np.float64],
-    known: NDArray[np.float64] | float = 0,
+    known: NDArray[np.float64],
 ) -> tuple[float, float]:
     """Factor >= 0 of a term (N,) that with what is `known` explains variances (N,).
 
@@ -293,64 +244,51 @@ def _likeliest(
     least squares weighted by what it explains, found in a few rounds. Also returns how unlikely
     it is, the deviance but for a constant.
     """
-    explained = np.full(len(variances), variances.mean())
+    explained = np.full(len(variances), np.mean(variances))
+    factor = 0.0
     for _ in range(_ROUNDS):
         weight = term / explained**2
-        factor = max(float((weight * (variances - known)).sum()), 0.0)
-        factor /= max(float((weight * term).sum()), 1e-300)
+        factor = max((weight * (variances - known)).sum(), 0.0)
+        factor /= max((weight * term).sum(), 1e-300)
         explained = np.maximum(known + factor * term, 1e-3 * variances)
-    return factor, float((np.log(explained) + variances / explained).sum())
+    return factor, (np.log(explained) + variances / explained).sum()
 
 
-def _random(within: NDArray[np.float64], between: float) -> tuple[float, float, float]:
+def _random(within: list[float], between: float) -> tuple[float, float, float]:
     """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(4)."""
-    shown = np.maximum(np.array([*within, between]), 1e-9)
+    shown = np.maximum(np.array([*within[:3], between]), 1e-9)
     best = np.inf
     result = 1.0, 1.0, 0.0
     for width in _WIDTHS:
         hidden = correlated_residuals(width)
-        predicted = np.array([*hidden[: len(within)], hidden[3]])
-        terms = np.stack([np.ones(len(shown)), predicted], axis=1) / shown[:, None]
-        (white, correlated), error = nnls(terms, np.ones(len(shown)))
+        predicted = np.array([*hidden[: len(shown) - 1], hidden[3]])
+        white, correlated, error = _white_and_correlated(predicted, shown)
         if error < best:
-            best = error
-            total = white + correlated
-            result = float(total), float(white / total), width
+            best, total = error, white + correlated
+            result = total, white / total, width
     return result
 
 
-def _quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
-    """Steps of the inverse range, 1/m, and of the range, metres, that an image is rounded to."""
-    rows = inverse[:: max(len(inverse) // _ROWS, 1)]
-    pairs = rows[:, 1:], rows[:, :-1]
-    measured = (pairs[0] > 0) & (pairs[1] > 0)
-    same = measured & (pairs[0] == pairs[1])
-    measured &= ~same & (np.abs(pairs[0] - pairs[1]) < _COARSEST * pairs[0])
-    unlike = np.count_nonzero(measured)
-    # Without rounding neighbours are hardly ever the same.
-    if unlike < _PER_BIN or np.count_nonzero(same) < _SAME * unlike:
-        return 0.0, 0.0
-    here, there = (side[measured].astype(np.float64) for side in pairs)
-    step = np.abs(here - there)
-    in_range = step / (here * there)
-    (quantum, clear), (range_quantum, range_clear) = _common_step(step), _common_step(in_range)
-    if max(clear, range_clear) < _CLEAR:
-        return 0.0, 0.0
-    return (quantum, 0.0) if clear > range_clear else (0.0, range_quantum)
+@njit(cache=True)
+def _white_and_correlated(
+    predicted: NDArray[np.float64], shown: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    """Variances >= 0 of white noise and of noise that shows as `predicted`, and their error.
 
-
-def _common_step(steps: NDArray[np.float64]) -> tuple[float, float]:
-    """The step of which the smaller ones of these are multiples, and how clearly they are."""
-    small = _ranked(steps, _SMALLEST)
-    # What was rounded twice is off by a little.
-    near = np.abs(steps - small) < 0.2 * small
-    beside = np.count_nonzero(steps < 1.8 * small) - np.count_nonzero(near)
-    return float(np.median(steps[near])), float(np.count_nonzero(near)) / max(int(beside), 1)
-
-
-def _quad_sums(values: NDArray[Any]) -> NDArray[Any]:
-    """Sums (ceil(rows / 2), ceil(columns / 2)) of every 2 x 2 values."""
-    rows, columns = values.shape
-    even = np.zeros((rows + rows % 2, columns + columns % 2), values.dtype)
-    even[:rows, :columns] = values
-    return np.asarray(even.reshape(len(even) // 2, 2, -1, 2).sum(axis=(1, 3)))
+    Of the sum of both, relative to what was `shown`, by least squares.
+    """
+    one, other = 1 / shown, predicted / shown
+    aa, ab, bb = (one * one).sum(), (one * other).sum(), (other * other).sum()
+    a, b = one.sum(), other.sum()
+    determinant = aa * bb - ab * ab
+    white, correlated = 0.0, b / bb
+    if determinant > 1e-12 * aa * bb:
+        white, correlated = (a * bb - b * ab) / determinant, (b * aa - a * ab) / determinant
+    # Where one of them would be negative, the other explains it alone, and better than the sum
+    # would with the negative one left out.
+    if correlated < 0:
+        white, correlated = a / aa, 0.0
+    elif white < 0:
+        white, correlated = 0.0, b / bb
+    error = (white * one + correlated * other - 1) ** 2
+    return white, correlated, error.sum()

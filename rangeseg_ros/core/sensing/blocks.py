@@ -47,7 +47,9 @@ class Blocks(NamedTuple):
     def planes(cls, moments: NDArray[np.float64], rays: NDArray[np.float32], size: int) -> Blocks:
         """Planes of the blocks of `size` pixels with these moments."""
         squared = moments[..., CHI2] / np.maximum(moments[..., COUNT], 1)
-        return cls(moments, squared, *_slopes_and_residuals(moments, rays, size))
+        slope, residual = np.zeros_like(squared), np.zeros_like(squared)
+        strips(_fit_blocks, len(moments), moments, rays, size, slope, residual)
+        return cls(moments, squared, slope, residual)
 
 
 def block_moments(
@@ -119,18 +121,34 @@ def quads(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _slopes_and_residuals(
-    moments: NDArray[np.float64], rays: NDArray[np.float32], size: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    rows, columns = moments.shape[:2]
-    slope, residual = np.zeros((rows, columns)), np.zeros((rows, columns))
+def quad_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums (ceil(rows / 2), ceil(columns / 2)) of every 2 x 2 values."""
+    rows, columns = values.shape
+    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2))
+    for i in range(rows):
+        for j in range(columns):
+            result[i // 2, j // 2] += values[i, j]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _fit_blocks(
+    first: int,
+    after: int,
+    moments: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    size: int,
+    slope: NDArray[np.float64],
+    residual: NDArray[np.float64],
+) -> None:
+    """Slopes and residuals of rows of blocks."""
     theta = np.zeros(3)
     # Variance of the slope in both directions together, of noise of unit variance.
     doubt = 2 * 12 / (size * size - 1)
     # The pixel in the middle of a block and its neighbours; the last block may be cut off.
-    for bi in range(rows):
+    for bi in range(first, after):
         i = min(bi * size + size // 2, len(rays) - 2)
-        for bj in range(columns):
+        for bj in range(moments.shape[1]):
             j = min(bj * size + size // 2, rays.shape[1] - 2)
             count = moments[bi, bj, COUNT]
             if count == 0:
@@ -144,4 +162,3 @@ def _slopes_and_residuals(
                 down += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
             noise = residual[bi, bj] / (count - 3) * doubt / count
             slope[bi, bj] = max(across * across + down * down - noise, 0.0)
-    return slope, residual
