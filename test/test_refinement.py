@@ -10,6 +10,7 @@ from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
+from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut import expansion
@@ -44,14 +45,26 @@ def random_case(seed, height, width, count=3):
     for edge in edges:
         edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
     # Half of chi-squared, one to four variances granted.
-    models = Models(theta, 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)]))
+    price = 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)])
+    box = np.array([[0, 0, 0, 0]] + count * [[0, 0, -(-height // BLOCK), -(-width // BLOCK)]])
+    area = box[:, 2] * box[:, 3]
+    shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
+    models = Models(theta, price, Shifts(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
     return Problem.of(image, SENSOR, edges, BLOCK), models, labels.astype(np.int32)
 
 
 def unary(problem, models):
     """Cost (K + 1, H, W) of every label at every pixel, from the definition."""
-    residual = problem.inverse - models.theta @ problem.rays.T
+    level = models.theta @ problem.rays.T
+    row, column = np.divmod(np.arange(level.shape[1]), problem.width)
+    for label, (top, left, rows, columns) in enumerate(models.shifts.box[1:], 1):
+        start = models.shifts.start[label]
+        shift = np.zeros((row[-1] // BLOCK + 1, problem.width // BLOCK + 1))
+        values = models.shifts.values[start : start + rows * columns]
+        shift[top : top + rows, left : left + columns] = values.reshape(rows, columns)
+        level[label] *= 1 + shift[row // BLOCK, column // BLOCK]
+    residual = problem.inverse - level
     cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0)
     cost[0] = 6.0
     return np.where(problem.weight > 0, cost, 0).reshape(len(cost), -1, problem.width)
@@ -229,12 +242,12 @@ def small_room(seed=900):
     blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
     blocks = weighted(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
     found = surfaces(blocks, block_links(edges, BLOCK), BLOCK)
-    return Problem.of(image, sensor, edges, BLOCK), found, sensor
+    return Problem.of(image, sensor, edges, BLOCK), (found[0], blocks, found[1]), sensor
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):
     """From no plane at all over the descent through every expansion."""
-    problem, (surface, moments), sensor = small_room()
+    problem, (surface, blocks, moments), sensor = small_room()
     values = []
 
     def watched(name, labels_and_models):
@@ -253,7 +266,7 @@ def test_each_stage_lowers_the_energy(monkeypatch):
 
     watched('_descended', lambda arguments, result: (result[0], arguments[2]))
     watched('_expand_each', lambda arguments, result: (arguments[2].labels, arguments[4]))
-    labels, models = refine(problem, surface, moments, sensor)
+    labels, models = refine(problem, surface, blocks, moments, sensor)
     assert len(values) == 3
     assert (np.diff(values) <= 1e-3).all()
     assert values[1] < 0.5 * values[0]
@@ -263,13 +276,13 @@ def test_each_stage_lowers_the_energy(monkeypatch):
 
 def test_no_expansion_helps_after_the_exact_minimisation():
     """Of no plane to anywhere, of the others to the pixels around their blocks."""
-    problem, (surface, moments), sensor = small_room()
-    labels, models = refine(problem, surface, moments, sensor, exact=True)
+    problem, (surface, blocks, moments), sensor = small_room()
+    labels, models = refine(problem, surface, blocks, moments, sensor, exact=True)
     value = energy(labels, problem, models)
     measured = problem.weight.reshape(-1, problem.width) > 0
     for alpha in range(len(models.theta)):
-        blocks = np.pad(surface == alpha, 4)
-        around = np.lib.stride_tricks.sliding_window_view(blocks, (9, 9)).any(axis=(2, 3))
+        own = np.pad(surface == alpha, 4)
+        around = np.lib.stride_tricks.sliding_window_view(own, (9, 9)).any(axis=(2, 3))
         pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
         front = np.flatnonzero(pixels & measured).astype(np.int32)
         changed, cost = labels.copy(), costs(labels, problem, models)
@@ -280,15 +293,15 @@ def test_no_expansion_helps_after_the_exact_minimisation():
 
 @pytest.mark.parametrize('exact', [False, True])
 def test_refits_lower_the_energy_until_they_do_not(exact):
-    problem, (surface, moments), sensor = small_room()
+    problem, (surface, blocks, moments), sensor = small_room()
     values = []
     for refits in (0, 1, 2, 5, 40):
-        labels, models = refine(problem, surface, moments, sensor, exact, refits)
+        labels, models = refine(problem, surface, blocks, moments, sensor, exact, refits)
         values.append(energy(labels, problem, models))
     assert values[1] < values[0]
     assert (np.diff(values) <= 0).all()
     # Some round before the last did not help.
-    again, _ = refine(problem, surface, moments, sensor, exact, 41)
+    again, _ = refine(problem, surface, blocks, moments, sensor, exact, 41)
     np.testing.assert_array_equal(labels, again)
 
 

@@ -6,9 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, region_moments
+from rangeseg_ros.core.by_planes.plane_energy import Problem, region_moments
 from rangeseg_ros.core.runtime.threads import halves
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
@@ -54,7 +54,7 @@ def curved(
     rays = problem.rays.reshape(*shape, 3)[sparse]
     weight = problem.weight.reshape(shape)[sparse]
     moments = region_moments(regions, count, inverse, rays, weight, sensor)
-    models = Models.of(moments, problem.enlarged)
+    theta, _ = fit_all(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
     parts = halves(
@@ -64,7 +64,7 @@ def curved(
         inverse,
         rays,
         weight,
-        models.theta,
+        theta,
         limit,
     )
     normal, right, square, area, scale = map(np.add, *parts)

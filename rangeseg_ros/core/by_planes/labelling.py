@@ -20,7 +20,9 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     data_cost,
     energy,
     region_moments,
+    shifted_cost,
 )
+from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
 from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -37,6 +39,7 @@ _DOMAIN = 4
 def refine(
     problem: Problem,
     surfaces: NDArray[np.intp],
+    blocks: NDArray[np.float64],
     moments: NDArray[np.float64],
     sensor: SensorModel,
     exact: bool = False,
@@ -49,6 +52,8 @@ def refine(
     problem : Problem
     surfaces : (rows, columns) int
         Surface of each block, 0...K, 0 for none.
+    blocks : (rows, columns, 13) float64
+        Moments of the blocks, weighted.
     moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
@@ -66,7 +71,8 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    starts, models = surfaces.astype(np.int32), Models.of(moments, problem.enlarged)
+    starts = surfaces.astype(np.int32)
+    models = _shifted(Models.of(moments, problem.enlarged), starts, blocks, sensor)
     labels, cost = _descended(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains)
@@ -76,16 +82,22 @@ def refine(
         arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
         weight = problem.weight.reshape(shape)
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
-        refitted, better = (
-            Models.of(moments, problem.enlarged)._replace(price=models.price),
-            labels.copy(),
-        )
+        refitted = Models.of(moments, problem.enlarged)._replace(price=models.price)
+        refitted, better = _shifted(refitted, starts, blocks, sensor), labels.copy()
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
         last, value = value, energy(better, problem, refitted)
         if value >= last - _STEP:
             break
         labels, models = better, refitted
     return labels, models
+
+
+def _shifted(
+    models: Models, surfaces: NDArray[np.int32], blocks: NDArray[np.float64], sensor: SensorModel
+) -> Models:
+    """Models with the shifts of their planes wherever they may be labels."""
+    local = shifts(surfaces, blocks, models.theta, _DOMAIN, sensor.agreement)
+    return models._replace(shifts=local)
 
 
 def _minimise(
@@ -157,7 +169,7 @@ def _take_nearest(
     width, block = problem.width, problem.block
     height = len(labels) // width
     side = 2 * _REACH + 1
-    candidates = np.empty(side * side, np.int32)
+    candidates, scale = np.empty(side * side, np.int32), np.empty(side * side)
     for bi in range(first, after):
         for bj in range(columns):
             count = 0
@@ -170,6 +182,7 @@ def _take_nearest(
                         known |= candidates[k] == label
                     if not known:
                         candidates[count] = label
+                        scale[count] = 1 + shift_at(models.shifts, label, bi, bj)
                         count += 1
             for i in range(bi * block, min((bi + 1) * block, height)):
                 row = i * width
@@ -181,7 +194,9 @@ def _take_nearest(
                         continue
                     best, least = 0, np.float32(NO_PLANE)
                     for k in range(count):
-                        value = np.float32(data_cost(candidates[k], p, problem, models))
+                        value = np.float32(
+                            shifted_cost(candidates[k], p, scale[k], problem, models)
+                        )
                         if value < least:
                             best, least = candidates[k], value
                     labels[p], cost[p] = best, least

@@ -107,7 +107,9 @@ def segment(
     surface, moments = surfaces(weights, block_links(grid, size), size, least, enlarged)
     problem = pending.result()
     lap('surfaces')
-    labels, models = refine(problem, surface, moments, sensor, config.exact, config.refits)
+    labels, models = refine(
+        problem, surface, weights, moments, sensor, config.exact, config.refits
+    )
     lap('labels')
     return Labelling(labels.reshape(image.shape), sensor, problem, models)
 

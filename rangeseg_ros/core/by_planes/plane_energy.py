@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.regions import VGA
@@ -31,8 +32,6 @@ _SMOOTHNESS = 1.2
 NO_PLANE = 6.0
 """Data cost of label 0."""
 _CAP = 8.0
-# Systematic variances granted to the pixels of a plane.
-_GRANTED = 2.0
 
 
 class Problem(NamedTuple):
@@ -97,19 +96,23 @@ class Models(NamedTuple):
         theta . ray = inverse range; entry 0 is no plane.
     price : (K + 1,) float64
         Data cost of a residual of one random variance: the less, the more variance is granted.
+    shifts : Shifts
+        How much nearer the planes look at each block.
     """
 
     theta: NDArray[np.float64]
     price: NDArray[np.float64]
+    shifts: Shifts
 
     @classmethod
     def of(cls, moments: NDArray[np.float64], enlarged: float = 1.0) -> Models:
-        """Planes of moment vectors (K + 1, 13) in an image of so many times VGA's pixels."""
+        """Planes of moment vectors (K + 1, 13) in an image of so many times VGA's pixels, as yet
+        without shifts."""
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
         ratio = moments[:, RATIO] / (count + enlarged * DISTORTION_PIXELS)
-        granted = (1 + moments[:, SLOPE] / count) * (1 + _GRANTED * ratio)
-        return cls(theta, 0.5 / granted)
+        granted = (1 + moments[:, SLOPE] / count) * (1 + ratio)
+        return cls(theta, 0.5 / granted, Shifts.none(len(theta)))
 
 
 def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
@@ -124,13 +127,21 @@ def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float
 @njit(cache=True)
 def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     """What a label costs a measured pixel."""
+    row, column = p // problem.width // problem.block, p % problem.width // problem.block
+    shift = shift_at(models.shifts, label, row, column)
+    return shifted_cost(label, p, 1 + shift, problem, models)
+
+
+@njit(cache=True)
+def shifted_cost(label: int, p: int, scale: float, problem: Problem, models: Models) -> float:
+    """The same where 1 + s of the plane is known."""
     if label == 0:
         return NO_PLANE
     theta, rays = models.theta, problem.rays
     level = (
         theta[label, 0] * rays[p, 0] + theta[label, 1] * rays[p, 1] + theta[label, 2] * rays[p, 2]
     )
-    residual = problem.inverse[p] - level
+    residual = problem.inverse[p] - scale * level
     return min(models.price[label] * problem.weight[p] * residual * residual, _CAP)
 
 
