@@ -105,10 +105,11 @@ def energies(many, problem, models):
 def expand(alpha, labels, cost, problem, models, reach=12):
     """Expand a label from everywhere; in place."""
     labels, cost = labels.ravel(), cost.ravel()
-    start, sites = expansion.fronts(labels, problem.links, problem.width, len(models.theta))
+    rows = 0, len(labels) // problem.width
+    start, sites = expansion.fronts(labels, problem.links, problem.width, len(models.theta), rows)
     front = sites[start[alpha] : start[alpha + 1]]
     labelling = expansion.GridLabelling.of(labels, cost, problem.links, problem.width)
-    helped = refinement._expand(alpha, front, reach, labelling, problem, models)
+    helped = refinement._expand(alpha, front, rows, reach, labelling, problem, models)
     assert (labelling.position == -1).all()
     return helped
 
@@ -265,7 +266,7 @@ def test_each_stage_lowers_the_energy(monkeypatch):
         monkeypatch.setattr(refinement, name, run)
 
     watched('_descended', lambda arguments, result: (result[0], arguments[2]))
-    watched('_expand_each', lambda arguments, result: (arguments[2].labels, arguments[4]))
+    watched('_minimise', lambda arguments, result: (arguments[0], arguments[3]))
     labels, models = refine(problem, surface, blocks, moments, sensor)
     assert len(values) == 3
     assert (np.diff(values) <= 1e-3).all()
@@ -287,7 +288,9 @@ def test_no_expansion_helps_after_the_exact_minimisation():
         front = np.flatnonzero(pixels & measured).astype(np.int32)
         changed, cost = labels.copy(), costs(labels, problem, models)
         labelling = expansion.GridLabelling.of(changed, cost, problem.links, problem.width)
-        refinement._expand(alpha, front, 1, labelling, problem, models)
+        refinement._expand(
+            alpha, front, (0, len(labels) // problem.width), 1, labelling, problem, models
+        )
         assert energy(changed, problem, models) > value - 1e-2
 
 

@@ -102,7 +102,8 @@ def _expand(
     vectors = directions.astype(np.float32)
     links = link_costs(grid, smoothness)
     labelling = GridLabelling.of(labels, chosen_angles(labels, sites, vectors), links, width)
-    _expand_each(sites, vectors, labelling, fronts(labels, links, width, len(vectors)))
+    near = fronts(labels, links, width, len(vectors), (0, len(image)))
+    _expand_each(sites, vectors, labelling, near)
 
 
 @njit(cache=True, nogil=True)
@@ -114,11 +115,12 @@ def _expand_each(
 ) -> None:
     """Expand each label once, to the pixels about its front; in place."""
     start, beside = near
+    rows = 0, len(labelling.labels) // labelling.width
     for alpha in range(len(vectors)):
         front = beside[start[alpha] : start[alpha + 1]]
         if len(front):
             front = _onward(alpha, front, normals, vectors[alpha], labelling)
-            sites = band(alpha, front, _BAND_PIXELS, labelling)
+            sites = band(alpha, front, _BAND_PIXELS, labelling, rows)
             new = angles(sites, normals, vectors[alpha])
             expand(alpha, sites, new, labelling, ROUNDING)
 

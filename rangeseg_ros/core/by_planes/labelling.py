@@ -7,6 +7,9 @@ at hand.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import cv2
 import numpy as np
 from numba import njit
@@ -24,7 +27,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import aside, strips
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # An improvement smaller than this is rounding.
@@ -108,17 +111,28 @@ def _minimise(
     domains: Sites | None,
 ) -> None:
     """Expand the labels near their boundaries, or in their domains until none helps; in place."""
-    count = len(models.theta)
     if domains is None:
-        near = fronts(labels, problem.links, problem.width, count)
         labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
-        # Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
-        _expand_each(1, count, labelling, problem, models, near, _BAND)
+        _in_halves(_expand_near, len(labels) // problem.width, labelling, problem, models)
         return
     cost = costs(labels, problem, models)
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
-    while _expand_each(0, count, labelling, problem, models, domains, 1):
+    everywhere = 0, len(labels) // problem.width
+    while _expand_each(0, everywhere, labelling, problem, models, domains, 1):
         pass
+
+
+def _in_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> None:
+    """Run kernel(rows, *arguments) on both halves of an image at once, then where they meet.
+
+    Two rows in the middle are left to the end, so that neither half sees the other change: the
+    result is the same for any number of threads.
+    """
+    middle = height // 2
+    lower = aside(kernel, (min(middle + 1, height), height), *arguments)
+    kernel((0, max(middle - 1, 0)), *arguments)
+    lower.result()
+    kernel((max(middle - 2 * _BAND, 0), min(middle + 2 * _BAND, height)), *arguments)
 
 
 def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites:
@@ -146,7 +160,7 @@ def _descended(
     least = cv2.erode(exact, window)
     settled = (least > 0) & (least == cv2.dilate(exact, window))
     strips(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
-    _descend(labels, cost, problem, models)
+    _in_halves(_descend, len(labels) // problem.width, labels, cost, problem, models)
     return labels, cost
 
 
@@ -202,38 +216,44 @@ def _take_nearest(
                     labels[p], cost[p] = best, least
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _descend(
-    labels: NDArray[np.int32], cost: NDArray[np.float32], problem: Problem, models: Models
+    rows: tuple[int, int],
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
 ) -> None:
     """Iterated conditional modes (Besag 1986): pixels take a neighbour's label where it pays.
 
-    In place, until no pixel changes. It leaves the energy in a poor local minimum, but one from
-    which the cuts have only the boundaries left to move.
+    In place, until no pixel of the rows from the first to before the second changes. It leaves the
+    energy in a poor local minimum, but one from which the cuts have only the boundaries left to
+    move.
     """
+    begin, end = rows[0] * problem.width, rows[1] * problem.width
     offsets = np.array([1, problem.width, -1, -problem.width])
     links = problem.links
     around = np.zeros(4, np.int32)
     link = np.zeros(4)
     # A ring, long enough as no pixel is in it twice.
-    queue = np.empty(len(labels), np.int32)
-    queued = np.zeros(len(labels), np.bool_)
+    queue = np.empty(max(end - begin, 1), np.int32)
+    queued = np.zeros(end - begin, np.bool_)
     waiting = 0
-    for p in range(len(labels)):
+    for p in range(max(begin - problem.width, 0), end):
         for k in range(2):
             q = p + offsets[k]
             if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
-                for end in (p, q):
-                    if not queued[end]:
-                        queue[waiting] = end
-                        queued[end] = True
+                for site in (p, q):
+                    if begin <= site < end and not queued[site - begin]:
+                        queue[waiting] = site
+                        queued[site - begin] = True
                         waiting += 1
     first, last = 0, waiting % len(queue)
     while waiting > 0:
         p = queue[first]
         first = (first + 1) % len(queue)
         waiting -= 1
-        queued[p] = False
+        queued[p - begin] = False
         here = labels[p]
         least = np.float64(cost[p]) - _STEP
         for k in range(4):
@@ -257,32 +277,45 @@ def _descend(
             continue
         for k in range(4):
             q = p + offsets[k]
-            if link[k] > 0 and not queued[q]:
-                queued[q] = True
+            if link[k] > 0 and begin <= q < end and not queued[q - begin]:
+                queued[q - begin] = True
                 queue[last] = q
                 last = (last + 1) % len(queue)
                 waiting += 1
 
 
 @njit(cache=True, nogil=True)
+def _expand_near(
+    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models
+) -> None:
+    """Expand every label once in some rows, near its boundaries; in place.
+
+    Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
+    """
+    count = len(models.theta)
+    near = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
+    _expand_each(1, rows, labelling, problem, models, near, _BAND)
+
+
+@njit(cache=True, nogil=True)
 def _expand_each(
     first: int,
-    after: int,
+    rows: tuple[int, int],
     labelling: GridLabelling,
     problem: Problem,
     models: Models,
     near: Sites,
     reach: int,
 ) -> bool:
-    """Expand labels `first` to before `after` once, to the pixels `near` and `reach` - 1 beyond.
+    """Expand labels from `first` on once, to the pixels `near` and `reach` - 1 beyond in `rows`.
 
     In place. Whether that helped.
     """
     start, sites = near
     helped = False
-    for alpha in range(first, after):
+    for alpha in range(first, len(models.theta)):
         front = sites[start[alpha] : start[alpha + 1]]
-        helped |= _expand(alpha, front, reach, labelling, problem, models)
+        helped |= _expand(alpha, front, rows, reach, labelling, problem, models)
     return helped
 
 
@@ -290,13 +323,14 @@ def _expand_each(
 def _expand(
     alpha: int,
     front: NDArray[np.int32],
+    rows: tuple[int, int],
     reach: int,
     labelling: GridLabelling,
     problem: Problem,
     models: Models,
 ) -> bool:
     """Expand one label from its front."""
-    sites = band(alpha, front, reach, labelling)
+    sites = band(alpha, front, reach, labelling, rows)
     new = np.empty(len(sites), np.float32)
     for s in range(len(sites)):
         new[s] = data_cost(alpha, int(sites[s]), problem, models)

@@ -54,8 +54,14 @@ class GridLabelling(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, count: int) -> Sites:
-    """Sites across an edge from each label's own.
+def fronts(
+    labels: NDArray[np.int32],
+    links: NDArray[np.float32],
+    width: int,
+    count: int,
+    rows: tuple[int, int],
+) -> Sites:
+    """Sites in some rows that are across an edge from each label's own.
 
     Parameters
     ----------
@@ -65,17 +71,26 @@ def fronts(labels: NDArray[np.int32], links: NDArray[np.float32], width: int, co
         Sites in a row.
     count : int
         Number of labels.
+    rows : tuple of 2 int
+        The first of the rows, and the one after the last.
     """
-    beside, sites = np.empty(4 * len(labels), np.int32), np.empty(4 * len(labels), np.int32)
+    first, after = rows[0] * width, rows[1] * width
+    beside, sites = (
+        np.empty(4 * (after - first), np.int32),
+        np.empty(4 * (after - first), np.int32),
+    )
     found = 0
-    for p in range(len(labels)):
+    for p in range(max(first - width, 0), after):
         here = labels[p]
         for k in range(2):
             q = p + (1 if k == 0 else width)
             if q < len(labels) and labels[q] != here and links[k, p] > 0:
-                beside[found], sites[found] = here, q
-                beside[found + 1], sites[found + 1] = labels[q], p
-                found += 2
+                if first <= q < after:
+                    beside[found], sites[found] = here, q
+                    found += 1
+                if p >= first:
+                    beside[found], sites[found] = labels[q], p
+                    found += 1
     return grouped(beside[:found], sites[:found], count)
 
 
@@ -95,9 +110,13 @@ def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> 
 
 @njit(cache=True, nogil=True)
 def band(
-    alpha: int, front: NDArray[np.int32], reach: int, labelling: GridLabelling
+    alpha: int,
+    front: NDArray[np.int32],
+    reach: int,
+    labelling: GridLabelling,
+    rows: tuple[int, int],
 ) -> NDArray[np.int32]:
-    """Sites of other labels within `reach` edges of a label.
+    """Sites of other labels, in some rows, within `reach` edges of a label.
 
     Parameters
     ----------
@@ -107,6 +126,8 @@ def band(
     reach : int
     labelling : GridLabelling
         `position` receives the place of each site in the result.
+    rows : tuple of 2 int
+        The first of the rows, and the one after the last.
 
     Returns
     -------
@@ -114,6 +135,7 @@ def band(
     """
     labels, links, position = labelling.labels, labelling.links, labelling.position
     offsets = np.array([1, labelling.width, -1, -labelling.width])
+    first, after = rows[0] * labelling.width, rows[1] * labelling.width
     sites = np.empty(max(64, 2 * reach * len(front)), np.int32)
     count = done = 0
     for p in front:
@@ -128,7 +150,7 @@ def band(
             done += 1
             for k in range(4):
                 q = p + offsets[k]
-                linked = links[k % 2, min(p, q)] > 0
+                linked = first <= q < after and links[k % 2, min(p, q)] > 0
                 if linked and labels[q] != alpha and position[q] < 0:
                     if count == len(sites):
                         sites = np.concatenate((sites, np.empty_like(sites)))
