@@ -69,8 +69,13 @@ def test_second_coefficient_where_the_range_is_offset():
     result = calibrate(seen(40, range_offset), CAMERA.shape)
     distortion = result.distortion
     assert distortion.slope is not None
+    assert rms(distortion.slope.mean()) < 1e-6
+    v, u = np.indices(CAMERA.shape)
+    terms = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    plane = np.linalg.lstsq(terms, distortion.offset.ravel().astype(float), rcond=None)[0]
+    assert np.abs(terms @ plane).max() < 1e-6
     for inverse in (0.45, 0.6, 0.9):
-        error = distortion.offset + distortion.slope * (inverse - distortion.reference)
+        error = distortion.offset + distortion.slope * inverse
         truth = inverse**2 * offset
         known = np.ones(CAMERA.shape, bool)
         off = without_plane(error - truth, known)

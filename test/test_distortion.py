@@ -49,11 +49,11 @@ def test_clouds_are_corrected_along_their_rays():
     assert image.points[valid] == pytest.approx(true[valid], rel=1e-5)
 
 
-def test_slope_acts_around_the_reference():
+def test_slope_is_the_coefficient_of_the_inverse_depth():
     slope = np.full(CAMERA.shape, 0.1, np.float32)
     image = RangeImage.from_depth((1 / wall()).astype(np.float32), CAMERA)
-    found = DistortionMap(smooth_map(), None, slope, 0.5).corrected(image)
-    error = smooth_map() + 0.1 * (wall() - 0.5)
+    found = DistortionMap(smooth_map(), None, slope).corrected(image)
+    error = smooth_map() + 0.1 * wall()
     assert found.inverse == pytest.approx(wall() - error, abs=1e-6)
 
 
@@ -85,14 +85,14 @@ def test_segmenter_does_not_forget_the_map(tmp_path):
 @pytest.mark.parametrize('pages', [1, 2, 3])
 def test_file_holds_the_map(tmp_path, pages):
     parts = [smooth_map(), abs(smooth_map()), smooth_map(0.1)][:pages]
-    distortion = DistortionMap(*[*parts, None, None][:3], reference=0.6, camera=CAMERA)
+    distortion = DistortionMap(*[*parts, None, None][:3], camera=CAMERA)
     path = tmp_path / 'map.tiff'
     write_distortion(path, distortion)
     read = read_distortion(path)
     for name in ('offset', 'deviation', 'slope'):
         before, after = getattr(distortion, name), getattr(read, name)
         assert (before is None and after is None) or np.array_equal(before, after)
-    assert read.camera == CAMERA and read.reference == 0.6
+    assert read.camera == CAMERA
     # Readers of one page read the offset.
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), smooth_map())
     assert [file.name for file in tmp_path.iterdir()] == ['map.tiff']

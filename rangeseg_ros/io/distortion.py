@@ -1,7 +1,7 @@
 """Distortion maps in files: TIFF with a float32 page for each of offset, deviation and slope.
 
-The description tag of the first page holds, as JSON, the reference of the slope and the camera;
-other programs' maps, of one page and without a description, are read as well.
+The description tag of the first page holds, as JSON, the camera; other programs' maps, of one page
+and without a description, are read as well.
 """
 
 from __future__ import annotations
@@ -66,12 +66,11 @@ def read_distortion(path: Path) -> DistortionMap:
     about = _about(description)
     try:
         camera = Camera(**about['camera']) if about.get('camera') else None
-        reference = float(about.get('reference', 0.0))
     except (TypeError, ValueError):
         raise DistortionError(f'{path}: damaged description') from None
     offset, deviation, slope = [*pages, None, None][:3]
     assert offset is not None
-    return DistortionMap(offset, deviation, slope, reference, camera)
+    return DistortionMap(offset, deviation, slope, camera)
 
 
 def write_distortion(path: Path, distortion: DistortionMap) -> None:
@@ -81,7 +80,7 @@ def write_distortion(path: Path, distortion: DistortionMap) -> None:
         pages.append(distortion.deviation)
         if distortion.slope is not None:
             pages.append(distortion.slope)
-    about: dict[str, Any] = {'kind': KIND, 'unit': '1/m', 'reference': distortion.reference}
+    about: dict[str, Any] = {'kind': KIND, 'unit': '1/m'}
     if distortion.camera is not None:
         about['camera'] = asdict(distortion.camera)
     tags = TiffImagePlugin.ImageFileDirectory_v2()

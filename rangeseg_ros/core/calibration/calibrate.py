@@ -91,16 +91,19 @@ def calibrate(
     learned = learn(seen, shape)
     known = _in_pixels(views > 0, shape)
     offset = _smooth_in_pixels(learned.field[0], shape) + learned.profile
-    offset = without_plane(offset, known)
-    deviation = np.where(known, _smooth_in_pixels(learned.deviation, shape), 0)
     slope = None
     if len(learned.field) > 1:
-        slope = np.where(known, _smooth_in_pixels(learned.field[1], shape), 0).astype(np.float32)
+        slope = np.where(known, _smooth_in_pixels(learned.field[1], shape), 0)
+        # One slope everywhere scales all planes, and leaves them planes.
+        slope -= known * slope[known].mean()
+        offset -= slope * learned.reference
+        slope = slope.astype(np.float32)
+    offset = without_plane(offset, known)
+    deviation = np.where(known, _smooth_in_pixels(learned.deviation, shape), 0)
     distortion = DistortionMap(
         offset.astype(np.float32),
         deviation.astype(np.float32),
         slope,
-        learned.reference if slope is not None else 0.0,
         camera,
     )
     kept = learned.profile, learned.gain, learned.smoothness, learned.folds

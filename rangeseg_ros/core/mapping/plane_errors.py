@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3)."""
     across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(across, normal)
+    first = _cross(across, normal)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(normal, first)], axis=1)
+    return np.stack([first, _cross(normal, first)], axis=1)
 
 
 def to_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,8 +52,15 @@ def shifted(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     first = first - (first * normal).sum(axis=1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    axes = np.stack([first, _cross(normal, first)], axis=1)
     return normal, point - step[:, 2:] * normal, axes
+
+
+def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross products (N, 3); for few of them much faster than numpy's."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

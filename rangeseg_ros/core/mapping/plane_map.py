@@ -14,7 +14,14 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.evidence import Evidence
-from rangeseg_ros.core.mapping.map_outlines import MapOutline, polygon_of, rings, shape_of, united
+from rangeseg_ros.core.mapping.map_outlines import (
+    MapOutline,
+    areas,
+    polygon_of,
+    rings,
+    shape_of,
+    united,
+)
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
@@ -255,7 +262,9 @@ class PlaneMap:
             world = ring @ pose.rotation.T + pose.shift
             return filters.coordinates(np.full(len(ring), k), world)
 
-        self._grow(k, polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes]))
+        part = polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes])
+        # Corners of pixels are finer than the map, and cost time in every step that follows.
+        self._grow(k, areas(part.simplify(self.config.map_resolution / 4)))
 
     def _merge(self, stamp: int, camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with those that have just grown."""

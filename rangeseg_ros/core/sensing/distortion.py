@@ -22,7 +22,7 @@ class DistortionError(ValueError):
 class DistortionMap:
     """Error of the inverse depth 1/z of every pixel, z along the optical axis.
 
-    The error at an inverse depth y is offset + slope (y - reference).
+    The error at an inverse depth y is offset + slope y.
 
     Attributes
     ----------
@@ -30,11 +30,10 @@ class DistortionMap:
         1/m; 0 where it is not known. Without its free part: its least-squares plane
         a u + b v + c over the pixels that were seen is zero.
     deviation : (H, W) float32 or None
-        Standard deviation of the offset, 1/m; 0 where it is not known.
+        Standard deviation of the error at the distances it was learned from, 1/m; 0 where it is
+        not known.
     slope : (H, W) float32 or None
         Change of the error with y; None where it does not depend on it.
-    reference : float
-        Inverse depth at which the offset holds, 1/m.
     camera : Camera or None
         Whose images it is for; None where that is not known.
     """
@@ -42,7 +41,6 @@ class DistortionMap:
     offset: NDArray[np.float32]
     deviation: NDArray[np.float32] | None = None
     slope: NDArray[np.float32] | None = None
-    reference: float = 0.0
     camera: Camera | None = None
 
     def corrected(self, image: RangeImage) -> RangeImage:
@@ -62,7 +60,7 @@ class DistortionMap:
         if self.slope is not None:
             with np.errstate(divide='ignore', invalid='ignore'):
                 inverse_depth = image.inverse / along
-            error = error + self.slope * (inverse_depth - np.float32(self.reference))
+            error = error + self.slope * inverse_depth
         if image.camera is None:
             error = error * along
         inverse = np.where(image.inverse > 0, image.inverse - error, np.float32(0))
