@@ -75,7 +75,9 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
             else:
                 filters.update(np.array([0]), seen, np.array([0]))
         error = np.append(filters.normal[0], filters.distance[0]) - truth
-        values.append(error @ np.linalg.pinv(filters.plane_covariance()[0], 1e-10) @ error / 3)
+        values.append(
+            error @ np.linalg.pinv(filters.plane_covariance(np.array([0]))[0], 1e-10) @ error / 3
+        )
         errors.append(np.linalg.norm(error[:3]))
     assert 0.7 < np.mean(values) < 1.5
     assert np.median(errors) < np.radians(0.4)
@@ -160,6 +162,18 @@ def test_what_rays_pass_through_is_gone_within_seconds():
     # The floor behind it is filled in.
     floor = next(plane for plane in plane_map.planes if on_face(plane, (0, 0, 1, 0)))
     assert shapely.Polygon(floor.hull[:, :2]).contains(shapely.Point(2.3, 0))
+
+
+def test_a_map_keeps_so_many_planes_and_those_seen_last():
+    room = kinect_room(0)
+    scene = Scene(room.solids, room.poses * 8)
+    plane_map, random = PlaneMap(Config(map_planes=3)), np.random.default_rng(0)
+    for k in range(8):
+        add(plane_map, scene, k, random)
+        assert len(plane_map.planes) <= 3
+    assert len(plane_map.planes) == 3
+    stamps = [plane.last_stamp for plane in plane_map.planes]
+    assert max(stamps) == 10**9 + 7 * 10**9 // 30
 
 
 def test_a_map_begun_anew_gives_other_ids():

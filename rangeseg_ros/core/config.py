@@ -288,6 +288,12 @@ class Config:
         low=0.001,
         high=10.0,
     )
+    map_planes: int = option(
+        1000,
+        'planes that the map keeps at most: those out of sight the longest are forgotten',
+        low=1,
+        high=100000,
+    )
     odometry: bool = option(
         False,
         "the camera's own motion from the planes in sight: ~/odometry, and, without fixed_frame, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
@@ -26,19 +27,20 @@ class Evidence:
     ----------
     centres : (K, 2) float64
         Of the cells, metres along the axes of the plane.
+    odds : (K,) float64
     """
 
     def __init__(self) -> None:
         self.centres = np.zeros((0, 2))
         self._side = 0.0
         self._keys = np.zeros(0, np.int64)
-        self._odds = np.zeros(0)
+        self.odds = np.zeros(0)
 
     def follow(self, outline: Polygon | MultiPolygon) -> None:
         """Have the cells of an outline; what is new has just been seen."""
         side = 2.0 ** math.ceil(math.log2(math.sqrt(max(outline.area, 1e-4) / _CELLS)))
         if side != self._side:
-            self._side, self._keys, self._odds = side, np.zeros(0, np.int64), np.zeros(0)
+            self._side, self._keys, self.odds = side, np.zeros(0, np.int64), np.zeros(0)
         # Borders are not as certain as what is within.
         within = outline.buffer(-side / 2, join_style='mitre')
         if within.is_empty:
@@ -55,20 +57,14 @@ class Evidence:
         keys = cells[:, 0] * 2**32 + cells[:, 1]
         odds = np.full(len(keys), _HIT)
         known = np.isin(keys, self._keys)
-        odds[known] = self._odds[np.searchsorted(self._keys, keys[known])]
+        odds[known] = self.odds[np.searchsorted(self._keys, keys[known])]
         order = np.argsort(keys)
-        self._keys, self._odds = keys[order], odds[order]
+        self._keys, self.odds = keys[order], odds[order]
         self.centres = (cells[order] + 0.5) * side
-
-    def see(self, found: NDArray[np.int8]) -> bool:
-        """Take in `sightings` of the cells; whether there are any that rays pass through."""
-        self._odds += np.where(found > 0, _HIT, np.where(found < 0, _MISS, 0))
-        np.clip(self._odds, _LEAST, _MOST, out=self._odds)
-        return bool((self._odds < 0).any())
 
     def remaining(self, outline: Polygon | MultiPolygon) -> Polygon | MultiPolygon:
         """What is left of an outline without the cells that rays pass through."""
-        gone = self._odds < 0
+        gone = self.odds < 0
         if gone.all():
             return Polygon()
         half = self._side / 2
@@ -81,3 +77,20 @@ class Evidence:
         kept = areas(outline.intersection(around[0]).difference(around[1]))
         self.follow(kept)
         return kept
+
+
+def see(evidence: Sequence[Evidence], found: NDArray[np.int8]) -> NDArray[np.intp]:
+    """Take in `sightings` of the cells of planes, one plane after the other.
+
+    Returns
+    -------
+    (K,) int
+        Numbers of the planes with cells that rays pass through.
+    """
+    odds = np.concatenate([one.odds for one in evidence])
+    odds += np.where(found > 0, _HIT, np.where(found < 0, _MISS, 0))
+    np.clip(odds, _LEAST, _MOST, out=odds)
+    ends = np.cumsum([len(one.odds) for one in evidence])
+    for one, part in zip(evidence, np.split(odds, ends[:-1]), strict=True):
+        one.odds = part
+    return np.unique(np.searchsorted(ends, np.flatnonzero(odds < 0), side='right'))

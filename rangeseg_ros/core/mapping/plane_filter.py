@@ -70,10 +70,10 @@ class PlaneFilters:
         """(N,) distance of the planes in normal . p + distance = 0, metres."""
         return -(self.normal * self.point).sum(axis=1)
 
-    def plane_covariance(self) -> NDArray[np.float64]:
-        """(N, 4, 4) covariance of (normal, distance), of rank 3."""
-        jacobian = from_errors(self.axes, self.point)
-        return jacobian @ self.covariance[:, :3, :3] @ jacobian.transpose(0, 2, 1)
+    def plane_covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(K, 4, 4) covariance of (normal, distance) of some planes, of rank 3."""
+        jacobian = from_errors(self.axes[index], self.point[index])
+        return jacobian @ self.covariance[index, :3, :3] @ jacobian.transpose(0, 2, 1)
 
     def where(self, chosen: NDArray) -> PlaneFilters:
         """Some of the planes."""
@@ -136,12 +136,14 @@ class PlaneFilters:
         widest, farthest : float
             Largest angle, radians, and offset as share of the distance from `camera`.
         """
-        away = np.linalg.norm(self.point - camera, axis=1)
         offset = (self.point - self.point[k]) @ self.normal[k]
+        away = np.linalg.norm(self.point - camera, axis=1)
         close = self.normal @ self.normal[k] > np.cos(widest)
         close &= np.abs(offset) < farthest * away
         close[k] = False
         m = np.flatnonzero(close)
+        if not len(m):
+            return m
         gap, spread = self._apart(k, m)
         at = self.coordinates(np.full(len(m), k), self.point[m])
         return m[_chi_squared(gap, spread, at, away[m]) < gate]
@@ -154,7 +156,7 @@ class PlaneFilters:
         """
         gap, _ = self._apart(k, np.array([m]))
         local = to_errors(self.axes[[k]], self.point[[k]])[0]
-        other = local @ self.plane_covariance()[m] @ local.T
+        other = local @ self.plane_covariance(np.array([m]))[0] @ local.T
         own = self.covariance[k, :3, :3]
         sizes = np.cbrt([np.linalg.det(other), np.linalg.det(own)])
         weight = sizes / sizes.sum()
@@ -181,7 +183,7 @@ class PlaneFilters:
         local = to_errors(self.axes[[k]], self.point[[k]])[0]
         other = np.column_stack([self.normal[m], self.distance[m]])
         return other @ local.T, (
-            local @ self.plane_covariance()[m] @ local.T + self.covariance[k, :3, :3]
+            local @ self.plane_covariance(m) @ local.T + self.covariance[k, :3, :3]
         )
 
     def _shift(self, index: NDArray[np.intp], step: NDArray[np.float64]) -> None:

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.evidence import Evidence
-from rangeseg_ros.core.mapping.map_outlines import (
-    MapOutline,
-    areas,
-    polygon_of,
-    rings,
-    shape_of,
-    united,
-)
+from rangeseg_ros.core.mapping.evidence import see
+from rangeseg_ros.core.mapping.map_outlines import areas, polygon_of, rounded, united
+from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, described
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
@@ -36,9 +27,6 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
 _GATE = 16.27
-# Observations that make a plane of the map, and their least share of the frames in which rays
-# ended where it is: what is found less often is what clutter looks like now and then.
-_CONFIRMED, _REGULAR = 3, 0.25
 # Nanoseconds after which what is not confirmed and not seen again is forgotten.
 _PROBATION = 3 * 10**9
 # Largest angle, and offset as share of the range, of what may be one plane: beyond is no error of
@@ -46,75 +34,7 @@ _PROBATION = 3 * 10**9
 _WIDEST, _FARTHEST = np.radians(15.0), 0.1
 # Nanoseconds between unions of an outline, and unions in a frame: twice a second follows what a
 # hand or a robot shows, and the work does not grow with the number of planes in sight.
-_UNION_INTERVAL, _UNIONS = 500_000_000, 4
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class MapPlane(Plane):
-    """A plane of the map; normal . p + distance = 0 in the fixed frame.
-
-    All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
-    seen from. `count` is the number of pixels of all observations, `rms` and
-    `confidence` are means over them, and `role` is what most observations found.
-
-    Attributes
-    ----------
-    observations : int
-        Number of regions that were fused.
-    age : float
-        Seconds between the first and the last sight of it.
-    first_stamp, last_stamp : int
-        Of these, nanoseconds.
-    """
-
-    outline: MapOutline  # type: ignore[assignment]
-    observations: int
-    age: float
-    first_stamp: int
-    last_stamp: int
-
-
-@dataclass(eq=False)
-class _Record:
-    """What is kept of a plane beside its equation."""
-
-    id: int
-    first: int
-    last: int
-    observations: int = 0
-    pixels: int = 0
-    squares: float = 0.0
-    confidence: float = 0.0
-    roles: Counter[str] = field(default_factory=Counter)
-    outline: shapely.Geometry = field(default_factory=shapely.Polygon)
-    united: int = -_UNION_INTERVAL
-    frames: int = 0
-    looks: int = 0
-    evidence: Evidence = field(default_factory=Evidence)
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether it was seen often enough to be part of the map."""
-        return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
-
-    def add(self, plane: Plane, stamp: int) -> None:
-        self.frames += self.last != stamp or self.frames == 0
-        self.last = stamp
-        self.observations += 1
-        self.pixels += plane.count
-        self.squares += plane.count * plane.rms**2
-        self.confidence += plane.count * plane.confidence
-        self.roles[plane.role] += 1
-
-    def absorb(self, other: _Record) -> None:
-        self.id = min(self.id, other.id)
-        self.first, self.last = min(self.first, other.first), max(self.last, other.last)
-        self.observations += other.observations
-        self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
-        self.pixels += other.pixels
-        self.squares += other.squares
-        self.confidence += other.confidence
-        self.roles += other.roles
+_UNION_INTERVAL, _UNIONS = 500_000_000, 2
 
 
 class PlaneMap:
@@ -141,7 +61,7 @@ class PlaneMap:
     def clear(self, why: str = '') -> None:
         """Begin anew; ids are not given twice."""
         self.begun_anew = why
-        self._records: list[_Record] = []
+        self._records: list[Record] = []
         self._filters: PlaneFilters | None = None
 
     def __len__(self) -> int:
@@ -184,9 +104,10 @@ class PlaneMap:
         """The planes that were seen often enough, in the order of their ids."""
         if self._filters is None:
             return []
-        covariance = self._filters.plane_covariance()
+        filters = self._filters
+        covariance = filters.plane_covariance(np.arange(len(self._records)))
         found = [
-            self._described(k, covariance[k])
+            described(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
             for k, record in enumerate(self._records)
             if record.confirmed and not record.outline.is_empty
         ]
@@ -238,16 +159,14 @@ class PlaneMap:
             first = PlaneFilters.of(Observations(*(part[new] for part in seen)))
             self._filters = self._filters.joined(first) if self._filters else first
             for _ in new:
-                self._records.append(_Record(self._next, stamp, stamp))
+                self._records.append(Record(self._next, stamp, stamp))
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp)
-        due = [
-            k
-            for k in np.unique(match).tolist()
-            if abs(stamp - self._records[k].united) >= _UNION_INTERVAL
-        ]
-        due.sort(key=lambda k: self._records[k].united)
+        # The new ones first, then those that wait the longest.
+        waited = {k: self._records[k].waited(stamp) for k in np.unique(match).tolist()}
+        due = [k for k, time in waited.items() if time >= _UNION_INTERVAL]
+        due.sort(key=lambda k: -waited[k])
         for k in due[: max(_UNIONS, len(new))]:
             self._records[k].united = stamp
             for part in np.flatnonzero(match == k).tolist():
@@ -302,8 +221,11 @@ class PlaneMap:
         return shapely.transform(self._records[source].outline, lambda xy: xy @ turn.T + shift)
 
     def _grow(self, k: int, part: shapely.Geometry) -> None:
-        record = self._records[k]
-        record.outline = united(record.outline, part, self.config.map_resolution)
+        record, resolution = self._records[k], self.config.map_resolution
+        if record.outline.is_empty:
+            record.outline = rounded(part, resolution)
+        else:
+            record.outline = united(record.outline, part, resolution)
         record.evidence.follow(record.outline)
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
@@ -318,9 +240,9 @@ class PlaneMap:
         filters = self._filters
         if filters is None or not self._records:
             return
-        centres = [record.evidence.centres for record in self._records]
-        owner = np.repeat(np.arange(len(centres)), [len(part) for part in centres])
-        at = np.concatenate(centres)
+        evidence = [record.evidence for record in self._records]
+        owner = np.repeat(np.arange(len(evidence)), [len(one.centres) for one in evidence])
+        at = np.concatenate([one.centres for one in evidence])
         points, sigma = filters.places(owner, at)
         points = (points - pose.shift) @ pose.rotation
         spread = noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
@@ -331,48 +253,22 @@ class PlaneMap:
             image,
             SensorModel.from_config(self.config),
         )
-        ends = np.cumsum([0, *(len(part) for part in centres)])
-        for k in np.unique(owner[found != 0]).tolist():
+        there = np.bincount(owner[found == THERE], minlength=len(evidence))
+        for k in np.flatnonzero(2 * there > np.bincount(owner, minlength=len(evidence))).tolist():
+            self._records[k].looks += 1
+        for k in see(evidence, found).tolist():
             record = self._records[k]
-            own = found[ends[k] : ends[k + 1]]
-            record.looks += 2 * int((own == THERE).sum()) > len(own)
-            if record.evidence.see(own):
-                record.outline = record.evidence.remaining(record.outline)
+            record.outline = record.evidence.remaining(record.outline)
         kept = [
             not r.outline.is_empty and (r.confirmed or stamp - r.last < _PROBATION)
             for r in self._records
         ]
+        if (surplus := sum(kept) - self.config.map_planes) > 0:
+            # Those out of sight the longest are forgotten, and of these the ones hardly seen.
+            records = self._records
+            order = np.flatnonzero(kept).tolist()
+            order.sort(key=lambda k: (records[k].last, records[k].observations))
+            for k in order[:surplus]:
+                kept[k] = False
         if not all(kept):
             self._keep(np.array(kept))
-
-    def _described(self, k: int, covariance: NDArray[np.float64]) -> MapPlane:
-        filters, record = self._filters, self._records[k]
-        assert filters is not None
-        normal, point, axes = filters.normal[k], filters.point[k], filters.axes[k]
-        parts = rings(record.outline)
-        shape = shape_of(parts)
-        frame = np.stack([shape.axis, [-shape.axis[1], shape.axis[0]]]) @ axes
-        middle = shape.limits.mean(axis=1) @ frame
-        turn = Rotation.from_matrix(np.stack([*frame, normal], axis=1)).as_quat()
-        return MapPlane(
-            label=record.id,
-            id=record.id,
-            surface=record.id,
-            normal=normal.copy(),
-            distance=float(filters.distance[k]),
-            covariance=covariance,
-            centroid=point + shape.centroid @ axes,
-            count=record.pixels,
-            rms=float(np.sqrt(record.squares / record.pixels)),
-            confidence=record.confidence / record.pixels,
-            area=shape.area,
-            extents=shape.limits[:, 1] - shape.limits[:, 0],
-            centre=point + middle,
-            orientation=turn if turn[3] >= 0 else -turn,
-            outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
-            role=record.roles.most_common(1)[0][0],
-            observations=record.observations,
-            age=(record.last - record.first) * 1e-9,
-            first_stamp=record.first,
-            last_stamp=record.last,
-        )

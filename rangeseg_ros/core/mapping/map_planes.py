@@ -1,0 +1,139 @@
+"""Planes of a map: what is kept of each beside its equation, and what is told of it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.evidence import Evidence
+from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
+from rangeseg_ros.core.mapping.transforms import quaternion
+
+# Observations that make a plane of the map, and their least share of the frames in which rays
+# ended where it is: what is found less often is what clutter looks like now and then.
+_CONFIRMED, _REGULAR = 3, 0.25
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MapPlane(Plane):
+    """A plane of the map; normal . p + distance = 0 in the fixed frame.
+
+    All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
+    seen from. `count` is the number of pixels of all observations, `rms` and
+    `confidence` are means over them, and `role` is what most observations found.
+
+    Attributes
+    ----------
+    observations : int
+        Number of regions that were fused.
+    age : float
+        Seconds between the first and the last sight of it.
+    first_stamp, last_stamp : int
+        Of these, nanoseconds.
+    """
+
+    outline: MapOutline  # type: ignore[assignment]
+    observations: int
+    age: float
+    first_stamp: int
+    last_stamp: int
+
+
+@dataclass(eq=False)
+class Record:
+    """What is kept of a plane beside its equation."""
+
+    id: int
+    first: int
+    last: int
+    observations: int = 0
+    pixels: int = 0
+    squares: float = 0.0
+    confidence: float = 0.0
+    roles: Counter[str] = field(default_factory=Counter)
+    outline: shapely.Geometry = field(default_factory=shapely.Polygon)
+    united: int | None = None
+    frames: int = 0
+    looks: int = 0
+    evidence: Evidence = field(default_factory=Evidence)
+
+    @property
+    def confirmed(self) -> bool:
+        """Whether it was seen often enough to be part of the map."""
+        return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
+
+    def waited(self, stamp: int) -> float:
+        """Nanoseconds since something was added to the outline."""
+        return np.inf if self.united is None else abs(stamp - self.united)
+
+    def add(self, plane: Plane, stamp: int) -> None:
+        """Take in a plane of a frame."""
+        self.frames += self.last != stamp or self.frames == 0
+        self.last = stamp
+        self.observations += 1
+        self.pixels += plane.count
+        self.squares += plane.count * plane.rms**2
+        self.confidence += plane.count * plane.confidence
+        self.roles[plane.role] += 1
+
+    def absorb(self, other: Record) -> None:
+        """Take in what is kept of a plane that turned out to be this one."""
+        self.id = min(self.id, other.id)
+        self.first, self.last = min(self.first, other.first), max(self.last, other.last)
+        self.observations += other.observations
+        self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
+        self.pixels += other.pixels
+        self.squares += other.squares
+        self.confidence += other.confidence
+        self.roles += other.roles
+
+
+def described(
+    record: Record,
+    normal: NDArray[np.float64],
+    point: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> MapPlane:
+    """The plane of a record.
+
+    Parameters
+    ----------
+    record : Record
+    normal, point : (3,) float64
+        In the fixed frame.
+    axes : (2, 3) float64
+        Those of the outline.
+    covariance : (4, 4) float64
+        Of normal and distance.
+    """
+    parts = rings(record.outline)
+    shape = shape_of(parts)
+    frame = np.stack([shape.axis, [-shape.axis[1], shape.axis[0]]]) @ axes
+    return MapPlane(
+        label=record.id,
+        id=record.id,
+        surface=record.id,
+        normal=normal.copy(),
+        distance=float(-normal @ point),
+        covariance=covariance,
+        centroid=point + shape.centroid @ axes,
+        count=record.pixels,
+        rms=float(np.sqrt(record.squares / record.pixels)),
+        confidence=record.confidence / record.pixels,
+        area=shape.area,
+        extents=shape.limits[:, 1] - shape.limits[:, 0],
+        centre=point + shape.limits.mean(axis=1) @ frame,
+        orientation=quaternion(np.stack([*frame, normal], axis=1)),
+        outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
+        role=record.roles.most_common(1)[0][0],
+        observations=record.observations,
+        age=(record.last - record.first) * 1e-9,
+        first_stamp=record.first,
+        last_stamp=record.last,
+    )
