@@ -11,6 +11,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.meaning import STAIRS, stairs_row, write_table
 from rangeseg_ros.io.planes import PlaneTable
 
 
@@ -55,6 +56,10 @@ def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
         table.write(result.planes)
 
 
+def _stairs(path: Path, image: RangeImage, result: Segmentation) -> None:
+    write_table(path, STAIRS, [stairs_row(stairs) for stairs in result.stairs])
+
+
 FRAME_FILES = {
     'labels': FrameFile('_labels.png', _labels),
     'overlay': FrameFile('_overlay.png', _overlay),
@@ -62,6 +67,7 @@ FRAME_FILES = {
     'terrain': FrameFile('_terrain.png', _terrain),
     'height': FrameFile('_height.tiff', _height),
     'planes': FrameFile('_planes.csv', _planes),
+    'stairs': FrameFile('_stairs.csv', _stairs),
 }
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.result_bag import ResultBag, Timed, open_source, read_record
-from rangeseg_ros.batch.result_folder import LEADING, PICTURES, ResultFolder
+from rangeseg_ros.batch.result_folder import LEADING, PICTURES, TERRAIN, ResultFolder
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.meaning.tilt import Tilt
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -24,6 +25,7 @@ from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.meaning import GROUND, STAIRS, ground_row, stairs_row, write_table
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.io.poses import write_trajectory
@@ -56,6 +58,10 @@ class Outcome:
         Number of planes in the map.
     unlocated : dict
         Which frame of tf was not known, and why -> number of images.
+    tilted : int
+        Number of frames whose planes say that up is elsewhere.
+    tilt : str
+        What is said of the one that is tilted most.
     """
 
     frames: int
@@ -65,6 +71,8 @@ class Outcome:
     found_done: bool = False
     mapped: int = 0
     unlocated: dict[str, int] = field(default_factory=dict)
+    tilted: int = 0
+    tilt: str = ''
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,8 @@ class Replay:
         Copy the topics of the recording into the bag.
     raw : bool
         See `DepthBag`.
+    terrain : bool
+        Also write terrain and height of every frame, and the tables of ground and stairs.
     overwrite : bool
         Also replace files with the names of results that no replay has written.
     """
@@ -102,6 +112,7 @@ class Replay:
     copy: bool = False
     raw: bool = False
     overwrite: bool = False
+    terrain: bool = False
 
     def check(self) -> str:
         """Topics that will be read; BagError when the recording or the folder will not do."""
@@ -137,14 +148,25 @@ class Replay:
             trajectory: list[tuple[int, Transform]] = []
             located = stack.enter_context(Locator(self.recording, self.config))
 
+            kinds = PICTURES + TERRAIN if self.terrain else PICTURES
+            ground: list[list[str]] = []
+            stairs: list[list[str]] = []
+            tilts: list[Tilt] = []
+
             def results() -> Iterator[Timed]:
                 found = segmented(source, sequence, located.place, progress)
                 for index, frame, image, result in found:
                     stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                     stem = f'{index:06d}_{stamp}'
-                    files = write_frame(self.folder, stem, image, result, PICTURES)
+                    files = write_frame(self.folder, stem, image, result, kinds)
                     table.write(result.planes, index, stamp)
                     report.add(frame.stamp, result, files['overlay'])
+                    if result.tilt:
+                        tilts.append(result.tilt)
+                    if self.terrain:
+                        leading = [str(index), stamp]
+                        ground.append([*leading, *ground_row(result)])
+                        stairs.extend([*leading, *stairs_row(seen)] for seen in result.stairs)
                     motion = located.last.target
                     target = (self.config.target_frame, motion) if motion else None
                     if sequence.motion:
@@ -156,6 +178,9 @@ class Replay:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
+            if self.terrain:
+                write_table(self.folder / 'ground.csv', [*LEADING, *GROUND], ground)
+                write_table(self.folder / 'stairs.csv', [*LEADING, *STAIRS], stairs)
             planes = sequence.map.planes
             if self.config.odometry:
                 write_trajectory(self.folder / 'trajectory.txt', trajectory)
@@ -174,6 +199,8 @@ class Replay:
                 '; '.join(filter(None, damage)),
                 mapped=len(planes),
                 unlocated=dict(located.problems),
+                tilted=len(tilts),
+                tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
             )
             report.write(self.folder / 'report.html', outcome.damage)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}

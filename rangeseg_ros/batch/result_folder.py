@@ -21,15 +21,18 @@ BAG = 'bag'
 """Name of the bag among the results."""
 PICTURES = ('labels', 'overlay')
 """Which of `FRAME_FILES` every frame has."""
+TERRAIN = ('terrain', 'height')
+"""Which of them every frame has where terrain is asked for."""
 MARK = '.rangeseg_replay'
 """Name of a file that is there, and locked, while a replay is at work."""
 
 LEADING = ('frame', 'stamp')
 """First columns of the table of planes."""
 
-_ENDINGS = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES)
+_ENDINGS = '|'.join(re.escape(FRAME_FILES[name].ending) for name in PICTURES + TERRAIN)
 _OWN = re.compile(
-    rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|planes\.csv|map\.(csv|ply)|report\.html|trajectory\.txt'
+    rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|(planes|stairs|ground)\.csv|map\.(csv|ply)|'
+    r'report\.html|trajectory\.txt'
 )
 _PARTIAL = re.compile(rf'\.\d+\.({_OWN.pattern}|{BAG})')
 

@@ -43,6 +43,11 @@ from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_s
     show_default=True,
     help='Topic of the node to write into the bag; several may be given.',
 )
+@click.option(
+    '--terrain',
+    is_flag=True,
+    help='Also write <frame>_<stamp>_terrain.png and _height.tiff, ground.csv and stairs.csv.',
+)
 @click.option('--copy', is_flag=True, help='Copy the topics of the recording into the bag.')
 @measures.jobs
 @click.option(
@@ -69,6 +74,7 @@ def command(
     raw: bool,
     overwrite: bool,
     topics: tuple[str, ...],
+    terrain: bool,
     copy: bool,
     jobs: int | None,
     scheduler: str | None,
@@ -106,7 +112,9 @@ def command(
         folders = [folder.absolute() for folder in folders]
     topics = tuple(name for name in OUTPUTS if name in topics)
     tasks = [
-        Replay(bag, folder, config, depth_topic, camera_topic, topics, copy, raw, overwrite)
+        Replay(
+            bag, folder, config, depth_topic, camera_topic, topics, copy, raw, overwrite, terrain
+        )
         for bag, folder in zip(bags, folders, strict=True)
     ]
     # All are opened, and so checked, before anything is written.
@@ -166,6 +174,8 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():
         click.echo(f'{count} frames without the {problem}')
+    if outcome.tilted:
+        click.echo(f'rangeseg: {outcome.tilted} frames: {outcome.tilt}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
     already = ', done before' if outcome.found_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')

@@ -59,8 +59,9 @@ def command(
     """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
 
     Writes for each image <stem>_labels.png (16 bits, 0 = no plane), <stem>_planes.csv (a row for
-    each plane, metres, x right, y down, z forward) and <stem>_overlay.png. Nothing that is there
-    already is replaced, unless --overwrite says so.
+    each plane, metres, x right, y down, z forward), <stem>_overlay.png, <stem>_terrain.png (0
+    unknown, 1 ground, 2 obstacle, 3 drop), <stem>_height.tiff (metres above the ground) and
+    <stem>_stairs.csv. Nothing that is there already is replaced, unless --overwrite says so.
     """
     name, count = Counter(path.stem for path in depth).most_common(1)[0]
     if count > 1:
@@ -81,6 +82,8 @@ def command(
         result = replace(result, planes=with_roles(result.planes, segmenter.config))
         write_frame(output, path.stem, image, result, files)
         found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
-        click.echo(f'{path}: {found}')
+        click.echo(f'{path}: {found}, {result.ground}')
+        if result.tilt:
+            click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
         if sensor:
             click.echo(f'{path}: {result.sensor}')

@@ -18,7 +18,9 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.meaning.stairs import Stairs, stairs_of
 from rangeseg_ros.core.meaning.survey import Survey
+from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -79,6 +81,8 @@ class Segmentation:
         Edges of the grid that cross a jump; None where none were looked for.
     survey : Survey or Terrain
         How the ground is found, or what was found.
+    tilt : Tilt or None
+        Where the planes say that up is, when that is not what was stated.
     """
 
     labels: NDArray[np.uint16]
@@ -89,6 +93,7 @@ class Segmentation:
     labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
     survey: Survey | Terrain | None = field(default=None, repr=False)
+    tilt: Tilt | None = None
 
     @cached_property
     def normals(self) -> NDArray[np.float32]:
@@ -118,6 +123,13 @@ class Segmentation:
         """The ground and what interrupts it, worked out when read; None where none was asked."""
         return self.survey.terrain() if isinstance(self.survey, Survey) else self.survey
 
+    @cached_property
+    def stairs(self) -> list[Stairs]:
+        """Staircases in sight, up and down, worked out when read."""
+        if not isinstance(self.survey, Survey) or self.ground is None:
+            return []
+        return stairs_of(self.survey.image, self.ground)
+
     @property
     def terrain(self) -> NDArray[np.uint8]:
         """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
@@ -139,7 +151,8 @@ class Segmentation:
 
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
-        return {**self.__dict__, 'labelling': kept, 'survey': self.ground}
+        survey, stairs = self.ground, self.stairs
+        return {**self.__dict__, 'labelling': kept, 'survey': survey, 'stairs': stairs}
 
 
 class Segmenter:
@@ -211,7 +224,8 @@ class Segmenter:
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)
         laps = watch.laps
-        return Segmentation(labels, planes, laps, reason, sensor, labelling, jumps, survey)
+        tilt = tilt_of(planes, survey.up, config.role_tolerance, config.role_area)
+        return Segmentation(labels, planes, laps, reason, sensor, labelling, jumps, survey, tilt)
 
     def _by_planes(
         self,

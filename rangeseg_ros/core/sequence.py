@@ -16,6 +16,7 @@ from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.roles import roles, unit
 from rangeseg_ros.core.meaning.survey import Survey
+from rangeseg_ros.core.meaning.tilt import tilt_of
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
@@ -105,12 +106,14 @@ class SequenceSegmenter:
                 pose = self.motion.pose
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
-        survey = result.survey
+        survey, tilt = result.survey, result.tilt
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=unit(up))
+            config = self.config
+            tilt = tilt_of(planes, survey.up, config.role_tolerance, config.role_area)
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
-        return replace(result, planes=planes, survey=survey)
+        return replace(result, planes=planes, survey=survey, tilt=tilt)
 
     def _follow(
         self, labels: NDArray[np.uint16], planes: list[Plane], stamp: int, up: ArrayLike | None

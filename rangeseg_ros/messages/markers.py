@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.stairs import Stairs
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.make import Make
 
@@ -89,6 +90,42 @@ def outline_message(make: Make, header: Any, lines: Sequence[NDArray[np.floating
                 scale=(0.02, 0.0, 0.0),
                 colour=(0.1, 0.9, 0.1, 1.0),
                 points=_points(make, closed),
+            )
+        )
+    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+
+
+def stairs_message(make: Make, header: Any, staircases: Sequence[Stairs]) -> Any:
+    """visualization_msgs/MarkerArray: the first edges of staircases and what they are, no others.
+
+    Namespaces `edges`, of type LINE_STRIP, and `stairs`, whose texts are such as
+    'up 4 x 0.17 / 0.28 m': direction, treads in sight, rise and run.
+    """
+    markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
+    for number, stairs in enumerate(staircases):
+        markers.append(
+            _marker(
+                make,
+                header,
+                'edges',
+                number,
+                LINE_STRIP,
+                scale=(0.04, 0.0, 0.0),
+                colour=(1.0, 0.6, 0.0, 1.0),
+                points=_points(make, stairs.edge),
+            )
+        )
+        markers.append(
+            _marker(
+                make,
+                header,
+                'stairs',
+                number,
+                TEXT_VIEW_FACING,
+                scale=(0.0, 0.0, 0.12),
+                colour=(1.0, 1.0, 1.0, 1.0),
+                position=_points(make, stairs.edge.mean(axis=0, keepdims=True))[0],
+                text=str(stairs),
             )
         )
     return make('visualization_msgs/msg/MarkerArray', markers=markers)

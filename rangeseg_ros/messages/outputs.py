@@ -21,7 +21,7 @@ from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import planes_message, points_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
-from rangeseg_ros.messages.markers import markers_message, outline_message
+from rangeseg_ros.messages.markers import markers_message, outline_message, stairs_message
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,10 @@ def _outline(make: Make, header: Any, image: RangeImage, result: Segmentation) -
     return outline_message(make, header, lines)
 
 
+def _stairs(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return stairs_message(make, header, result.stairs)
+
+
 OUTPUTS = {
     'labels': Output('sensor_msgs/msg/Image', _labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
@@ -121,6 +125,7 @@ OUTPUTS = {
     'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
     'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': Output('visualization_msgs/msg/MarkerArray', _outline),
+    'stairs': Output('visualization_msgs/msg/MarkerArray', _stairs),
 }
 
 IN_TARGET = frozenset({'planes', 'markers'})

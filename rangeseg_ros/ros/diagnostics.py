@@ -108,6 +108,10 @@ class FrameStatistics:
         Why there is none.
     sensor : str
         Errors of the sensor as the last frame shows them.
+    tilt : str
+        Where the planes of the last frame say that up is; empty when they agree with it.
+    ground, stairs : str
+        Of the last frame; empty when nobody listens to what needs it.
     times : FrameTimes or None
         Of the last frame.
     """
@@ -125,6 +129,9 @@ class FrameStatistics:
         self.planes = 0
         self.reason = ''
         self.sensor = ''
+        self.tilt = ''
+        self.ground = ''
+        self.stairs = ''
         self.times: FrameTimes | None = None
         self._unanswered: float | None = None
 
@@ -171,6 +178,8 @@ class FrameStatistics:
             'planes': str(self.planes),
             'reason for no planes': self.reason,
             'sensor': self.sensor,
+            'ground': self.ground,
+            'stairs': self.stairs,
         }
         if self.times:
             values.update(self.times.values(1000 * stall_timeout))
@@ -218,6 +227,8 @@ class FrameStatistics:
             return DiagnosticStatus.WARN, lost
         if self.missing:
             return DiagnosticStatus.WARN, self.missing
+        if self.tilt:
+            return DiagnosticStatus.WARN, self.tilt
         if self.published.total and not self.planes:
             return DiagnosticStatus.WARN, f'no planes: {self.reason}'
         return DiagnosticStatus.OK, f'{self.planes} planes at {self.published.rate():.1f} Hz'

@@ -225,6 +225,11 @@ class Pipeline:
         statistics.planes = len(found.planes)
         statistics.reason = found.reason
         statistics.sensor = str(found.sensor)
+        statistics.tilt = str(found.tilt or '')
+        # Only what was worked out for a listener.
+        known = vars(found)
+        statistics.ground = str(known.get('ground', ''))
+        statistics.stairs = ', '.join(map(str, known.get('stairs', ())))
         statistics.answered(statistics.published)
 
     def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:

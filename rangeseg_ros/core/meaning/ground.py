@@ -75,6 +75,13 @@ class Terrain(NamedTuple):
     stand: Stand
     field: GroundField
 
+    def __str__(self) -> str:
+        """Where the ground is and how sure that is, in a few words."""
+        if not self.stand.surface:
+            return 'no ground'
+        height = self.stand.height(self.field.up)
+        return f'ground {height:.2f} m below, confidence {self.stand.confidence:.2f}'
+
 
 def terrain_of(
     image: RangeImage,

@@ -50,6 +50,10 @@ class Stand(NamedTuple):
     theta: NDArray[np.float64]
     confidence: float
 
+    def height(self, up: NDArray[np.float64]) -> float:
+        """Of the sensor above the ground below it, along `up`, metres; NaN without a ground."""
+        return float(-1 / (self.theta @ up)) if self.surface else float('nan')
+
 
 def stand(
     cells: Cells,

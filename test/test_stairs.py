@@ -1,0 +1,111 @@
+"""Stairs as objects: edge, count, rise and run against simulated truth; the camera's tilt."""
+
+import csv
+import pickle
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros.batch.frame_files import write_frame
+from rangeseg_ros.cli.segment import command
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.images import write_image
+from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.kinect import Kinect
+from rangeseg_ros.simulation.sensors.sensor import resized
+from rangeseg_ros.simulation.solids import box
+from rangeseg_ros.simulation.terrain import ALL, Piece, Terrain, simulate_terrain, slab
+
+CAMERA = resized(Kinect().camera, 320, 240)
+FLOOR = slab(-3, 12, 0, 0, ALL)
+
+
+def treads(edge, count, rise, run, class_, sides):
+    sign = 1 if class_ == OBSTACLE else -1
+    for k in range(count):
+        end = edge + (k + 1) * run if k < count - 1 else edge + count * run + 3
+        level = sign * (k + 1) * rise
+        yield Piece(slab(edge + k * run, end, level, level, sides), class_, abs(level))
+
+
+def seen(*pieces, height=1.5, pitch=35, yaw=0):
+    pose = Pose.looking((0, 0, height), yaw, pitch, 2)
+    terrain = Terrain('', pieces, (FLOOR,), pose)
+    frame = simulate_terrain(terrain, Kinect(), CAMERA)
+    config = Config(**up_of(terrain.up), sensor_height=height)
+    image = RangeImage.from_depth(frame.depth, CAMERA)
+    return terrain, image, Segmenter(config).segment(image)
+
+
+def up_of(up):
+    return dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True))
+
+
+@pytest.mark.parametrize('direction', ['up', 'down'])
+def test_edge_count_rise_and_run(direction, tmp_path):
+    sides = (-0.5, 0.6)
+    if direction == 'up':
+        pieces = (Piece(FLOOR, GROUND), *treads(1.9, 3, 0.17, 0.28, OBSTACLE, sides))
+    else:
+        floor = Piece(slab(-3, 1.3, 0, 0, ALL), GROUND)
+        pieces = (floor, *treads(1.3, 4, 0.16, 0.3, DROP, sides))
+    terrain, image, result = seen(*pieces, yaw=10)
+    (stairs,) = result.stairs
+    assert stairs.direction == direction
+    assert stairs.count == (3 if direction == 'up' else 4)
+    assert stairs.rise == pytest.approx(0.17 if direction == 'up' else 0.16, abs=0.01)
+    assert stairs.run == pytest.approx(0.28 if direction == 'up' else 0.3, abs=0.025)
+    assert stairs.width == pytest.approx(1.1, abs=0.1)
+    edge = stairs.edge @ terrain.pose.rotation.T + terrain.pose.position
+    assert edge[:, 0] == pytest.approx(1.9 if direction == 'up' else 1.3, abs=0.06)
+    assert np.sort(edge[:, 1]) == pytest.approx(sides, abs=0.08)
+    assert np.abs(edge[:, 2]).max() < 0.03
+    # It is written as the contract says, and survives another process.
+    path = write_frame(tmp_path, 'a', image, pickle.loads(pickle.dumps(result)), ['stairs'])
+    with path['stairs'].open(newline='') as file:
+        (row,) = csv.DictReader(file)
+    assert list(row)[:7] == [*(f'edge_{a}{k}' for k in (1, 2) for a in 'xyz'), 'width']
+    assert row['direction'] == direction and int(row['count']) == stairs.count
+    assert float(row['edge_x1']) == pytest.approx(stairs.edge[0, 0], abs=1e-6)
+
+
+def test_boxes_side_by_side_a_table_and_one_step_are_no_stairs():
+    boxes = [
+        Piece(box((0.3, 0.3, h), np.eye(3), (1.6 + 0.1 * k, 0.4 * k - 0.4, h / 2)), OBSTACLE, h)
+        for k, h in enumerate((0.15, 0.3, 0.45))
+    ]
+    curb = Piece(slab(1.9, 12, 0.17, 0.17, ALL), OBSTACLE, 0.17)
+    for pieces in (boxes, [curb]):
+        assert seen(*pieces, Piece(FLOOR, GROUND))[2].stairs == []
+
+
+def test_nothing_is_worked_out_unless_asked_for():
+    result = seen(Piece(FLOOR, GROUND))[2]
+    assert not {'ground', 'stairs'} & set(vars(result))
+    assert result.stairs == [] and 'ground' in vars(result)
+
+
+@pytest.mark.parametrize('axis', [(1, 0, 0), (-1, 0, 0), (0, 0, 1)])
+def test_a_tilted_camera_is_noticed_and_said(axis, tmp_path):
+    wall = Piece(box((1, 20, 6), np.eye(3), (3.5, 0, 0)), OBSTACLE, 3.0)
+    terrain, _, straight = seen(Piece(FLOOR, GROUND), wall)
+    assert straight.tilt is None
+    wrong = Rotation.from_rotvec(np.radians(20) * np.array(axis)).apply(terrain.up)
+    frame = simulate_terrain(terrain, Kinect(), CAMERA)
+    config = Config(**up_of(wrong))
+    tilt = Segmenter(config).segment(RangeImage.from_depth(frame.depth, CAMERA)).tilt
+    apart = np.degrees(np.arccos(wrong @ terrain.up))
+    assert tilt is not None and tilt.degrees == pytest.approx(apart, abs=2)
+    assert tilt.up == pytest.approx(terrain.up, abs=0.03)
+    write_camera(tmp_path / 'camera.yaml', CAMERA)
+    write_image(tmp_path / 'depth.png', frame.depth)
+    text = ''.join(f'{name}: {value}\n' for name, value in up_of(wrong).items())
+    (tmp_path / 'params.yaml').write_text(text)
+    names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
+    paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
+    said = CliRunner().invoke(command, paths)
+    assert said.exit_code == 0 and 'the camera looks tilted by' in said.output
