@@ -176,7 +176,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         return prior
     scale = _Scale.of(blocks, flat)
     within = [scale.mean(scale.variance_ratio(blocks, level), _QUANTILE)]
-    between = 1.0
+    between = filled = 1.0
     distortion = none
     # What is new in every pixel shows in the smallest blocks.
     shown = noise.times(within[0])
@@ -195,10 +195,13 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
         bending = scale.errors(excess.ravel()[scale.place], 0.5, kinds, none, shown)
         within.append(scale.mean(scale.variance_ratio(parts, level), _QUANTILE))
+        # Measured in each of the four blocks: s^2 where there are no holes.
+        pixels = float(np.median(parts.moments[..., COUNT].ravel()[scale.place])) / 4
         if side == BLOCK:
             between = scale.mean((excess / level).ravel()[scale.place], 0.5)
-        # M(s) = v + D^2 s^2 / 8.
-        smooth = bending.times(8 / side**2)
+            filled = pixels / side**2
+        # M(s) = v + D^2 n / 8, with n pixels in a block.
+        smooth = bending.times(8 / pixels)
         expected = shown.at(parts.squared, parts.slope) + bending.at(parts.squared, parts.slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
@@ -210,7 +213,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         side = 2 * side
     if len(within) == 1:
         return prior
-    total, white, width = _random(within, between)
+    total, white, width = _random(within, between, filled)
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
         noise=max(float(np.sqrt(noise.constant * total)), rounding),
@@ -254,14 +257,17 @@ def _likeliest(
     return factor, (np.log(explained) + variances / explained).sum()
 
 
-def _random(within: list[float], between: float) -> tuple[float, float, float]:
-    """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(4)."""
+def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:
+    """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(4).
+
+    M rises with the number of pixels that agree: with the share of a block that is `filled`.
+    """
     shown = np.maximum(np.array([*within[:3], between]), 1e-9)
     best = np.inf
     result = 1.0, 1.0, 0.0
     for width in _WIDTHS:
         hidden = correlated_residuals(width)
-        predicted = np.array([*hidden[: len(shown) - 1], hidden[3]])
+        predicted = np.array([*hidden[: len(shown) - 1], 1 + filled * (hidden[3] - 1)])
         white, correlated, error = _white_and_correlated(predicted, shown)
         if error < best:
             best, total = error, white + correlated
