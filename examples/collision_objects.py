@@ -1,4 +1,10 @@
-"""Planes for MoveIt: hulls as meshes, the floor as an endless plane, in its planning scene."""
+"""Planes for MoveIt: hulls as meshes, the floor as an endless plane, in its planning scene.
+
+On the map of planes (docs/frames.md) objects are sent once, again when they have changed by more
+than CHANGE, and taken away when rays pass through them.
+"""
+
+import math
 
 import rclpy
 from geometry_msgs.msg import Pose
@@ -9,6 +15,16 @@ from shape_msgs.msg import Mesh, MeshTriangle, Plane
 from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros import ROLES, planes_from_message
+
+CHANGE = 0.02  # metres
+
+
+def differ(hull, other):
+    """Whether corners of two markers are not the same, or not in the same place."""
+    if other is None or len(hull.points) != len(other.points):
+        return True
+    pairs = zip(hull.points, other.points, strict=True)
+    return any(math.dist((p.x, p.y, p.z), (q.x, q.y, q.z)) > CHANGE for p, q in pairs)
 
 
 def mesh_of(hull):
@@ -32,19 +48,22 @@ def floor_of(message):
 class CollisionObjects(Node):
     def __init__(self):
         super().__init__('collision_objects')
-        self.known = set()
+        self.known = {}
         self.scene = self.create_publisher(CollisionObject, '/collision_object', 50)
         self.create_subscription(MarkerArray, 'segment_planes/markers', self.on_markers, 5)
         self.create_subscription(PointCloud2, 'segment_planes/planes', self.on_planes, 5)
 
     def on_markers(self, message):
         hulls = {f'plane {m.id}': m for m in message.markers if m.ns == 'hulls' and m.points}
-        for name in self.known - set(hulls):
+        for name in set(self.known) - set(hulls):
+            del self.known[name]
             header = message.markers[0].header
             gone = CollisionObject(header=header, id=name, operation=CollisionObject.REMOVE)
             self.scene.publish(gone)
-        self.known = set(hulls)
         for name, hull in hulls.items():  # an object with a known id is replaced
+            if not differ(hull, self.known.get(name)):
+                continue
+            self.known[name] = hull
             mesh = CollisionObject(header=hull.header, id=name, operation=CollisionObject.ADD)
             mesh.meshes, mesh.mesh_poses = [mesh_of(hull)], [Pose()]
             self.scene.publish(mesh)

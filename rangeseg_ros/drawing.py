@@ -127,28 +127,31 @@ def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale
 
 
 def plan(
-    planes: Sequence[Plane], towards: NDArray[np.float64], size: int = 800
+    planes: Sequence[Plane],
+    towards: NDArray[np.float64],
+    top: NDArray[np.float64],
+    size: int = 800,
 ) -> NDArray[np.uint8]:
     """Picture of planes as they look from far away, with a grid of metres.
+
+    Planes that face away are left out: from above a room has no ceiling, from a side no front.
 
     Parameters
     ----------
     planes : sequence of Plane
         In any frame.
-    towards : (3,) float64
-        Unit vector to where they are looked at from.
+    towards, top : (3,) float64
+        Unit vectors to where they are looked at from, and to the top of the picture, across it.
     size : int
         Longer side, pixels.
 
     Returns
     -------
     (H, W, 3) uint8
-        RGB; what is nearer covers the rest, and planes that face away are darker.
+        RGB; what is nearer covers the rest, and what is seen at a slant is darker.
     """
-    # z is up in the picture, but seen along it, y is.
-    right = np.cross([0, 1, 0] if abs(towards[2]) > 0.7 else [0, 0, 1], towards)
-    right /= np.linalg.norm(right)
-    frame = np.stack([right, np.cross(towards, right)])
+    planes = [plane for plane in planes if plane.normal @ towards > 0]
+    frame = np.stack([np.cross(top, towards), top])
     rings = [
         [(ring @ frame.T) for part in plane.outline.parts for ring in part] for plane in planes
     ]
@@ -166,7 +169,7 @@ def plan(
                 picture[max(shape[1] - 1 - at, 0)] = 225
     depth = [plane.centroid @ towards for plane in planes]
     for k in np.argsort(depth, kind='stable').tolist():
-        shade = 0.45 + 0.55 * max(float(planes[k].normal @ towards), 0)
+        shade = 0.45 + 0.55 * float(planes[k].normal @ towards)
         colour = shade * colours([planes[k].id])[0].astype(float)
         flat = [
             np.round(

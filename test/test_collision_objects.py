@@ -2,6 +2,7 @@
 
 import runpy
 import sys
+from copy import deepcopy
 from pathlib import Path
 from types import ModuleType
 
@@ -65,7 +66,7 @@ class Scene(list):
     """Takes the place of the node and of its publisher."""
 
     def __init__(self):
-        self.known, self.scene, self.publish = set(), self, self.append
+        self.known, self.scene, self.publish = {}, self, self.append
 
 
 def area(mesh):
@@ -96,10 +97,17 @@ def test_hulls_become_meshes_and_go_with_their_planes(example, room):
         markers=[m for m in messages['markers'].markers if m.id != planes[0].id],
     )
     example['CollisionObjects'].on_markers(scene, wall)
-    assert [(o.id, o.operation) for o in scene] == [
-        (f'plane {planes[0].id}', b'\x01'),
-        (f'plane {planes[1].id}', b'\x00'),
-    ]
+    # What has not changed is not sent again.
+    assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[0].id}', b'\x01')]
+    scene.clear()
+    for shift in (0.01, 0.05):
+        moved = deepcopy(wall)
+        for marker in moved.markers:
+            # Triangles share their corners.
+            for point in {id(point): point for point in marker.points}.values():
+                point.z += shift
+        example['CollisionObjects'].on_markers(scene, moved)
+    assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[1].id}', b'\x00')]
 
 
 def test_the_floor_becomes_a_plane(example, room):

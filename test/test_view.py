@@ -101,3 +101,24 @@ def test_without_rerun_view_says_what_is_missing(tmp_path, monkeypatch, capsys):
         main()
     assert end.value.code == 2
     assert capsys.readouterr().err == ('rangeseg: view needs rerun-sdk: install the extra view\n')
+
+
+def test_view_shows_the_map(tmp_path, monkeypatch):
+    reader = pytest.importorskip('rerun.chunk').RrdReader
+    record_walls(tmp_path / 'bag', 4)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'p.yaml').write_text('odometry: true\n')
+    arguments = ['view', 'bag', '--output', 'walls.rrd', '--params', 'p.yaml']
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    chunks = list(reader(tmp_path / 'walls.rrd').stream())
+    (strips,) = [
+        chunk.to_record_batch().column('LineStrips3D:strips').to_pylist()[0]
+        for chunk in chunks
+        if chunk.is_static and chunk.entity_path == '/map'
+    ]
+    # x is forward in the frame of the odometry.
+    assert sorted(round(strip[0][0], 1) for strip in strips) == [1.5, 2.5]
+    assert any('Transform3D:translation' in c.to_record_batch().schema.names for c in chunks)

@@ -202,7 +202,7 @@ class Replay:
                 tilted=len(tilts),
                 tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
             )
-            report.write(self.folder / 'report.html', outcome.damage)
+            report.write(self.folder / 'report.html', outcome.damage, planes)
             kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
             files = results_folder.digest()
             bag.record({'key': key, 'outcome': kept, 'files': files})

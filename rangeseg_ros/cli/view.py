@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,8 +12,10 @@ from typing import Any
 import click
 import numpy as np
 
+from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import segmented
 from rangeseg_ros.cli import options
+from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -34,6 +38,12 @@ ARROW_LENGTH = 0.2
 @click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
 @options.raw
+@click.option(
+    '--fixed-frame',
+    metavar='FRAME',
+    help='Frame in which planes stay put, such as odom: shows camera and map of planes in it, '
+    'where the recording has tf.  [default: that of the parameters]',
+)
 @options.params
 @options.exact
 @click.pass_context
@@ -44,31 +54,43 @@ def command(
     depth_topic: str | None,
     camera_topic: str | None,
     raw: bool,
+    fixed_frame: str | None,
     params_file: Path | None,
     exact: bool,
 ) -> None:
     """Segment a recording and log what is found, to look at in 3D.
 
-    Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image. Needs
+    Cloud, hulls and normals in the colours of the planes' ids, and the labels as an image; in a
+    fixed frame, or with the parameter odometry, the map of planes as it is in the end. Needs
     the extra view (rerun-sdk), whose telemetry is off. What is damaged is left out, and the exit
     code is then 1.
     """
     config = options.read_parameters(params_file, exact)
+    if fixed_frame is not None:
+        config = replace(config, fixed_frame=fixed_frame)
     options.check_replaceable(output, b'RRF')
     rerun = _rerun()
-    with DepthBag(bag, depth_topic, camera_topic, raw) as source, replacing(output) as file:
+    sequence = SequenceSegmenter(config)
+    with (
+        DepthBag(bag, depth_topic, camera_topic, raw) as source,
+        Locator(bag, config) as located,
+        replacing(output) as file,
+    ):
         log = rerun.RecordingStream('rangeseg', recording_id=output.stem, send_properties=False)
         log.save(file)
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)
         count = 0
         show = partial(options.progress, unit='frame')
-        for index, frame, image, result in segmented(
-            source, SequenceSegmenter(config), progress=show
-        ):
+        for index, frame, image, result in segmented(source, sequence, located.place, show):
             log.set_time('frame', sequence=index)
             log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
+            if sequence.pose:
+                turn, shift = sequence.pose
+                log.log('camera', rerun.Transform3D(translation=shift, mat3x3=turn))
             _log_frame(rerun, log, image, result)
             count += 1
+        if config.map_frame:
+            log.log('map', _outlines(rerun, sequence.map.planes), static=True)
         log.flush()
         log.disconnect()
         problems = list(filter(None, (source.damage, source.loss())))
@@ -99,18 +121,7 @@ def _log_frame(rerun: Any, log: Any, image: RangeImage, result: Segmentation) ->
     log.log('camera/cloud', rerun.Points3D(image.points[image.valid], colors=pixels[image.valid]))
     log.log(
         'camera/hulls',
-        rerun.LineStrips3D(
-            [
-                np.vstack([ring, ring[:1]])
-                for plane in planes
-                for ring in (plane.hull, *plane.holes)
-            ],
-            colors=[
-                tint
-                for plane, tint in zip(planes, tints, strict=True)
-                for _ in range(1 + len(plane.holes))
-            ],
-        ),
+        _outlines(rerun, planes),
     )
     log.log(
         'camera/normals',
@@ -126,3 +137,16 @@ def _log_frame(rerun: Any, log: Any, image: RangeImage, result: Segmentation) ->
     ]
     log.log('labels', rerun.AnnotationContext([(0, 'no plane', (0, 0, 0)), *classes]))
     log.log('labels', rerun.SegmentationImage(result.labels))
+
+
+def _outlines(rerun: Any, planes: Sequence[Plane]) -> Any:
+    """Borders of planes and of their holes, in the colours of their ids."""
+    tints = colours([plane.id for plane in planes])
+    lines = [
+        (tint, ring)
+        for plane, tint in zip(planes, tints, strict=True)
+        for part in plane.outline.parts
+        for ring in part
+    ]
+    closed = [np.vstack([ring, ring[:1]]) for _, ring in lines]
+    return rerun.LineStrips3D(closed, colors=[tint for tint, _ in lines])

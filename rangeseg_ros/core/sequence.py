@@ -29,6 +29,8 @@ class SequenceSegmenter:
     ----------
     map : PlaneMap
         Of the frames whose pose was given, or else found by the odometry.
+    pose : Transform or None
+        Of the last frame, in the frame of the map.
     motion : Motion or None
         Of the camera up to the last frame, with the parameter `odometry`.
 
@@ -42,6 +44,7 @@ class SequenceSegmenter:
         self._segmenter = Segmenter(config)
         self._tracker = Tracker(config)
         self.map = PlaneMap(config)
+        self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config.odometry_frame)
         self._stamp = 0
@@ -104,6 +107,7 @@ class SequenceSegmenter:
             self._follow(result.labels, planes, stamp, up)
             if not self.config.fixed_frame and self.motion:
                 pose = self.motion.pose
+        self.pose = pose
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey, tilt = result.survey, result.tilt

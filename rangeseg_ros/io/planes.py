@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.io.files import replacing
 
 

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement
-from rangeseg_ros.core.mapping.plane_map import MapPlane
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.segmenter import Segmentation

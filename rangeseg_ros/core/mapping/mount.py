@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.mapping.plane_map import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.transforms import quaternion
 
 # Largest angle between up and -y of the camera, so that no wall is taken for the floor.
