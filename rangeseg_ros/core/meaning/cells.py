@@ -106,22 +106,13 @@ def _means(
     sensor: SensorModel,
     cells: Cells,
 ) -> None:
-    height, width = inverse.shape
     half = size.columns // 2
+    # Of the left and the right half: sums of rays and inverse ranges, and their number.
     sums = np.zeros((2, 5), np.float32)
     for i in range(first, after):
         for c in range(cells.inverse.shape[1]):
-            sums[:] = 0
-            for v in range(i * size.rows, min((i + 1) * size.rows, height)):
-                for side in range(2):
-                    start = c * size.columns + side * half
-                    for j in range(start, min(start + half, width)):
-                        if inverse[v, j] > 0:
-                            sums[side, 0] += rays[v, j, 0]
-                            sums[side, 1] += rays[v, j, 1]
-                            sums[side, 2] += rays[v, j, 2]
-                            sums[side, 3] += inverse[v, j]
-                            sums[side, 4] += 1
+            for side in range(2):
+                _sum(inverse, rays, i, c * size.columns + side * half, size.rows, half, sums[side])
             count = sums[0, 4] + sums[1, 4]
             if 2 * count < size.rows * size.columns:
                 continue
@@ -129,17 +120,45 @@ def _means(
             cells.inverse[i, c] = value
             for k in range(3):
                 cells.ray[i, c, k] = (sums[0, k] + sums[1, k]) / count
+            ray = cells.ray[i, c]
             for k in range(3):
-                cells.place[i, c, k] = _along(axes[k], sums[0] + sums[1])
+                cells.place[i, c, k] = _dot(axes[k], ray) / value
             deviation = np.sqrt(random_variance(sensor, value * value))
             cells.error[i, c] = abs(cells.place[i, c, 0]) / value * deviation
             if min(sums[0, 4], sums[1, 4]) * 4 >= size.rows * size.columns:
-                apart = [_along(axes[k], sums[0]) - _along(axes[k], sums[1]) for k in range(3)]
-                cells.kink[i, c, 0] = abs(apart[0])
-                cells.kink[i, c, 1] = np.hypot(apart[1], apart[2])
+                left, right = sums[0, 3], sums[1, 3]
+                up, ahead, across = (
+                    _dot(axes[0], sums[0]) / left - _dot(axes[0], sums[1]) / right,
+                    _dot(axes[1], sums[0]) / left - _dot(axes[1], sums[1]) / right,
+                    _dot(axes[2], sums[0]) / left - _dot(axes[2], sums[1]) / right,
+                )
+                cells.kink[i, c, 0] = abs(up)
+                cells.kink[i, c, 1] = np.sqrt(ahead * ahead + across * across)
 
 
 @njit(cache=True, inline='always')
-def _along(axis: NDArray[np.float32], sums: NDArray[np.float32]) -> float:
-    """Coordinate along an axis of the point of summed rays and inverse ranges."""
-    return (axis[0] * sums[0] + axis[1] * sums[1] + axis[2] * sums[2]) / sums[3]
+def _sum(
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    row: int,
+    start: int,
+    rows: int,
+    columns: int,
+    total: NDArray[np.float32],
+) -> None:
+    """Sum what is measured in `rows` x `columns` pixels of row `row` of cells."""
+    x = y = z = value = count = np.float32(0)
+    for v in range(row * rows, min((row + 1) * rows, inverse.shape[0])):
+        for j in range(start, min(start + columns, inverse.shape[1])):
+            if inverse[v, j] > 0:
+                x += rays[v, j, 0]
+                y += rays[v, j, 1]
+                z += rays[v, j, 2]
+                value += inverse[v, j]
+                count += np.float32(1)
+    total[0], total[1], total[2], total[3], total[4] = x, y, z, value, count
+
+
+@njit(cache=True, inline='always')
+def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -20,8 +20,8 @@ from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
     cell_heights,
     ground_field,
-    height_above,
-    plane_at,
+    height_in_row,
+    planes_of_row,
 )
 from rangeseg_ros.core.meaning.growth import grown
 from rangeseg_ros.core.meaning.under_robot import FEWEST, TILT, Stand, stand
@@ -178,11 +178,11 @@ def _nearest_part(
     tolerance: float,
 ) -> NDArray[np.bool_]:
     """Cells of a surface nearest to the robot that lie on one plane."""
-    rows, columns = np.nonzero(where)
+    with np.errstate(invalid='ignore'):
+        square = np.where(where, place[..., 1] ** 2 + place[..., 2] ** 2, np.inf)
+    near = square <= (np.sqrt(square.min()) + _START) ** 2
+    rows, columns = np.nonzero(near)
     x, y = place[rows, columns, 1:].T.astype(np.float64)
-    reach = np.hypot(x, y)
-    near = reach <= reach.min() + _START
-    rows, columns, x, y = rows[near], columns[near], x[near], y[near]
     h = height[rows, columns].astype(np.float64)
     design = np.stack([np.ones(len(x)), x, y], axis=1)
     off = h - np.median(h)
@@ -273,14 +273,19 @@ def _classify(
     obstacle or drop (`bounds`), the other one is less probable. Eleven parameters, as a kernel
     cannot return what several threads write.
     """
+    line = np.empty((field.theta.shape[1], 4))
+    # Divisions would take as long as all the rest.
+    blocks, cells = 1 / field.columns, 1 / size.columns
     for i in range(first * size.rows, min(after * size.rows, len(inverse))):
         row = i // size.rows
+        planes_of_row(field, i, line)
         for j in range(inverse.shape[1]):
-            if inverse[i, j] == 0:
+            value = inverse[i, j]
+            if value == 0:
                 continue
-            height = height_above(plane_at(field, i, j), inverse[i, j], rays[i, j], field.up)
+            height = height_in_row(line, (j + 0.5) * blocks - 0.5, value, rays[i, j])
             heights[i, j] = height
-            c = j // size.columns
+            c = int((j + 0.5) * cells)
             kind = said[row, c]
             if kind > GROUND:
                 classes[i, j] = kind

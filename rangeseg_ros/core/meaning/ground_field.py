@@ -41,43 +41,47 @@ def ground_field(
     -------
     (M, N, 3) float64, one for each block of the image.
     """
-    levels = [_moments(cells, on_ground)]
-    while max(levels[-1][0].shape[:2]) > 1:
-        ground, every = levels[-1]
-        levels.append((_halved(ground), _halved(every)))
+    levels = [_moments(cells.ray, cells.inverse, on_ground)]
+    while max(levels[-1].shape[:2]) > 1:
+        levels.append(_halved(levels[-1]))
     theta = np.asarray(base, np.float64)[None, None]
-    for ground, every in reversed(levels):
-        rows, columns = ground.shape[:2]
-        parents = theta[np.arange(rows)[:, None] // 2, np.arange(columns) // 2]
-        theta = _fitted(_window(ground), _window(every), parents)
+    for sums in reversed(levels):
+        theta = _fitted(sums, theta)
     return theta
 
 
 @njit(cache=True, nogil=True)
 def _moments(
-    cells: Cells, on_ground: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sums of ray ray^T (6) and ray * inverse (3): of the ground, and the first of all cells."""
+    ray: NDArray[np.float32], inverse: NDArray[np.float32], on_ground: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Sums over blocks: ray ray^T (6), ray * inverse (3) of the ground; ray ray^T of all (6)."""
     rows, columns = on_ground.shape
-    blocks = -(-rows // _ROWS), -(-columns // _COLUMNS)
-    ground = np.zeros((*blocks, 9))
-    every = np.zeros((*blocks, 6))
+    sums = np.zeros((-(-rows // _ROWS), -(-columns // _COLUMNS), 15))
     for i in range(rows):
         for c in range(columns):
-            value = cells.inverse[i, c]
+            value = inverse[i, c]
             if value == 0:
                 continue
-            m, n = i // _ROWS, c // _COLUMNS
-            x, y, z = cells.ray[i, c]
-            for k, product in enumerate((x * x, x * y, x * z, y * y, y * z, z * z)):
-                every[m, n, k] += product
-                if on_ground[i, c]:
-                    ground[m, n, k] += product
+            total = sums[i // _ROWS, c // _COLUMNS]
+            x, y, z = ray[i, c, 0], ray[i, c, 1], ray[i, c, 2]
+            xx, xy, xz, yy, yz, zz = x * x, x * y, x * z, y * y, y * z, z * z
+            total[9] += xx
+            total[10] += xy
+            total[11] += xz
+            total[12] += yy
+            total[13] += yz
+            total[14] += zz
             if on_ground[i, c]:
-                ground[m, n, 6] += x * value
-                ground[m, n, 7] += y * value
-                ground[m, n, 8] += z * value
-    return ground, every
+                total[0] += xx
+                total[1] += xy
+                total[2] += xz
+                total[3] += yy
+                total[4] += yz
+                total[5] += zz
+                total[6] += x * value
+                total[7] += y * value
+                total[8] += z * value
+    return sums
 
 
 def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,25 +91,29 @@ def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]
 
 
-def _window(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums of 3 x 3 neighbours."""
-    padded = np.pad(sums, ((1, 1), (1, 1), (0, 0)))
-    tall = padded[:-2] + padded[1:-1] + padded[2:]
-    return tall[:, :-2] + tall[:, 1:-1] + tall[:, 2:]
-
-
 @njit(cache=True, nogil=True)
-def _fitted(
-    ground: NDArray[np.float64], every: NDArray[np.float64], prior: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Planes that fit the moments of the ground, and those of all rays on the prior planes."""
-    theta = prior.copy()
-    for i in range(ground.shape[0]):
-        for j in range(ground.shape[1]):
-            g, p = ground[i, j], prior[i, j]
+def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Planes that fit the ground in windows of 3 x 3 blocks, and all rays on the prior planes.
+
+    `prior` has a plane for 2 x 2 blocks.
+    """
+    rows, columns = sums.shape[:2]
+    theta = np.empty((rows, columns, 3))
+    window = np.empty(15)
+    for i in range(rows):
+        for j in range(columns):
+            p = prior[min(i // 2, prior.shape[0] - 1), min(j // 2, prior.shape[1] - 1)]
+            theta[i, j] = p
+            window[:] = 0
+            for m in range(max(i - 1, 0), min(i + 2, rows)):
+                for n in range(max(j - 1, 0), min(j + 2, columns)):
+                    for k in range(15):
+                        window[k] += sums[m, n, k]
+            g = window
             if g[0] + g[3] + g[5] == 0:
                 continue
-            a, b, c, d, e, f = g[:6] + _PRIOR * every[i, j]
+            a, b, c = g[0] + _PRIOR * g[9], g[1] + _PRIOR * g[10], g[2] + _PRIOR * g[11]
+            d, e, f = g[3] + _PRIOR * g[12], g[4] + _PRIOR * g[13], g[5] + _PRIOR * g[14]
             # What the ground is off the prior plane.
             x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
             y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
@@ -167,12 +175,45 @@ def _cell_heights(
     size: CellSize,
     result: NDArray[np.float32],
 ) -> None:
+    line = np.empty((field.theta.shape[1], 4))
     for i in range(first, after):
+        planes_of_row(field, (i + 0.5) * size.rows - 0.5, line)
         for c in range(result.shape[1]):
-            if cells.inverse[i, c] > 0:
-                row, column = (i + 0.5) * size.rows - 0.5, (c + 0.5) * size.columns - 0.5
-                theta = plane_at(field, row, column)
-                result[i, c] = height_above(theta, cells.inverse[i, c], cells.ray[i, c], field.up)
+            value = cells.inverse[i, c]
+            if value > 0:
+                x = (c + 0.5) * size.columns / field.columns - 0.5
+                result[i, c] = height_in_row(line, x, value, cells.ray[i, c])
+
+
+@njit(cache=True, inline='always')
+def planes_of_row(field: GroundField, row: float, line: NDArray[np.float64]) -> None:
+    """Planes theta of the ground at a row of the image, and theta . up, one for each block."""
+    theta, up = field.theta, field.up
+    y = min(max((row + 0.5) / field.rows - 0.5, 0.0), theta.shape[0] - 1.0)
+    i = int(y)
+    k, v = min(i + 1, theta.shape[0] - 1), y - i
+    for j in range(theta.shape[1]):
+        for n in range(3):
+            line[j, n] = (1 - v) * theta[i, j, n] + v * theta[k, j, n]
+        line[j, 3] = line[j, 0] * up[0] + line[j, 1] * up[1] + line[j, 2] * up[2]
+
+
+@njit(cache=True, inline='always')
+def height_in_row(
+    line: NDArray[np.float64], x: float, inverse: float, ray: NDArray[np.float32]
+) -> float:
+    """Height of a point above the plane theta . p = 1 at x, in blocks, along up."""
+    x = min(max(x, 0.0), line.shape[0] - 1.0)
+    j = int(x)
+    k, u = min(j + 1, line.shape[0] - 1), x - j
+    theta = (
+        line[j, 0] + u * (line[k, 0] - line[j, 0]),
+        line[j, 1] + u * (line[k, 1] - line[j, 1]),
+        line[j, 2] + u * (line[k, 2] - line[j, 2]),
+    )
+    along = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]
+    rise = line[j, 3] + u * (line[k, 3] - line[j, 3])
+    return (along - inverse) / (inverse * rise)
 
 
 @njit(cache=True, inline='always')
@@ -190,16 +231,3 @@ def plane_at(field: GroundField, row: float, column: float) -> tuple[float, floa
         a * theta[i, j, 1] + b * theta[i, m, 1] + c * theta[k, j, 1] + d * theta[k, m, 1],
         a * theta[i, j, 2] + b * theta[i, m, 2] + c * theta[k, j, 2] + d * theta[k, m, 2],
     )
-
-
-@njit(cache=True, inline='always')
-def height_above(
-    theta: tuple[float, float, float],
-    inverse: float,
-    ray: NDArray[np.float32],
-    up: NDArray[np.float64],
-) -> float:
-    """Height of the point above the plane theta . p = 1, along up."""
-    along = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]
-    rise = theta[0] * up[0] + theta[1] * up[1] + theta[2] * up[2]
-    return (along / inverse - 1) / rise

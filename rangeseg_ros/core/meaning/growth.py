@@ -65,7 +65,8 @@ def grown(
                 _add(sums, ground, height, cells, i, c)
             if candidate[i, c]:
                 tile = (i // ROWS) * wide + c // COLUMNS
-                reach = np.hypot(place[i, c, 1], place[i, c, 2])
+                x, y = place[i, c, 1], place[i, c, 2]
+                reach = np.sqrt(x * x + y * y)
                 distance[tile] = min(distance[tile], reach)
     order = np.argsort(distance, kind='mergesort')
     for turn in range(2):  # outwards, and back behind what stands in the way

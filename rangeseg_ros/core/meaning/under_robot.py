@@ -130,7 +130,7 @@ def _reaches(
             k = surface[i, c]
             if k:
                 z, x, y = cells.place[i, c]
-                way = np.hypot(x, y)
+                way = np.sqrt(x * x + y * y)
                 reach[k] = min(reach[k], way)
                 ratio[k] = min(ratio[k], way / max(-z, np.float32(1e-3)))
     return reach, ratio
@@ -159,7 +159,7 @@ def _sums(
             if k == 0 or rank[k] < 0:
                 continue
             z, x, y = cells.place[i, c]
-            way = np.hypot(x, y) - reach[k]
+            way = np.sqrt(x * x + y * y) - reach[k]
             if way > _WAYS[0]:
                 continue
             square = cells.inverse[i, c] ** 2
