@@ -27,7 +27,7 @@ def linked():
 
 def groups(regions, inverse, grid):
     fits = Fits.of(regions, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
-    edges = touching(regions, grid, int(regions.max()) + 1)
+    edges = touching(regions, grid, int(regions.max()) + 1, fits.inner)
     return parts(fits, edges).tolist()
 
 

@@ -59,7 +59,8 @@ def test_exact_planes_come_back(form):
         assert plane.rms < 1e-6 and plane.confidence == pytest.approx(1)
         assert plane.count == np.count_nonzero(labels == plane.label)
         points = image.points[labels == plane.label]
-        np.testing.assert_allclose(plane.centroid, points.mean(axis=0, dtype=float), atol=1e-5)
+        # Of blocks inside regions, the sums tell where their middle is.
+        np.testing.assert_allclose(plane.centroid, points.mean(axis=0, dtype=float), atol=5e-5)
         for ring in (plane.hull, *plane.holes, plane.centre[None], plane.centroid[None]):
             np.testing.assert_allclose(ring @ NORMAL + DISTANCE, 0, atol=1e-5)
         frame = rotation(plane.orientation)

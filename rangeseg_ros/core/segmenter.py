@@ -209,10 +209,10 @@ class Segmenter:
         method = self._by_planes if config.method == 'planes' else self._by_normals
         regions, labelling = method(whole, blocks, grid, sensor, watch)
         if config.method == 'planes':
-            regions, fits = by_planes.united(regions, image, sensor, grid)
+            regions, fits = by_planes.united(regions, image, blocks, sensor, grid)
         else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
-            fits = Fits.of(regions, image, SensorModel.from_config(config))
+            fits = Fits.of(regions, image, SensorModel.from_config(config), blocks)
         planes = described(regions, whole, fits)
         if len(planes) < regions.max():
             # Of some no plane is known: a pixel or two, or so steep that they have no end.

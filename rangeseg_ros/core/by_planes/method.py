@@ -115,7 +115,11 @@ def segment(
 
 
 def united(
-    regions: NDArray[np.uint16], image: RangeImage, sensor: SensorModel, grid: Grid
+    regions: NDArray[np.uint16],
+    image: RangeImage,
+    blocks: Blocks,
+    sensor: SensorModel,
+    grid: Grid,
 ) -> tuple[NDArray[np.uint16], Fits]:
     """Unite regions that touch and whose planes agree; the regions and their planes.
 
@@ -125,13 +129,14 @@ def united(
         0...M.
     image : RangeImage
         (H, W).
+    blocks : Blocks
+        Of the image.
     sensor : SensorModel
     grid : Grid
     """
-    count = int(regions.max(initial=0)) + 1
-    edges = aside(touching, regions, grid, count)
-    fits = Fits.of(regions, image, sensor)
-    group = parts(fits, edges.result())
+    fits = Fits.of(regions, image, sensor, blocks)
+    count = len(fits.theta)
+    group = parts(fits, touching(regions, grid, count, fits.inner))
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)

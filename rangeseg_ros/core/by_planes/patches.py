@@ -59,7 +59,7 @@ def patches(
         residual[a] = fit(blocks[a], theta)
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     pairs = _pairs(smooth.reshape(shape), right, below)
-    parent = _quads(blocks, residual, smooth.reshape(shape), right, below)
+    parent = _quads(blocks, residual, smooth.reshape(shape), right, below, largest)
     return _grow(blocks, residual, smooth, pairs, parent, largest) + first * shape[1]
 
 
@@ -117,8 +117,9 @@ def _quads(
     smooth: NDArray[np.bool_],
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
+    largest: float,
 ) -> NDArray[np.intp]:
-    """Merge every 2 x 2 blocks that clearly lie on one plane; in place.
+    """Merge every 2 x 2 blocks that clearly lie on one plane, and 2 x 2 of these; in place.
 
     Most blocks do; merging these at once saves the queue of `_grow` most of its work. Returns
     the parent of each block.
@@ -126,24 +127,36 @@ def _quads(
     rows, columns = smooth.shape
     parent = np.arange(rows * columns)
     theta, total = np.zeros(3), np.zeros(SIZE)
-    for i in range(0, rows - 1, 2):
-        for j in range(0, columns - 1, 2):
-            if not (
-                smooth[i, j] and smooth[i, j + 1] and smooth[i + 1, j] and smooth[i + 1, j + 1]
-            ):
-                continue
-            if not (right[i, j] and right[i + 1, j] and below[i, j] and below[i, j + 1]):
-                continue
-            a = i * columns + j
-            apart = 0.0
-            total[:] = 0
-            for b in (a, a + 1, a + columns, a + columns + 1):
-                total += moments[b]
-                apart += residual[b]
-            together = fit(total, theta)
-            if together - apart < _CLEAR:
-                parent[a + 1] = parent[a + columns] = parent[a + columns + 1] = a
-                moments[a], residual[a] = total, together
+    whole, side = smooth.copy(), 1
+    while whole.any():
+        merged = np.zeros_like(whole)
+        for i in range(0, rows - 2 * side + 1, 2 * side):
+            for j in range(0, columns - 2 * side + 1, 2 * side):
+                middle = i + side, j + side
+                if not (whole[i, j] and whole[i, middle[1]]):
+                    continue
+                if not (whole[middle[0], j] and whole[middle]):
+                    continue
+                if not (
+                    right[i : i + 2 * side, middle[1] - 1].all()
+                    and below[middle[0] - 1, j : j + 2 * side].all()
+                ):
+                    continue
+                apart = 0.0
+                total[:] = 0
+                for u in (i, middle[0]):
+                    for v in (j, middle[1]):
+                        total += moments[u * columns + v]
+                        apart += residual[u * columns + v]
+                together = fit(total, theta)
+                if total[COUNT] <= largest and together - apart < _CLEAR:
+                    merged[i, j] = True
+                    a = i * columns + j
+                    moments[a], residual[a] = total, together
+                    for u in range(i, i + 2 * side):
+                        for v in range(j, j + 2 * side):
+                            parent[u * columns + v] = a
+        whole, side = merged, 2 * side
     return parent
 
 

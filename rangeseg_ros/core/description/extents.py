@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
@@ -18,6 +19,7 @@ def areas_and_axes(
     image: RangeImage,
     theta: NDArray[np.float64],
     tangents: NDArray[np.float64],
+    inner: NDArray[np.uint16],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Area of regions and the axis along which they are longest.
 
@@ -31,6 +33,8 @@ def areas_and_axes(
         Planes, theta . ray = inverse range.
     tangents : (M + 1, 2, 3) float64
         Two orthonormal vectors in each plane.
+    inner : (rows, columns) uint16
+        Blocks inside regions, see `interior`.
 
     Returns
     -------
@@ -39,7 +43,7 @@ def areas_and_axes(
     major : (M + 1, 3) float64
         Unit vector in the plane of the largest second moment of the area; x >= 0.
     """
-    arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents
+    arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents, inner
     upper, lower = halves(_area_moments, len(labels), *arrays)
     sums = upper + lower
     # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
@@ -59,6 +63,7 @@ def rectangles(
     image: RangeImage,
     theta: NDArray[np.float64],
     axes: NDArray[np.float64],
+    inner: NDArray[np.uint16],
 ) -> NDArray[np.float64]:
     """Rectangles around regions on their planes.
 
@@ -68,6 +73,8 @@ def rectangles(
         As for `areas_and_axes`.
     axes : (M + 1, 2, 3) float64
         Directions of the rectangles' sides.
+    inner
+        As for `areas_and_axes`.
 
     Returns
     -------
@@ -77,7 +84,7 @@ def rectangles(
     """
     camera = image.camera
     half = (0.5 / camera.fx, 0.5 / camera.fy) if camera and camera.pinhole else (0.0, 0.0)
-    arrays = labels, image.inverse, image.rays, theta, axes
+    arrays = labels, image.inverse, image.rays, theta, axes, inner
     upper, lower = halves(_limits, len(labels), *arrays, *half)
     # Smallest and largest.
     return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
@@ -127,11 +134,16 @@ def _area_moments(
     footprints: NDArray[np.float32],
     theta: NDArray[np.float64],
     tangents: NDArray[np.float64],
+    inner: NDArray[np.uint16],
 ) -> NDArray[np.float64]:
-    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2: a is area over |theta|."""
+    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2: a is area over |theta|.
+
+    A block inside a region counts as so many times its middle.
+    """
     sums = np.zeros((len(theta), 6))
     width = labels.shape[1]
     for i in range(first, after):
+        within, middle = inner[i // BLOCK], i % BLOCK == BLOCK // 2
         j = 0
         while j < width:
             label = int(labels[i, j])
@@ -142,18 +154,30 @@ def _area_moments(
             # In variables of their own: sums in an array go through memory for every pixel.
             one = su = sv = suu = suv = svv = 0.0
             while j < width and labels[i, j] == label:
+                pixels = 1
+                if within[j // BLOCK] > 0:
+                    if not middle:
+                        j = (j // BLOCK + 1) * BLOCK
+                        continue
+                    pixels = BLOCK * BLOCK
+                    j = j // BLOCK * BLOCK + BLOCK // 2
                 y = inverse[i, j]
                 x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+                if pixels > 1:
+                    # Of the four pixels in the middle, two will do.
+                    x0 = (x0 + rays[i - 1, j - 1, 0]) / 2
+                    x1 = (x1 + rays[i - 1, j - 1, 1]) / 2
+                    x2 = (x2 + rays[i - 1, j - 1, 2]) / 2
                 level = plane[0] * x0 + plane[1] * x1 + plane[2] * x2
                 if y > 0 and level * _FAR >= y:
                     z = 1 / level
                     u = z * (across[0] * x0 + across[1] * x1 + across[2] * x2)
                     v = z * (along[0] * x0 + along[1] * x1 + along[2] * x2)
-                    area = footprints[i, j] * z * z * z
+                    area = pixels * footprints[i, j] * z * z * z
                     au, av = area * u, area * v
                     one, su, sv = one + area, su + au, sv + av
                     suu, suv, svv = suu + au * u, suv + au * v, svv + av * v
-                j += 1
+                j += 1 if pixels == 1 else BLOCK // 2
             for entry, value in enumerate((one, su, sv, suu, suv, svv)):
                 sums[label, entry] += value
     return sums
@@ -168,6 +192,7 @@ def _limits(
     rays: NDArray[np.float32],
     theta: NDArray[np.float64],
     axes: NDArray[np.float64],
+    inner: NDArray[np.uint16],
     half_x: float,
     half_y: float,
 ) -> NDArray[np.float64]:
@@ -177,13 +202,16 @@ def _limits(
     corners = 1 if half_x == 0 else 4
     height, width = labels.shape
     for i in range(first, after):
+        within = inner[i // BLOCK]
         for j in range(width):
             label = labels[i, j]
+            if label == 0 or within[j // BLOCK] > 0:
+                continue
             # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends.
-            inner = 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]
-            if inner and corners == 1:
-                inner = 0 < i < height - 1 and labels[i - 1, j] == label == labels[i + 1, j]
-            if label == 0 or inner or inverse[i, j] == 0:
+            alike = 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]
+            if alike and corners == 1:
+                alike = 0 < i < height - 1 and labels[i - 1, j] == label == labels[i + 1, j]
+            if alike or inverse[i, j] == 0:
                 continue
             plane = theta[label]
             for corner in range(corners):

@@ -147,9 +147,9 @@ def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list
     share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
     confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
 
-    area, major = areas_and_axes(labels, image, theta, _tangents(normal))
+    area, major = areas_and_axes(labels, image, theta, _tangents(normal), fits.inner)
     axes = np.stack([major, np.cross(normal, major)], axis=1)
-    limits = rectangles(labels, image, theta, axes)
+    limits = rectangles(labels, image, theta, axes, fits.inner)
     boxes = fits.boxes()
     outlines = {k: _outline(k, labels, image, boxes[k], theta[k]) for k in found.tolist()}
     # Steep planes may have pixels whose rays do not meet them.

@@ -13,7 +13,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.fitting.interior import rows_of_blocks
 from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -47,6 +50,8 @@ class Cells(NamedTuple):
         Cells side by side.
     start : (M + 2,) int
         Where each region's cells begin in `sums`.
+    inner : (rows, columns) uint16
+        Region of each block of 4 x 4 pixels that its cells take as a whole, 0 for the others.
     sums : (N, 25) float64
         A moment vector and the entries after it, for each cell.
     """
@@ -56,10 +61,18 @@ class Cells(NamedTuple):
     size: NDArray[np.intp]
     columns: NDArray[np.intp]
     start: NDArray[np.intp]
+    inner: NDArray[np.uint16]
     sums: NDArray[np.float64]
 
     @classmethod
-    def of(cls, labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> Cells:
+    def of(
+        cls,
+        labels: NDArray[np.uint16],
+        image: RangeImage,
+        sensor: SensorModel,
+        blocks: Blocks,
+        inner: NDArray[np.uint16],
+    ) -> Cells:
         """Sums over all measured pixels.
 
         Parameters
@@ -69,6 +82,10 @@ class Cells(NamedTuple):
         image : RangeImage
             (H, W).
         sensor : SensorModel
+        blocks : Blocks
+            Of the image.
+        inner : (rows, columns) uint16
+            Region of each block inside it, see `interior`.
         """
         box, border = bounding_boxes(labels, int(labels.max(initial=0)) + 1)
         rows, columns = box[:, 2] - box[:, 0], box[:, 3] - box[:, 1]
@@ -77,11 +94,14 @@ class Cells(NamedTuple):
             size += large
         rows, columns = -(-rows // size), -(-columns // size)
         start = np.concatenate([[0], np.cumsum(rows * columns)])
-        cells = cls(box, border, size, columns, start, np.zeros((start[-1], RECORD)))
         central = image.camera is not None
-        upper, lower = halves(
-            _sums, len(labels), labels, image.inverse, image.rays, cells, sensor, central
-        )
+        # Small cells need the pixels, as blocks do not end where they do, and so do rays that have
+        # no z of 1.
+        taken = (size >= 2 * BLOCK) & central
+        inner = np.where(taken[inner], inner, np.uint16(0))
+        cells = cls(box, border, size, columns, start, inner, np.zeros((start[-1], RECORD)))
+        arrays = labels, image.inverse, image.rays, blocks
+        upper, lower = halves(_sums, len(labels), *arrays, cells, sensor, central)
         return cells._replace(sums=upper + lower)
 
     def without_doubtful(
@@ -90,6 +110,7 @@ class Cells(NamedTuple):
         image: RangeImage,
         theta: NDArray[np.float64],
         sensor: SensorModel,
+        blocks: Blocks,
     ) -> tuple[Cells, NDArray[np.intp], NDArray[np.float64]]:
         """Leave out of the sums what may not belong to regions: outliers, then rims.
 
@@ -106,7 +127,7 @@ class Cells(NamedTuple):
             Sums over whole regions, with their rims.
         """
         central = image.camera is not None
-        arrays = labels, image.inverse, image.rays
+        arrays = labels, image.inverse, image.rays, blocks
         parts = halves(_doubtful, len(labels), *arrays, self, sensor, theta, central)
         (pixels, outliers, rims), outlying, rim = (a + b for a, b in zip(*parts, strict=True))
         region = np.repeat(np.arange(len(self.size)), np.diff(self.start))
@@ -216,6 +237,26 @@ def _add(
         record[POINT + entry] += value
 
 
+@njit(cache=True, inline='always')
+def _add_block(
+    record: NDArray[np.float64], moments: NDArray[np.float64], squared: float, sensor: SensorModel
+) -> None:
+    """Add a block, of moments with unit weights, to a cell: its rays have z = 1."""
+    w = 1 / random_variance(sensor, squared)
+    for entry in range(CHI2):
+        record[entry] += w * moments[entry]
+    record[COUNT] += moments[COUNT]
+    for entry, place in enumerate((2, 4, 5)):
+        record[WEIGHTED_RAY + entry] += w * moments[place]
+    record[WEIGHT] += w * moments[COUNT]
+    # With 1 / y^2 for weights, sums of r y and r r^T are those of points and of their squares.
+    w = 1 / squared
+    for entry in range(3):
+        record[POINT + entry] += w * moments[6 + entry]
+    for entry in range(6):
+        record[SCATTER + entry] += w * moments[entry]
+
+
 @njit(cache=True, nogil=True)
 def _sums(
     top: int,
@@ -223,24 +264,38 @@ def _sums(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    blocks: Blocks,
     cells: Cells,
     sensor: SensorModel,
     central: bool,
 ) -> NDArray[np.float64]:
     """Sums (N, 25) over the measured pixels of some rows."""
     sums = np.zeros_like(cells.sums)
-    width = labels.shape[1]
+    inner, width = cells.inner, labels.shape[1]
+    first_block, after_block = rows_of_blocks(top, bottom)
+    for bi in range(first_block, after_block):
+        for bj in range(inner.shape[1]):
+            if inner[bi, bj] > 0 and blocks.moments[bi, bj, COUNT] > 0:
+                middle = bi * BLOCK + BLOCK // 2, bj * BLOCK + BLOCK // 2
+                record = sums[_index(cells, inner[bi, bj], *middle)]
+                _add_block(record, blocks.moments[bi, bj], blocks.squared[bi, bj], sensor)
     for i in range(top, bottom):
+        within = inner[i // BLOCK]
         j = 0
         while j < width:
             first, label = j, labels[i, j]
-            left, size = cells.box[label, 1], cells.size[label]
-            end = left + ((j - left) // size + 1) * size if label > 0 else width
-            while j < min(end, width) and labels[i, j] == label:
+            if label == 0:
                 j += 1
-            if label > 0:
-                record = sums[_index(cells, label, i, first)]
-                _add(record, i, first, j, inverse, rays, sensor, central)
+                continue
+            if within[j // BLOCK] > 0:
+                j = (j // BLOCK + 1) * BLOCK
+                continue
+            left, size = cells.box[label, 1], cells.size[label]
+            end = min(left + ((j - left) // size + 1) * size, width)
+            while j < end and labels[i, j] == label and within[j // BLOCK] == 0:
+                j += 1
+            record = sums[_index(cells, label, i, first)]
+            _add(record, i, first, j, inverse, rays, sensor, central)
     return sums
 
 
@@ -251,6 +306,7 @@ def _doubtful(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    blocks: Blocks,
     cells: Cells,
     sensor: SensorModel,
     theta: NDArray[np.float64],
@@ -261,12 +317,31 @@ def _doubtful(
     The numbers of all pixels, of outliers and of the rest of the rim, (3, M + 1), and the sums
     over either, (N, 25).
     """
-    height, width = labels.shape
+    inner, (height, width) = cells.inner, labels.shape
     count = np.zeros((3, len(theta)), np.intp)
     outlying, rim = np.zeros_like(cells.sums), np.zeros_like(cells.sums)
+    explained = np.zeros(inner.shape, np.bool_)
+    first_block, after_block = rows_of_blocks(first, after)
+    for bi in range(max(first_block - 1, 0), after_block):
+        for bj in range(inner.shape[1]):
+            label, squared = inner[bi, bj], blocks.squared[bi, bj]
+            if label == 0:
+                continue
+            variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+            # No pixel is farther off than all together.
+            left = squares_left(blocks.moments[bi, bj], theta[label])
+            explained[bi, bj] = left <= _OUTLIER**2 * variance
+            if explained[bi, bj] and bi >= first_block:
+                count[0, label] += int(blocks.moments[bi, bj, COUNT])
     for i in range(first, after):
         above, below = max(i - _RIM, 0), min(i + _RIM, height - 1)
-        for j in range(width):
+        within = explained[i // BLOCK]
+        j = -1
+        while j + 1 < width:
+            j += 1
+            if within[j // BLOCK]:
+                j = (j // BLOCK + 1) * BLOCK - 1
+                continue
             label = int(labels[i, j])
             y = float(inverse[i, j])
             if label == 0 or y == 0:
@@ -275,21 +350,23 @@ def _doubtful(
             ray, plane = rays[i, j], theta[label]
             residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
             squared = y * y
-            left, right = max(j - _RIM, 0), min(j + _RIM, width - 1)
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             if residual * residual > _OUTLIER**2 * variance:
                 count[1, label] += 1
                 sums = outlying
-            elif (
-                labels[above, left] != label
-                or labels[above, right] != label
-                or labels[below, left] != label
-                or labels[below, right] != label
-            ):
+            elif inner[i // BLOCK, j // BLOCK] > 0:
+                continue
+            else:
+                left, right = max(j - _RIM, 0), min(j + _RIM, width - 1)
+                if (
+                    labels[above, left] == label
+                    and labels[above, right] == label
+                    and labels[below, left] == label
+                    and labels[below, right] == label
+                ):
+                    continue
                 count[2, label] += 1
                 sums = rim
-            else:
-                continue
             record = sums[_index(cells, label, i, j)]
             _add(record, i, j, j + 1, inverse, rays, sensor, central)
     return count, outlying, rim

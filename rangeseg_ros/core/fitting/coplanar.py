@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import pairs
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Pairs of regions and how much links them, see `touching`.
@@ -51,6 +52,7 @@ def touching(
     regions: NDArray[np.uint16],
     grid: Grid,
     count: int,
+    inner: NDArray[np.uint16],
 ) -> Stretches:
     """Where regions touch, and whether jumps are between them.
 
@@ -61,6 +63,8 @@ def touching(
     grid : Grid
     count : int
         M + 1.
+    inner : (rows, columns) uint16
+        Not 0 for blocks without a border, see `interior`.
 
     Returns
     -------
@@ -76,8 +80,11 @@ def touching(
     pairs.clear()
     balance.clear()
     for i in range(height):
+        within = inner[i // BLOCK]
         for j in range(width):
             k = int(regions[i, j])
+            if k == 0 or within[j // BLOCK] > 0:
+                continue
             for axis in range(2):
                 if axis == 0:
                     m = int(regions[i, j + 1]) if j + 1 < width else k

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells
+from rangeseg_ros.core.fitting.interior import interior
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
     systematic_field,
     theta_covariances,
 )
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -46,6 +48,8 @@ class Fits(NamedTuple):
     sensor : SensorModel
     systematic : Field
         Its systematic errors.
+    inner : (rows, columns) uint16
+        Region of each block of 4 x 4 pixels inside it, see `interior`.
     """
 
     cells: Cells
@@ -59,9 +63,16 @@ class Fits(NamedTuple):
     covariance: NDArray[np.float64]
     sensor: SensorModel
     systematic: Field
+    inner: NDArray[np.uint16]
 
     @classmethod
-    def of(cls, labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> Fits:
+    def of(
+        cls,
+        labels: NDArray[np.uint16],
+        image: RangeImage,
+        sensor: SensorModel,
+        blocks: Blocks | None = None,
+    ) -> Fits:
         """Fit a plane to every region.
 
         Weighted least squares in inverse range, where a plane is linear and the error of a
@@ -79,18 +90,25 @@ class Fits(NamedTuple):
             (H, W).
         sensor : SensorModel
             Errors of the image.
+        blocks : Blocks, optional
+            Of the image, where they are known.
         """
-        cells = Cells.of(labels, image, sensor)
+        inner = interior(labels)
+        blocks = blocks or Blocks.of(image)
+        cells = Cells.of(labels, image, sensor, blocks, inner)
         sums = cells.regions()
         pixels = sums[:, COUNT].astype(np.intp)
-        cells, outliers, explained = cells.without_doubtful(labels, image, _theta(sums), sensor)
+        cells, outliers, explained = cells.without_doubtful(
+            labels, image, _theta(sums), sensor, blocks
+        )
         sums = cells.regions()
         theta, inverse = _solved(sums, image.camera is not None)
         covariance = theta_covariances(cells, theta, inverse, sensor)
         systematic = systematic_field(sensor)
         parts, start = np.arange(len(theta)), np.arange(len(theta) + 1)
         counts = pixels, outliers, explained
-        return cls(cells, parts, start, *counts, theta, inverse, covariance, sensor, systematic)
+        planes = theta, inverse, covariance
+        return cls(cells, parts, start, *counts, *planes, sensor, systematic, inner)
 
     def united(self, group: NDArray[np.integer], central: bool) -> Fits:
         """Planes of regions united to groups.
@@ -121,6 +139,7 @@ class Fits(NamedTuple):
             theta=theta,
             inverse=inverse,
             covariance=inverse @ middle @ inverse,
+            inner=group.astype(np.uint16)[self.inner],
         )
 
     def regions_of_parts(self) -> NDArray[np.intp]:

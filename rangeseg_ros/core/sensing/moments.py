@@ -50,6 +50,15 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
 
 
 @njit(cache=True)
+def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """Weighted sum of the squared residuals that a plane theta (3,) leaves of moments (13,)."""
+    a, b, c = theta[0], theta[1], theta[2]
+    square = a * (a * moments[0] + 2 * (b * moments[1] + c * moments[2]))
+    square += b * (b * moments[3] + 2 * c * moments[4]) + c * c * moments[5]
+    return moments[CHI2] - 2 * (a * moments[6] + b * moments[7] + c * moments[8]) + square
+
+
+@njit(cache=True)
 def common_residual(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
     """Weighted sum of the squared residuals of one plane for two moment vectors (13,).
 
