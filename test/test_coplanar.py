@@ -63,6 +63,42 @@ def test_faces_that_meet_in_a_crease_stay_apart():
     assert groups(regions, inverse, linked()) == [0, 1, 2]
 
 
+def framed(rows, columns):
+    """Region 1 with a region 2 in it."""
+    regions = np.ones(CAMERA.shape, np.uint16)
+    regions[rows, columns] = 2
+    return regions
+
+
+def test_a_dent_is_a_part_of_the_plane_around_it():
+    """Steeper than any crease, but neither before nor behind it."""
+    regions = framed(slice(50, 70), slice(60, 80))
+    tilt = 0.3 * (CAMERA.rays[..., 0] - CAMERA.rays[60, 70, 0])
+    inverse = (inverse_range(WALL) + (regions == 2) * tilt).astype(np.float32)
+    assert groups(regions, inverse, linked()) == [0, 1, 1]
+    # In a corner of the image, it lies in the wall along half of its outline.
+    corner = framed(slice(100, 120), slice(140, 160))
+    tilt = 0.3 * (CAMERA.rays[..., 0] - CAMERA.rays[110, 150, 0])
+    inverse = (inverse_range(WALL) + (corner == 2) * tilt).astype(np.float32)
+    assert groups(corner, inverse, linked()) == [0, 1, 2]
+
+
+def test_a_picture_on_a_wall_is_none_of_its_dents():
+    regions = framed(slice(50, 70), slice(60, 80))
+    inverse = (inverse_range(WALL) + (regions == 2) * 8 * KINECT.distortion).astype(np.float32)
+    assert groups(regions, inverse, linked()) == [0, 1, 2]
+
+
+def test_the_foot_of_a_face_is_no_dent():
+    """Two planes meet along a line, no more than half of the outline."""
+    regions = framed(slice(40, 120), slice(60, 80))
+    tilt = (regions == 2) * 0.3 * (CAMERA.rays[..., 0] - CAMERA.rays[60, 70, 0])
+    inverse = (inverse_range(WALL) + tilt).astype(np.float32)
+    grid = linked()
+    grid.right[40:120, 59] = grid.below[39, 60:80] = 0
+    assert groups(regions, inverse, grid) == [0, 1, 2]
+
+
 def test_a_row_of_parts_does_not_bend_a_plane_round():
     """Each agrees with the next, but not the first with the last."""
     regions = stripes(0, 40, 80, 120, 160)

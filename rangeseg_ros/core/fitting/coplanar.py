@@ -6,10 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.cells import WEIGHT
+from rangeseg_ros.core.fitting.fits import Fits, symmetric
 from rangeseg_ros.core.fitting.uncertainty import pairs
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_variance
 
 # Pairs of regions and how much links them, see `touching`.
 Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -23,6 +26,11 @@ _LIMIT = 11.34 * 2.5
 # that meet there meet in a crease: of 2300 pairs in simulated and real frames, 11 of parts were
 # apart by 0 to 56 (others, of bent or ragged parts, by more), those of faces by 119 at least.
 _TOUCHING_LIMIT = 11.34 * 6.0
+# Share of its outline along which a region lies in another. Two planes meet along a line, and a
+# line is never more than half of an outline.
+_ENCLOSED = 0.6
+# Quantile 0.99 of chi-squared with one degree of freedom.
+_LEVEL = 6.63
 
 
 def common_surfaces(fits: Fits) -> NDArray[np.intp]:
@@ -117,8 +125,10 @@ def _tell(k: int, m: int, links: int, count: int, pairs: list[int], balance: lis
 def parts(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """Group regions that touch and whose planes agree, as `common_surfaces` does.
 
-    Regions touch where jumps cut no more than half of their common border: between a step and
-    what is behind it there may be gaps in the jump.
+    What lies within a region, and on average no higher or deeper, is a part of it however its
+    own plane is tilted: a dent, or what the sensor saw as one. Regions touch where jumps cut no
+    more than half of their common border: between a step and what is behind it there may be gaps
+    in the jump.
 
     Parameters
     ----------
@@ -134,7 +144,28 @@ def parts(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """
     edges, place = np.unique(stretches[0], return_inverse=True)
     links = np.bincount(place, stretches[1], len(edges))
-    return _groups_of_touching(_by_falling_size(fits), fits, edges[links >= 0])
+    around = _around(fits, edges, links)
+    return _groups_of_touching(_by_falling_size(fits), fits, edges[links >= 0], around)
+
+
+def _around(fits: Fits, edges: NDArray[np.intp], links: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Region (M + 1,) that each lies in, neither before nor behind it; 0 for none."""
+    count = len(fits.theta)
+    result = np.zeros(count, np.intp)
+    inner, outer = edges // count, edges % count
+    enclosed = links > _ENCLOSED * fits.cells.border[inner]
+    inner, outer = inner[enclosed], outer[enclosed]
+    theta, sums = fits.theta[outer], fits.explained[inner]
+    normal = symmetric(sums[:, :6])
+    square = np.einsum('na,nab,nb->n', theta, normal, theta)
+    share = np.einsum('na,na->n', theta, sums[:, 6:9]) / np.maximum(square, FLOOR) - 1
+    level = square / np.maximum(sums[:, WEIGHT], FLOOR)
+    doubt = fits.sensor.agreement / np.maximum(sums[:, COUNT], 1)
+    variance = systematic_variance(fits.sensor, level)
+    variance += doubt * random_variance(fits.sensor, level)
+    same = share**2 * level < _LEVEL * variance
+    result[inner[same]] = outer[same]
+    return result
 
 
 def _by_falling_size(fits: Fits) -> NDArray[np.intp]:
@@ -159,12 +190,16 @@ def _groups(order: NDArray[np.intp], fits: Fits) -> NDArray[np.intp]:
 
 @njit(cache=True)
 def _groups_of_touching(
-    order: NDArray[np.intp], fits: Fits, edges: NDArray[np.intp]
+    order: NDArray[np.intp], fits: Fits, edges: NDArray[np.intp], around: NDArray[np.intp]
 ) -> NDArray[np.intp]:
     count = len(fits.theta)
     group = np.zeros(count, np.intp)
     start = np.searchsorted(edges, np.arange(count + 1) * count)
     for k in order:
+        # 0 while the region around, then the smaller one, has had no turn.
+        group[k] = group[around[k]]
+        if group[k] > 0:
+            continue
         group[k] = k
         least = _TOUCHING_LIMIT
         for edge in edges[start[k] : start[k + 1]]:
