@@ -5,12 +5,15 @@ import struct
 import cv2
 import numpy as np
 from rosbags import rosbag1, rosbag2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+TF, EARLY_TF = 'tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage'
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
+for tf in (TF, EARLY_TF):
+    ROS1.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', tf))
 ROS2 = get_typestore(Stores.ROS2_JAZZY)
 SUFFIXES = {'mcap': '', 'sqlite3': '', 'rosbag1': '.bag'}
 
@@ -88,6 +91,20 @@ class Recording:
             **matrices,
         )
         self.messages.append((stamp, topic, CAMERA_INFO, message))
+
+    def add_transform(self, stamp, parent, child, rotation, shift, kind=TF, static=False):
+        """A transform of one moment, or for all; rotation x, y, z, w."""
+        types = self.store.types
+        fields = dict(zip('xyzw', rotation, strict=True)), dict(zip('xyz', shift, strict=True))
+        transform = types['geometry_msgs/msg/Transform'](
+            rotation=types['geometry_msgs/msg/Quaternion'](**fields[0]),
+            translation=types['geometry_msgs/msg/Vector3'](**fields[1]),
+        )
+        stamped = types['geometry_msgs/msg/TransformStamped'](
+            header=self.header(stamp, parent), child_frame_id=child, transform=transform
+        )
+        message = types[kind](transforms=[stamped])
+        self.messages.append((stamp, '/tf_static' if static else '/tf', kind, message))
 
     def write(self, path, storage='mcap'):
         """Write all messages; the file that holds them."""

@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from rangeseg_ros.io.chunks import Lost, Record
@@ -16,12 +16,19 @@ IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+EARLY_TRANSFORMS = 'tf/msg/tfMessage'
+"""Of ROS 1, until its nodes used tf2."""
 
 
 @cache
 def message_types(distribution: Stores) -> Typestore:
     """Message types of a ROS distribution; compiled once, at their first use."""
-    return get_typestore(distribution)
+    store = get_typestore(distribution)
+    if distribution is Stores.ROS1_NOETIC:
+        # `rosbags` has them for ROS 2 only.
+        for kind in (TRANSFORMS, EARLY_TRANSFORMS):
+            store.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', kind))
+    return store
 
 
 def make_rosbags(kind: str, **fields: Any) -> Any:

@@ -8,12 +8,12 @@ from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
 from rangeseg_ros.io.chunks import Lost
+from rangeseg_ros.io.message_types import EARLY_TRANSFORMS, TRANSFORMS
 from rangeseg_ros.io.recordings import open_recording
 from rangeseg_ros.messages.transforms import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'
-# The latter in recordings of early ROS 1.
-TYPES = ('tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage')
+TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
 
 
 class RecordedTransforms:

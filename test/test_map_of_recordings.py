@@ -1,0 +1,109 @@
+"""From a recording with tf to the map of planes: every format, poses in files, the command."""
+
+import csv
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from recordings import EARLY_TF, SUFFIXES, TF, Recording
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.batch.replay import Replay
+from rangeseg_ros.cli.main import rangeseg
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
+
+FRAMES, STEP = 6, 0.05
+FOCAL, WIDTH, HEIGHT = 50.0, 64, 48
+WALL, ABOVE = 2.0, 1.0
+# Optical axes, 35 degrees down, in a frame with x forward and z up.
+OPTICAL = Rotation.from_euler('y', 35, degrees=True) * Rotation.from_matrix(OPTICAL_IN_BODY)
+
+
+def depth(k):
+    """Of a wall at x = WALL and the ground at z = 0, STEP nearer to the wall every time."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.stack([(u - 31.5) / FOCAL, (v - 23.5) / FOCAL, np.ones(u.shape)], axis=-1)
+    ahead, _, up = np.moveaxis(rays @ OPTICAL.as_matrix().T, -1, 0)
+    ground = np.where(up < 0, -ABOVE / np.minimum(up, -1e-9), np.inf)
+    return np.round(1000 * np.minimum(ground, (WALL - STEP * k) / ahead)).astype(np.uint16)
+
+
+def stamp_of(k):
+    return 10**18 + k * 100_000_000
+
+
+def check(folder):
+    """Both planes, where they are in the fixed frame."""
+    with (folder / 'map.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    found = {
+        tuple(round(float(row[f'normal_{axis}']), 1) + 0.0 for axis in 'xyz'): row for row in rows
+    }
+    assert set(found) == {(-1, 0, 0), (0, 0, 1)}
+    wall, ground = found[-1, 0, 0], found[0, 0, 1]
+    assert float(wall['distance']) == pytest.approx(WALL, abs=0.02)
+    assert float(ground['distance']) == pytest.approx(0, abs=0.02)
+    assert wall['role'] == 'wall' and ground['role'] == 'floor'
+    for row in rows:
+        assert int(row['observations']) == FRAMES
+        assert int(row['last_stamp']) - int(row['first_stamp']) == (FRAMES - 1) * 10**8
+    assert (folder / 'map.ply').read_bytes().startswith(b'ply')
+
+
+@pytest.mark.parametrize(
+    ('storage', 'kind'),
+    [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)],
+)
+def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
+    recording = Recording(ros1=storage == 'rosbag1')
+    recording.add_transform(
+        10**18, 'base_link', 'optical', OPTICAL.as_quat(), (0, 0, ABOVE), kind, static=True
+    )
+    for k in range(FRAMES):
+        stamp = stamp_of(k)
+        recording.add_camera(stamp)
+        recording.add_image(stamp, depth(k))
+        # Between samples, so that they are interpolated.
+        for after in (-20_000_000, 20_000_000):
+            x = STEP * (k + after * 1e-8)
+            recording.add_transform(
+                stamp + after, 'odom', 'base_link', (0, 0, 0, 1), (x, 0, 0), kind
+            )
+    recording.messages.sort(key=lambda message: message[0])
+    path = tmp_path / f'recording{SUFFIXES[storage]}'
+    recording.write(path, storage)
+    config = Config(fixed_frame='odom', gravity_frame='odom', min_pixels=100)
+    outcome = Replay(path, tmp_path / 'out', config).run()
+    assert outcome.mapped == 2 and not outcome.unlocated
+    check(tmp_path / 'out')
+
+
+def test_poses_in_files_become_a_map(tmp_path):
+    images, poses = tmp_path / 'images', tmp_path / 'poses'
+    for folder in (images, poses):
+        folder.mkdir()
+    for k in range(FRAMES):
+        cv2.imwrite(str(images / f'frame-{k:04d}.depth.png'), depth(k))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = OPTICAL.as_matrix(), (STEP * k, 0, ABOVE)
+        np.savetxt(poses / f'frame-{k:04d}.pose.txt', pose)
+    (tmp_path / 'camera.yaml').write_text(
+        f'image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {{rows: 3, cols: 3, data: '
+        f'[{FOCAL}, 0, 31.5, 0, {FOCAL}, 23.5, 0, 0, 1]}}\n'
+    )
+    (tmp_path / 'p.yaml').write_text('min_pixels: 100\ngravity_frame: world\n')
+
+    def run(*words):
+        result = CliRunner().invoke(rangeseg, list(map(str, words)))
+        assert result.exit_code == 0, result.output
+        return result.output
+
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    camera = tmp_path / 'camera.yaml'
+    run('pack', images, '--camera', camera, '--poses', poses, '--rate', 10, '--output', bag)
+    options = '--fixed-frame', 'world', '--params', tmp_path / 'p.yaml'
+    told = run('replay', bag, *options, '--output', out)
+    assert f'{FRAMES} frames, 2 planes in the map' in told
+    check(out)
