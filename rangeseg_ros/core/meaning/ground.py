@@ -154,19 +154,22 @@ def _terrain(
     # Little pieces among the ground are its noise.
     verdict = np.full(count + 1, GROUND, np.int8)
     verdict[0] = UNKNOWN
-    verdict[large] = np.where(side > 0, OBSTACLE, DROP)
+    error = _CERTAIN * noise * cells.error[..., None]
+    # A surface of far cells is as sure as each of them, as their errors are alike.
+    sure = [-side[n] > np.median(error[surface == k, -1]) for n, k in enumerate(large)]
+    verdict[large] = np.where(side > 0, OBSTACLE, np.where(sure, DROP, UNKNOWN))
     verdict[level] = GROUND
     said = np.where(ground, GROUND, verdict[surface]).astype(np.int8)
-    error = _CERTAIN * noise * cells.error[..., None]
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = np.maximum(error[..., 0], (1 - _EXCUSED) * least)
     foot = _feet(cell_heights(cells, field, size), steep, rise, steps.least, turned)
     said[foot] = OBSTACLE
-    doubt = np.minimum(error[..., -1], _EXCUSED * least).astype(np.float32)
+    unsure = error[..., -1].astype(np.float32)
+    doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
     classes = np.zeros(image.shape, np.uint8)
     heights = np.full(image.shape, np.nan, np.float32)
     bounds = limits.obstacle / 2, limits.drop / 2
-    strips(_classify, len(said), image.inverse, image.rays, field, size, said, doubt, bounds,
+    strips(_classify, len(said), image.inverse, image.rays, field, size, said, doubt, unsure, bounds,
            classes, heights)  # fmt: skip
     return Terrain(classes, heights, under, field)
 
@@ -262,6 +265,7 @@ def _classify(
     size: CellSize,
     said: NDArray[np.int8],
     doubt: NDArray[np.float32],
+    unsure: NDArray[np.float32],
     bounds: tuple[float, float],
     classes: NDArray[np.uint8],
     heights: NDArray[np.float32],
@@ -270,7 +274,8 @@ def _classify(
 
     `said` is what is known of a cell: obstacles and drops as a whole, or that it is ground, which
     only heights beyond `doubt` contradict. For what is lower or higher than half of the least
-    obstacle or drop (`bounds`), the other one is less probable. Eleven parameters, as a kernel
+    obstacle or drop (`bounds`), the other one is less probable; what lies no deeper than `unsure`,
+    the noise, is no ground, and not claimed to be a drop. Twelve parameters, as a kernel
     cannot return what several threads write.
     """
     line = np.empty((field.theta.shape[1], 4))
@@ -294,7 +299,7 @@ def _classify(
             elif height > bounds[0]:
                 classes[i, j] = OBSTACLE
             elif height < -bounds[1]:
-                classes[i, j] = DROP
+                classes[i, j] = DROP if height < -unsure[row, c] else UNKNOWN
             else:
                 classes[i, j] = GROUND
 
