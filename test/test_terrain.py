@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resized
@@ -165,6 +166,54 @@ def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
              for line in outlines(image, result.ground)]  # fmt: skip
     edge = np.concatenate(lines)
     assert (np.abs(edge[:, 0] - 1.5) < 0.06).sum() > 1
+
+
+def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
+    """Nor is a table the floor, nor a landing that is seen for a moment."""
+    floor = Piece(FLOOR, GROUND)
+    table = Piece(box((3.0, 6, 0.5), np.eye(3), (1.9, 0, 0.25)), OBSTACLE, 0.5)
+    landing = Piece(slab(-3, 12, -0.5, -0.5, ALL), DROP, 0.5)
+    wall = Piece(box((1, 20, 12), np.eye(3), (1.4, 0, 0)), OBSTACLE, 4.0)
+    views = {
+        name: scene(*pieces, pitch=pitch)
+        for name, pieces, pitch in (
+            ('floor', (floor,), 35),
+            ('table', (table, floor), 35),
+            ('wall', (wall, floor), 0),
+            ('landing', (landing,), 35),
+        )
+    }
+    images = {
+        name: RangeImage.from_depth(simulate_terrain(view, Kinect(), CAMERA).depth, CAMERA)
+        for name, view in views.items()
+    }
+    ups = {name: view.up for name, view in views.items()}
+    sequence = SequenceSegmenter(Config())
+
+    def ground_at(name, second):
+        return sequence.segment(images[name], int(1e9 * second), ups[name]).ground
+
+    def share(name, second, class_):
+        return (ground_at(name, second).classes[images[name].valid] == class_).mean()
+
+    # Of itself, each of them is the ground.
+    for name in ('table', 'landing', 'floor'):
+        assert share(name, 0.0, GROUND) > 0.95
+        sequence = SequenceSegmenter(Config())
+    assert share('floor', 1.0, GROUND) > 0.95
+    assert share('table', 1.1, OBSTACLE) > 0.9
+    assert share('landing', 1.2, GROUND) < 0.01
+    assert share('wall', 1.3, OBSTACLE) > 0.95
+    hidden = ground_at('wall', 1.4)
+    assert hidden.remembered == pytest.approx(HEIGHT, abs=0.03)
+    assert str(hidden).startswith('no ground in view: it was')
+    assert share('floor', 1.5, GROUND) > 0.95
+    # A table is an obstacle however long it is seen, a deeper level in the end the ground.
+    assert share('table', 30.0, GROUND) < 0.1
+    assert share('landing', 31.0, GROUND) < 0.01
+    assert share('landing', 35.0, GROUND) > 0.95
+    # Where time begins anew, nothing is known.
+    assert share('table', 0.0, GROUND) > 0.95
 
 
 def test_a_view_without_floor_has_no_ground():

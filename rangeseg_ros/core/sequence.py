@@ -14,6 +14,7 @@ from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.meaning.memory import GroundMemory
 from rangeseg_ros.core.meaning.roles import roles, unit
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.meaning.tilt import tilt_of
@@ -47,6 +48,7 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config.odometry_frame)
+        self._ground = GroundMemory(self.config.track_time)
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -66,6 +68,7 @@ class SequenceSegmenter:
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config.odometry_frame), None
         self.map.config = config
+        self._ground.patience = config.track_time
 
     def segment(
         self,
@@ -94,6 +97,7 @@ class SequenceSegmenter:
             self._segmenter.reset()
             self._tracker.reset()
             self.map.clear('time has gone back')
+            self._ground.forget()
             self._pose = None
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
@@ -117,6 +121,8 @@ class SequenceSegmenter:
             tilt = tilt_of(planes, survey.up, config.role_tolerance, config.role_area)
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
+        if isinstance(survey, Survey):
+            survey = replace(survey, memory=self._ground, stamp=stamp)
         return replace(result, planes=planes, survey=survey, tilt=tilt)
 
     def _follow(

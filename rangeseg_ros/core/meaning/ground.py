@@ -68,17 +68,21 @@ class Terrain(NamedTuple):
         The ground under the robot.
     field : GroundField
         The ground continued everywhere; zeros where none is known.
+    remembered : float
+        How far below the camera the ground was, metres, when it is out of view; 0 for unknown.
     """
 
     classes: NDArray[np.uint8]
     height: NDArray[np.float32]
     stand: Stand
     field: GroundField
+    remembered: float = 0.0
 
     def __str__(self) -> str:
         """Where the ground is and how sure that is, in a few words."""
         if not self.stand.surface:
-            return 'no ground'
+            where = f': it was {self.remembered:.2f} m below' if self.remembered else ''
+            return f'no ground in view{where}'
         height = self.stand.height(self.field.up)
         return f'ground {height:.2f} m below, confidence {self.stand.confidence:.2f}'
 
@@ -169,8 +173,8 @@ def _terrain(
     classes = np.zeros(image.shape, np.uint8)
     heights = np.full(image.shape, np.nan, np.float32)
     bounds = limits.obstacle / 2, limits.drop / 2
-    strips(_classify, len(said), image.inverse, image.rays, field, size, said, doubt, unsure, bounds,
-           classes, heights)  # fmt: skip
+    strips(_classify, len(said), image.inverse, image.rays, field, size, said, doubt, unsure,
+           bounds, classes, heights)  # fmt: skip
     return Terrain(classes, heights, under, field)
 
 

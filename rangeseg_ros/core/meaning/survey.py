@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
+from rangeseg_ros.core.meaning.memory import GroundMemory
 from rangeseg_ros.core.meaning.roles import unit
 from rangeseg_ros.core.meaning.under_robot import HEIGHT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -28,6 +29,10 @@ class Survey:
     sensor_height : float
         Above the ground below the sensor, metres; 0 = unknown.
     limits : Limits
+    memory : GroundMemory, optional
+        Of the images before, for a height that is unknown.
+    stamp : int
+        When the image was taken, nanoseconds.
     """
 
     image: RangeImage
@@ -35,6 +40,8 @@ class Survey:
     up: NDArray[np.float64]
     sensor_height: float
     limits: Limits
+    memory: GroundMemory | None = None
+    stamp: int = 0
 
     @classmethod
     def of(
@@ -49,5 +56,11 @@ class Survey:
 
     def terrain(self) -> Terrain:
         """Find it."""
-        known = (self.sensor_height, HEIGHT) if self.sensor_height > 0 else (0.0, 0.0)
+        if self.sensor_height > 0:
+            return self._found((self.sensor_height, HEIGHT))
+        if self.memory is None:
+            return self._found((0.0, 0.0))
+        return self.memory.terrain(self._found, self.stamp)
+
+    def _found(self, known: tuple[float, float]) -> Terrain:
         return terrain_of(self.image, self.sensor, self.up, known, self.limits)
