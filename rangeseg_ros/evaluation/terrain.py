@@ -17,6 +17,12 @@ from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.label_files import EvaluationError, read_label_image
+from rangeseg_ros.evaluation.stairs import (
+    StairsCheck,
+    check_stairs,
+    stairs_figures,
+    stairs_line,
+)
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image
@@ -72,12 +78,14 @@ class Shares(NamedTuple):
     found : dict
         (height of the obstacle: index in `SIZES`, distance in whole metres) to pixels of
         obstacles, and how many of them were found.
+    stairs : StairsCheck
     """
 
     name: str
     kind: str
     pixels: NDArray[np.int64]
     found: dict[tuple[int, int], tuple[int, int]]
+    stairs: StairsCheck
 
 
 @dataclass(frozen=True)
@@ -104,11 +112,13 @@ class TerrainTask:
         name, reach = self.row['name'], REACH.get(self.row['sensor'], 3.5)
         depth = read_depth(self.folder / 'depth' / f'{name}.png')
         truth = read_label_image(self.folder / 'truth' / f'{name}.png').astype(np.uint8)
-        size, crossing = (
-            read_depth(self.folder / part / f'{name}.tiff') for part in ('size', 'crossing')
+        size, crossing, height = (
+            read_depth(self.folder / part / f'{name}.tiff')
+            for part in ('size', 'crossing', 'height')
         )
         image = RangeImage.from_depth(depth, read_camera(self.folder / 'camera.yaml'))
-        found = Segmenter(self.config).segment(corrected(image, self.config)).terrain
+        result = Segmenter(self.config).segment(corrected(image, self.config))
+        found, stairs = result.terrain, check_stairs(self.row, height, result.stairs)
         metres = np.where(truth == DROP, crossing, depth / 1000)
         judged = (truth > UNKNOWN) & (metres <= reach) & ~_near_borders(truth)
         pixels = np.zeros((4, 4), np.int64)
@@ -124,7 +134,7 @@ class TerrainTask:
             wrong = judged & (found != truth)
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
             write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
-        return Shares(name, self.row['kind'], pixels, table)
+        return Shares(name, self.row['kind'], pixels, table, stairs)
 
 
 _COLOURS = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [0, 0, 240]], np.uint8)
@@ -196,6 +206,7 @@ def terrain_figures(images: Sequence[Shares]) -> dict[str, Any]:
         'pooled': shares(_pooled(images)),
         'by_kind': {kind: shares(_pooled(i for i in images if i.kind == kind)) for kind in kinds},
         'by_size': _by_size(images),
+        'stairs': stairs_figures([image.stairs for image in images]),
         'per_image': {i.name: {'kind': i.kind, **shares(i.pixels)} for i in images},
         'drop_scenes_above_0.01': [
             i.name for i in images if shares(i.pixels)['drop_called_ground'] > 0.01
@@ -232,7 +243,7 @@ def terrain_table(figures: Mapping[str, Any]) -> str:
     lines.append('obstacles found, from this height (m) on, at 0, 1, 2, 3 m:')
     for least, row in figures['by_size'].items():
         lines.append(f'{least:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))
-    return '\n'.join(lines)
+    return '\n'.join([*lines, stairs_line(figures['stairs'])])
 
 
 def _share(value: float) -> str:

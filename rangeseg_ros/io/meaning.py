@@ -17,9 +17,9 @@ STAIRS = (
 )
 """Columns of stairs: ends of the first edge in the frame of the image; metres."""
 GROUND = ('found', 'height', 'confidence', 'tilt')
-"""Columns of the ground: whether one is found, how far below the camera it is, or was when it is out
-of view, metres, how likely it is the floor that the robot stands on, and degrees between the stated
-up and that of the planes, 0 where they agree."""
+"""Columns of the ground: whether one is found, how far below the camera it is, or was when it is
+out of view, metres, how likely it is the floor that the robot stands on, and degrees between the
+stated up and that of the planes, 0 where they agree."""
 
 
 def stairs_row(stairs: Stairs) -> list[str]:

@@ -1,0 +1,95 @@
+"""Stairs measured against the truth of simulated scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.meaning.stairs import Stairs
+
+# Pixels from which a tread counts as in sight, and metres that its pixels are off its height.
+_FEWEST, _OFF = 300, 0.005
+# Fewer treads in sight are a step or a drop.
+_LEAST = 2
+
+
+class StairsCheck(NamedTuple):
+    """The staircase of one scene, and what was found of it.
+
+    Attributes
+    ----------
+    in_sight : int
+        Treads of the true one in sight; 0 where there are no stairs.
+    found : (int, float, float) or None
+        Treads, and errors of rise and run, metres; None where it was not found.
+    false : int
+        Number of staircases found that are not there.
+    """
+
+    in_sight: int
+    found: tuple[int, float, float] | None
+    false: int
+
+
+def check_stairs(
+    row: Mapping[str, str], height: NDArray[np.float32], found: Sequence[Stairs]
+) -> StairsCheck:
+    """Compare stairs with the truth.
+
+    Parameters
+    ----------
+    row : mapping
+        Of the table of the scenes: `direction`, `count`, `rise`, `run`, empty without stairs.
+    height : (H, W) float32
+        True height above the ground, metres; NaN where nothing is measured.
+    found : sequence of Stairs
+    """
+    true = row.get('direction', '')
+    false = sum(stairs.direction != true for stairs in found)
+    if not true:
+        return StairsCheck(0, None, false)
+    rise, run = float(row['rise']), float(row['run'])
+    levels = rise * np.arange(1, int(row['count']) + 1) * (1 if true == 'up' else -1)
+    in_sight = sum(int((np.abs(height - level) < _OFF).sum() >= _FEWEST) for level in levels)
+    for stairs in found:
+        if stairs.direction == true:
+            return StairsCheck(
+                in_sight, (stairs.count, stairs.rise - rise, stairs.run - run), false
+            )
+    return StairsCheck(in_sight, None, false)
+
+
+def stairs_figures(checks: Sequence[StairsCheck]) -> dict[str, Any]:
+    """Figures over scenes; those with fewer than two treads in sight need not be found."""
+    there = [check for check in checks if check.in_sight >= _LEAST]
+    found = [(check.in_sight, *check.found) for check in there if check.found]
+    table = np.array(found, np.float64).reshape(-1, 4)
+    with np.errstate(invalid='ignore'):
+        middle = np.median(np.abs(table[:, 2:]), axis=0) if len(table) else np.full(2, np.nan)
+    return {
+        'scenes_with_stairs': len(there),
+        'found': len(found),
+        'treads_in_sight': int(table[:, 0].sum()),
+        'treads_found': int(table[:, 1].sum()),
+        'count_within_1': int((np.abs(table[:, 0] - table[:, 1]) <= 1).sum()),
+        'median_rise_error': float(middle[0]),
+        'median_run_error': float(middle[1]),
+        'largest_rise_error': float(np.abs(table[:, 2]).max(initial=0)),
+        'largest_run_error': float(np.abs(table[:, 3]).max(initial=0)),
+        'false_alarms': sum(check.false for check in checks),
+        'scenes_without_stairs': sum(not check.in_sight for check in checks),
+    }
+
+
+def stairs_line(figures: Mapping[str, Any]) -> str:
+    """Text of `stairs_figures`."""
+    f = figures
+    return (
+        f'stairs: {f["found"]} of {f["scenes_with_stairs"]} found, {f["treads_found"]} of their '
+        f'{f["treads_in_sight"]} treads in sight; median error of rise '
+        f'{1000 * f["median_rise_error"]:.0f} mm, of run {1000 * f["median_run_error"]:.0f} mm; '
+        f'{f["false_alarms"]} false alarms, {f["scenes_without_stairs"]} scenes without stairs'
+    )
