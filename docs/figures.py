@@ -36,7 +36,8 @@ from rangeseg_ros.io.params import read_config
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.terrain import simulate_terrain, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 
 ROOT = Path(__file__).parents[1]
 WIDTH = 360

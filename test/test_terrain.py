@@ -15,16 +15,9 @@ from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resized
 from rangeseg_ros.simulation.solids import box
-from rangeseg_ros.simulation.terrain import (
-    ALL,
-    KINDS,
-    Piece,
-    Terrain,
-    simulate_terrain,
-    slab,
-    stated,
-    terrain_scene,
-)
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.scene import ALL, Piece, Terrain, slab
 
 CAMERA = resized(Kinect().camera, 320, 240)
 HEIGHT = 1.0

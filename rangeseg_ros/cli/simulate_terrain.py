@@ -12,7 +12,8 @@ from rangeseg_ros.evaluation.terrain import TerrainTable
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.terrain import KINDS, simulate_terrain, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 
 
 @click.command('terrain')
