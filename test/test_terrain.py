@@ -155,6 +155,14 @@ def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
     inside = (world[:, 0] > 1.45) & (world[:, 0] < 2.3)
     assert inside.sum() > 500 and np.isnan(points[:, 3]).all()
     assert np.abs(world[inside, 2]).max() < 0.05
+    # A cloud does not say where it looked: what it saw around tells.
+    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
+    cloud = RangeImage.from_points(image.points)
+    others = unseen(cloud, Segmenter(config).segment(cloud).ground)
+    there = others[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
+    within = (there[:, 0] > 1.45) & (there[:, 0] < 2.3)
+    assert within.sum() > 0.8 * inside.sum() and np.abs(there[within, 2]).max() < 0.05
     lines = [line @ terrain.pose.rotation.T + terrain.pose.position
              for line in outlines(image, result.ground)]  # fmt: skip
     edge = np.concatenate(lines)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numba import njit
@@ -12,6 +14,7 @@ from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.ground_field import GroundField, plane_at
 from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.rays import completed_rays
 
 # Pixels that an outline may differ from the border of the ground.
 _TOLERANCE = 2.0
@@ -53,16 +56,24 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
 
     As far as ground is seen and not nearer: no sensor sees below its own nearest or farthest
     range. Not where the robot's own body is in the way. Single pixels do not count: sensors miss
-    some everywhere. None for clouds, which do not tell the rays of what they have not measured.
+    some everywhere. Clouds do not tell the rays of what they have not measured: those between
+    measured points, where their grid is smooth (see `completed_rays`).
     """
     seen = terrain.classes == GROUND
     missing = ~image.valid if image.body is None else ~(image.valid | image.body)
     opened = cv2.morphologyEx(missing.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if image.camera is None or not seen.any():
+    if not seen.any():
         return np.zeros((0, 4), np.float32)
+    if image.camera is None:
+        completed = completed_rays(image)
+        if completed is None:
+            return np.zeros((0, 4), np.float32)
+        image = replace(image, rays=completed[0])
+        opened[~completed[1]] = 0
     found = crossings(image, terrain, opened > 0)
     nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
-    depth = found[:, 2]
+    # Clouds measure along their rays, images along the optical axis.
+    depth = found[:, 2] if image.camera else np.linalg.norm(found[:, :3], axis=1)
     return found[(depth >= nearest) & (depth <= farthest)]
 
 

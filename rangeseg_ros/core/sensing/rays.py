@@ -1,0 +1,80 @@
+"""Rays of pixels that measured nothing, where an image does not tell them.
+
+A cloud has points, and no rays where there are none. Those of a camera or a scanner change so
+smoothly over its grid that a polynomial through those that are known tells the others.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# Degree of the polynomial: unit vectors over 120 degrees, to a hundredth of a pixel.
+_DEGREE = 6
+# Rows and columns of the grid of pixels that it is fitted to, at most.
+_GRID = 80
+# Largest error, in pixels, of a grid that is smooth.
+_SMOOTH = 0.5
+
+
+def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+    """Rays of all pixels between measured ones; None where the grid of rays is not smooth.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W), of a cloud.
+
+    Returns
+    -------
+    rays : (H, W, 3) float32
+        Those of the image where it has measured, unit vectors elsewhere.
+    between : (H, W) bool
+        Pixels with measured ones on either side, in their row or column: beyond these, a
+        polynomial goes anywhere.
+    """
+    valid = image.valid
+    steps = [max(size // _GRID, 1) for size in image.shape]
+    rows, columns = np.nonzero(valid[:: steps[0], :: steps[1]])
+    rows, columns = rows * steps[0], columns * steps[1]
+    if len(rows) < 10 * (_DEGREE + 1) ** 2:
+        return None
+    known = image.rays[rows, columns].astype(np.float64)
+    basis = _basis(rows, columns, image.shape)
+    coefficients = np.linalg.lstsq(basis, known, rcond=None)[0]
+    error = np.linalg.norm(basis @ coefficients - known, axis=1)
+    beside = valid[:, 1:] & valid[:, :-1]
+    if not beside.any():
+        return None
+    pixel = np.median(np.linalg.norm(np.diff(image.rays, axis=1)[beside], axis=1))
+    if np.quantile(error, 0.95) > _SMOOTH * pixel:
+        return None
+    between = _between(valid) | _between(valid.T).T
+    rows, columns = np.nonzero(between & ~valid)
+    rays = image.rays.copy()
+    found = _basis(rows, columns, image.shape) @ coefficients
+    rays[rows, columns] = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return rays, between
+
+
+def _basis(
+    rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """(N, M) Chebyshev polynomials of both coordinates, up to the degree together."""
+    vander = np.polynomial.chebyshev.chebvander
+    v, u = (
+        vander(2 * x / max(size - 1, 1) - 1, _DEGREE)
+        for x, size in zip((rows, columns), shape, strict=True)
+    )
+    terms = [v[:, i] * u[:, k] for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i)]
+    return np.stack(terms, axis=1)
+
+
+def _between(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels with valid ones on either side in their row."""
+    left = np.logical_or.accumulate(valid, axis=1)
+    right = np.logical_or.accumulate(valid[:, ::-1], axis=1)[:, ::-1]
+    result: NDArray[np.bool_] = left & right
+    return result
