@@ -240,3 +240,26 @@ def test_a_recording_that_fails_costs_no_other(tmp_path, monkeypatch, run):
     assert 'out/a: 2 frames' in output and 'out/c: 2 frames' in output
     page = (tmp_path / 'out/index.html').read_text()
     assert 'a/report.html' in page and 'b/report.html' not in page and 'c/report.html' in page
+
+
+def test_terrain_of_every_frame_is_that_of_the_messages(done):
+    folder = done / 'terrain'
+    outcome = replay(done / 'recording', folder, terrain=True, topics=('terrain', 'stairs'))
+    assert outcome.tilted == 0
+    messages = read(folder / 'bag')
+    images = [m for _, topic, m, _ in messages if topic.endswith('/terrain')]
+    pictures = sorted(folder.glob('*_terrain.png'))
+    assert len(pictures) == len(list(folder.glob('*_height.tiff'))) == 4
+    for image, picture in zip(images, pictures, strict=True):
+        pixels = image.data.reshape(image.height, image.width)
+        np.testing.assert_array_equal(pixels, read_labels(picture))
+    with (folder / 'ground.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ['frame', 'stamp', 'found', 'height', 'confidence', 'tilt']
+    assert [row['frame'] for row in rows] == ['0', '1', '2', '3']
+    # Two walls: no ground, and no stairs.
+    assert {row['found'] for row in rows} == {'0'}
+    assert len((folder / 'stairs.csv').read_text().splitlines()) == 1
+    # Without terrain, none of it stays behind.
+    replay(done / 'recording', folder)
+    assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
