@@ -108,14 +108,15 @@ def _mark(
     """Mark steps in the columns first...after of cells."""
     place, error = cells.place, cells.error
     rows = len(error)
-    for c in range(first, after):
-        for i in range(rows):
+    for i in range(rows):
+        for c in range(first, after):
             chance = _SIGNIFICANT * np.sqrt(2.0) * steps.noise[_HALF] * error[i, c]
             steep[i, c] = cells.kink[i, c, 0] > steps.slope * cells.kink[i, c, 1] + chance
-        for b in range(len(BASELINES)):
-            k = BASELINES[b]
-            factor = _SIGNIFICANT * np.sqrt(2.0) * steps.noise[b]
-            for i in range(rows - k):
+    for b in range(len(BASELINES)):
+        k = BASELINES[b]
+        factor = _SIGNIFICANT * np.sqrt(2.0) * steps.noise[b]
+        for i in range(rows - k):
+            for c in range(first, after):
                 rise = abs(place[i, c, 0] - place[i + k, c, 0])
                 # Also false where one of the two is not measured.
                 if not rise > factor * max(error[i, c], error[i + k, c]):

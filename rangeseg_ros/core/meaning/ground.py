@@ -31,6 +31,8 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Metres of the ground, from where it comes into view, that it is grown from.
 _START = 0.25
+# Cells that tell its plane.
+_PLENTY = 1000
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
 # Share of the least obstacle or drop that no noise excuses.
@@ -158,17 +160,18 @@ def _terrain(
     # Little pieces among the ground are its noise.
     verdict = np.full(count + 1, GROUND, np.int8)
     verdict[0] = UNKNOWN
-    error = _CERTAIN * noise * cells.error[..., None]
-    # A surface of far cells is as sure as each of them, as their errors are alike.
-    sure = [-side[n] > np.median(error[surface == k, -1]) for n, k in enumerate(large)]
-    verdict[large] = np.where(side > 0, OBSTACLE, np.where(sure, DROP, UNKNOWN))
+    unsure = (_CERTAIN * noise[-1] * cells.error).astype(np.float32)
+    verdict[large] = np.where(side > 0, OBSTACLE, DROP)
+    for k in large[side < -steps.least]:
+        # A surface of far cells is as sure as each of them, as their errors are alike.
+        if -side[large == k][0] <= np.median(unsure[surface == k]):
+            verdict[k] = UNKNOWN
     verdict[level] = GROUND
     said = np.where(ground, GROUND, verdict[surface]).astype(np.int8)
     # What rises less than is never excused is no foot, however precise the sensor.
-    rise = np.maximum(error[..., 0], (1 - _EXCUSED) * least)
+    rise = np.maximum(_CERTAIN * noise[0] * cells.error, (1 - _EXCUSED) * least)
     foot = _feet(cell_heights(cells, field, size), steep, rise, steps.least, turned)
     said[foot] = OBSTACLE
-    unsure = error[..., -1].astype(np.float32)
     doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
     classes = np.zeros(image.shape, np.uint8)
     heights = np.full(image.shape, np.nan, np.float32)
@@ -192,12 +195,15 @@ def _nearest_part(
     x, y = place[rows, columns, 1:].T.astype(np.float64)
     h = height[rows, columns].astype(np.float64)
     design = np.stack([np.ones(len(x)), x, y], axis=1)
-    off = h - np.median(h)
+    # Some of them tell the plane as well as all.
+    some = slice(None, None, max(len(x) // _PLENTY, 1))
+    plane = np.array([np.median(h[some]), 0.0, 0.0])
     for _ in range(3):
-        fits = np.abs(off) <= max(tolerance, float(np.median(np.abs(off))))
-        normal = design[fits].T @ design[fits] + 1e-9 * np.eye(3)
-        off = h - design @ np.linalg.solve(normal, design[fits].T @ h[fits])
-    inside = np.abs(off) <= tolerance
+        off = np.abs(h[some] - design[some] @ plane)
+        fits = design[some][off <= max(tolerance, float(np.median(off)))]
+        heights = h[some][off <= max(tolerance, float(np.median(off)))]
+        plane = np.linalg.solve(fits.T @ fits + 1e-9 * np.eye(3), fits.T @ heights)
+    inside = np.abs(h - design @ plane) <= tolerance
     part = np.zeros(where.shape, np.bool_)
     part[rows[inside], columns[inside]] = True
     return part

@@ -29,6 +29,8 @@ _FARTHER = 0.25
 _RAMP = 0.02
 # The squared deviation, in variances, from which what is known and what is seen contradict.
 _MISFIT = 25.0
+# Logarithm of a share of the probability that nobody would notice.
+_HOPELESS = 30.0
 # Largest surfaces that are looked at.
 _MOST = 32
 
@@ -95,13 +97,18 @@ def stand(
     sums = _sums(cells, surface, rank, reach, sensor, height)
     horizontal = axes_of(up)[1:]
     ramp = -np.log(_RAMP)
-    scores, planes = [], []
+    scores: list[float] = []
+    planes: list[NDArray[np.float64]] = []
     for k, total in zip(order, sums, strict=True):
         base = np.log(sizes[k]) - (reach[k] - reach[order].min()) / _FARTHER
         if height == 0:
             # A metre farther from below the sensor, for each metre of its height.
             base -= steepest[k] / _FARTHER
         best = -np.inf, np.zeros(3)
+        if scores and base < max(scores) - _HOPELESS:
+            scores.append(-np.inf)
+            planes.append(best[1])
+            continue
         for way, tilt, rarity in ((0, TILT, 0.0), (0, slope, ramp), (1, TILT, ramp)):
             spread = np.array([doubt or 1e3, tilt, tilt])
             solved, misfit = _solved(total[way], spread)
