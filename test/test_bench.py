@@ -40,11 +40,12 @@ def test_figures_of_given_frames_and_cached_exact_energies(frames, tmp_path):
     arguments = [*frames, '--rounds', 2, '--exact', '--cache', cache, '--json', path]
     params = tmp_path / 'params.yaml'
     params.write_text('min_pixels: 50\ndirection_count: 17\n')
-    arguments += ['--method', 'normals', '--params', params]
+    arguments += ['--method', 'normals', '--params', params, '--threads', 1]
     result = run(*arguments)
     assert result.exit_code == 0
     figures = json.loads(path.read_text())
     assert (figures['frames'], figures['width'], figures['method']) == (2, 96, 'normals')
+    assert figures['threads'] == 1
     assert [*figures['stages']] == [
         'image',
         'noise',

@@ -53,6 +53,11 @@ CACHE = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'rang
     help='How many times each frame is segmented.',
 )
 @click.option(
+    '--threads',
+    type=click.IntRange(min=1),
+    help='At most so many, of the four that a frame can use.  [default: one for each core]',
+)
+@click.option(
     '--exact',
     is_flag=True,
     help='Compare the energy to that of the exact minimisation: slow, but for frames seen before.',
@@ -77,6 +82,7 @@ def command(
     method: str | None,
     scenes: int,
     rounds: int,
+    threads: int | None,
     exact: bool,
     cache: Path,
     scaling: bool,
@@ -97,13 +103,13 @@ def command(
             frames = benchmark.Frames(depth, read_camera(camera_file), depth_scale)
         else:
             frames = _simulated(folder, VGA, scenes)
-        figures = benchmark.measure(frames, config, rounds, progress)
+        figures = benchmark.measure(frames, config, rounds, progress, threads)
         if exact:
             figures['energy_ratio'] = benchmark.energy_ratio(frames, config, cache, progress)
         click.echo(_title(figures))
         click.echo(benchmark.table(figures))
         if scaling:
-            figures['scaling'] = _series(folder, figures, config, scenes, rounds)
+            figures['scaling'] = _series(folder, figures, config, scenes, rounds, threads)
             click.echo()
             click.echo(benchmark.scaling_table(figures['scaling']))
     if json_file:
@@ -113,12 +119,18 @@ def command(
 def _title(figures: dict[str, Any]) -> str:
     return (
         f'{figures["frames"]} frames of {figures["width"]}x{figures["height"]}, '
-        f'{figures["rounds"]} rounds, method {figures["method"]}'
+        f'{figures["rounds"]} rounds, method {figures["method"]}, '
+        f'threads {figures["threads"]}'
     )
 
 
 def _series(
-    folder: Path, vga: dict[str, Any], config: Config, scenes: int, rounds: int
+    folder: Path,
+    vga: dict[str, Any],
+    config: Config,
+    scenes: int,
+    rounds: int,
+    threads: int | None,
 ) -> dict[str, dict[str, Any]]:
     """Figures of all sizes by name, with the `ratio` of their median time to that of VGA."""
     series = {}
@@ -126,7 +138,7 @@ def _series(
         figures = vga
         if size != VGA:
             frames = _simulated(folder, size, scenes)
-            figures = benchmark.measure(frames, config, rounds)
+            figures = benchmark.measure(frames, config, rounds, threads=threads)
         ratio = figures['total']['median_ms'] / vga['total']['median_ms']
         series[f'{size[0]}x{size[1]}'] = {**figures, 'ratio': ratio}
     return series

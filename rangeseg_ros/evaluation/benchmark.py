@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,7 +74,11 @@ def _silent(paths: Iterable[Path], total: int) -> Iterable[Path]:
 
 
 def measure(
-    frames: Frames, config: Config, rounds: int = 3, progress: Progress = _silent
+    frames: Frames,
+    config: Config,
+    rounds: int = 3,
+    progress: Progress = _silent,
+    threads: int | None = None,
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
 
@@ -85,6 +90,8 @@ def measure(
         How many times all frames are segmented.
     progress : callable
         Shows the progress through the paths of so many frames; can be pickled.
+    threads : int, optional
+        At most so many; as many as OpenCV takes by itself when not given.
 
     Returns
     -------
@@ -94,15 +101,20 @@ def measure(
         `cpu_ms`: median processor time of a frame, summed over threads. `first_frame_ms`: the
         first in a process. `frames_per_second`: 1 / mean total.
         `peak_memory_mb`: of the process, Python and all libraries included; NaN where the
-        system has no /proc. `frames`, `rounds`, `width`, `height`, `method`.
+        system has no /proc. `frames`, `rounds`, `width`, `height`, `method`,
+        `threads`.
     """
     # What numba has not compiled yet is compiled and cached here, not where it is measured.
     Segmenter(config).segment(corrected(frames.read(frames.paths[0]), config))
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
-        return pool.submit(_measure, frames, config, rounds, progress).result()
+        return pool.submit(_measure, frames, config, rounds, progress, threads).result()
 
 
-def _measure(frames: Frames, config: Config, rounds: int, progress: Progress) -> dict[str, Any]:
+def _measure(
+    frames: Frames, config: Config, rounds: int, progress: Progress, threads: int | None
+) -> dict[str, Any]:
+    if threads:
+        cv2.setNumThreads(threads)
     segmenter = Segmenter(config)
     order = (*frames.paths[:1] * WARM_UP, *frames.paths * rounds)
     laps = [_laps(segmenter, frames, path) for path in progress(order, len(order))]
@@ -112,6 +124,7 @@ def _measure(frames: Frames, config: Config, rounds: int, progress: Progress) ->
     totals = [lap['total'] for lap in counted]
     return {
         'method': config.method,
+        'threads': cv2.getNumThreads(),
         'width': frames.camera.width,
         'height': frames.camera.height,
         'frames': len(frames.paths),

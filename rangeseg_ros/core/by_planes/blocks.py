@@ -7,6 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.regions import VGA
+from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SLOPE
@@ -34,7 +35,6 @@ def block_size(shape: tuple[int, int]) -> int:
     return 4 if shape[0] * shape[1] <= 2 * VGA else 8
 
 
-@njit(cache=True)
 def whole_blocks(inverse: NDArray[np.float32], grid: Grid, size: int) -> NDArray[np.bool_]:
     """Blocks that no jump crosses and that were measured.
 
@@ -54,7 +54,22 @@ def whole_blocks(inverse: NDArray[np.float32], grid: Grid, size: int) -> NDArray
     """
     height, width = inverse.shape
     result = np.zeros((-(-height // size), -(-width // size)), np.bool_)
-    for bi in range(result.shape[0]):
+    strips(_find_whole, len(result), inverse, grid, size, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _find_whole(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    grid: Grid,
+    size: int,
+    result: NDArray[np.bool_],
+) -> None:
+    """The same of some rows of blocks."""
+    height, width = inverse.shape
+    for bi in range(first, after):
         bottom = min((bi + 1) * size, height)
         for bj in range(result.shape[1]):
             right = min((bj + 1) * size, width)
@@ -69,7 +84,6 @@ def whole_blocks(inverse: NDArray[np.float32], grid: Grid, size: int) -> NDArray
                     if i + 1 < bottom and inverse[i + 1, j] > 0:
                         whole &= grid.below[i, j] > 0
             result[bi, bj] = whole and count >= _MEASURED * size * size
-    return result
 
 
 @njit(cache=True)

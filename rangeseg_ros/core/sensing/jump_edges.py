@@ -161,10 +161,10 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     blocks = -(-image.shape[0] // BLOCK), -(-image.shape[1] // BLOCK)
     limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
     clear = _CLEAR * limits + 2 * np.asarray(slope, np.float32)
-    mask = (inverse > 0).astype(np.float32)
-    wide = aside(_window_sums, inverse, mask, 2 * _WINDOW + 1)
-    mean = _means(*_window_sums(inverse, mask, _WINDOW))
+    wide = aside(_window_sums, inverse, 2 * _WINDOW + 1)
     height, width = image.shape
+    mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
+    strips(_find_means, height, inverse, mean)
     strong = np.zeros((height, width), np.bool_)
     strips(_find_strong, height, mean, limits, strong)
     horizontal = np.zeros((height, width - 1), np.bool_)
@@ -184,25 +184,38 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
 
 
 def _window_sums(
-    inverse: NDArray[np.float32], mask: NDArray[np.float32], size: int
+    inverse: NDArray[np.float32], size: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Sum and number of the measurements in the window around each pixel."""
     window, border = (size, size), cv2.BORDER_CONSTANT
+    mask = (inverse > 0).astype(np.float32)
     total = cv2.boxFilter(inverse, -1, window, normalize=False, borderType=border)
     count = cv2.boxFilter(mask, -1, window, normalize=False, borderType=border)
     return np.asarray(total), np.asarray(count)
 
 
-@njit(cache=True)
-def _means(total: NDArray[np.float32], count: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Means of windows, NaN where nothing was measured and in a margin around the image."""
-    height, width = total.shape
-    mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
-    for i in range(height):
+@njit(cache=True, nogil=True, error_model='numpy')
+def _find_means(
+    first: int, after: int, inverse: NDArray[np.float32], mean: NDArray[np.float32]
+) -> None:
+    """Means of windows of 3 x 3 pixels around those of some rows, NaN where nothing was measured.
+
+    `mean` has a margin, in which it keeps what it holds.
+    """
+    height, width = inverse.shape
+    total, count = np.zeros(width + 2, np.float32), np.zeros(width + 2, np.float32)
+    for i in range(first, after):
+        total[:], count[:] = 0, 0
+        for k in range(max(i - 1, 0), min(i + 2, height)):
+            for j in range(width):
+                total[j + 1] += inverse[k, j]
+                count[j + 1] += np.float32(inverse[k, j] > 0)
+        result = mean[i + _MARGIN, _MARGIN : _MARGIN + width]
         for j in range(width):
-            if count[i, j] > 0.5:
-                mean[i + _MARGIN, j + _MARGIN] = total[i, j] / count[i, j]
-    return mean
+            # 0 / 0 where there is none.
+            result[j] = (total[j] + total[j + 1] + total[j + 2]) / (
+                count[j] + count[j + 1] + count[j + 2]
+            )
 
 
 @njit(cache=True, nogil=True)
