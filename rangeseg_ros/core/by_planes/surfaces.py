@@ -65,7 +65,9 @@ def surfaces(
     shape = moments.shape[:2]
     blocks = moments.reshape(-1, SIZE)
     # No patch reaches over the middle, but neither does any reach across a large surface.
-    roots = halves(patches, shape[0], moments, *links, enlarged * _PATCH_LARGEST)
+    # Not even in a small image is one smaller than four blocks.
+    largest = max(enlarged * _PATCH_LARGEST, 4 * block**2)
+    roots = halves(patches, shape[0], moments, *links, largest)
     patch, moments = _renumbered(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumbered(
