@@ -86,17 +86,17 @@ def _pairs(
 
 
 @njit(cache=True)
-def misfit(
-    extra: float, first: NDArray[np.float64], second: NDArray[np.float64], granted: float
-) -> float:
+def misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float) -> float:
     """How far two parts leave a common plane, in what noise and distortion are granted.
 
     Parameters
     ----------
     extra : float
         Chi-squared of the common plane less those of the parts' own.
-    first, second : (13,) float64
-        Moments of the parts.
+    moments : (N, 13) float64
+        Of all parts.
+    k, m : int
+        The two.
     granted : float
         Systematic variances.
 
@@ -105,9 +105,10 @@ def misfit(
     float
         1 is too far.
     """
-    pixels = first[COUNT] + second[COUNT]
-    ratio = (first[RATIO] + second[RATIO]) / pixels
-    return extra / (_NOISE + granted * ratio * first[COUNT] * second[COUNT] / pixels)
+    first, second = moments[k, COUNT], moments[m, COUNT]
+    pixels = first + second
+    ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
+    return extra / (_NOISE + granted * ratio * first * second / pixels)
 
 
 @njit(cache=True)
@@ -219,13 +220,13 @@ def _grow(
                 seen[b] = turn
                 before = e
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
-                    extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
-                    apart = misfit(extra, moments[a], moments[b], WITHIN_PATCH)
+                    extra = common_residual(moments, a, b) - residual[a] - residual[b]
+                    apart = misfit(extra, moments, a, b, WITHIN_PATCH)
                     if apart < best:
                         best, partner = apart, b
             e = following
         if partner >= 0:
-            residual[a] = common_residual(moments[a], moments[partner])
+            residual[a] = common_residual(moments, a, partner)
             moments[a] += moments[partner]
             parent[partner] = a
             if head[partner] >= 0:

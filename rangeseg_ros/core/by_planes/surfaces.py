@@ -143,8 +143,8 @@ def _join(
     for a in range(count):
         for b in range(a + 1, count):
             if border[a, b] > 0:
-                extra = common_residual(moments[a], moments[b]) - residual[a] - residual[b]
-                apart = misfit(extra, moments[a], moments[b], granted)
+                extra = common_residual(moments, a, b) - residual[a] - residual[b]
+                apart = misfit(extra, moments, a, b, granted)
                 strain[a, b] = strain[b, a] = apart * border[a, b]
                 heappush(heap, (strain[a, b] / border[a, b], a, b))
     parent = np.arange(count)
@@ -154,11 +154,11 @@ def _join(
             break
         if parent[a] != a or parent[b] != b or strain[a, b] / border[a, b] != mean:
             continue
-        chi2 = common_residual(moments[a], moments[b])
+        chi2 = common_residual(moments, a, b)
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
         within = _WITHIN_SURFACE * pixels / (pixels + enlarged * DISTORTION_PIXELS)
-        if misfit(extra, moments[a], moments[b], within) >= 1:
+        if misfit(extra, moments, a, b, within) >= 1:
             continue
         parent[b] = a
         moments[a] += moments[b]

@@ -347,8 +347,9 @@ def _doubtful(
             if label == 0 or y == 0:
                 continue
             count[0, label] += 1
-            ray, plane = rays[i, j], theta[label]
-            residual = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
+            # No views of a ray and a plane: their references would be counted for every pixel.
+            residual = y - theta[label, 0] * rays[i, j, 0] - theta[label, 1] * rays[i, j, 1]
+            residual -= theta[label, 2] * rays[i, j, 2]
             squared = y * y
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             if residual * residual > _OUTLIER**2 * variance:

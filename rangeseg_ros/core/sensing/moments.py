@@ -59,15 +59,17 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 
 @njit(cache=True)
-def common_residual(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Weighted sum of the squared residuals of one plane for two moment vectors (13,).
+def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
+    """Weighted sum of the squared residuals of one plane for two of N moment vectors (N, 13).
 
-    What `fit` returns for their sum, without memory traffic: growing spends its time here.
+    What `fit` returns for their sum, without memory traffic, views and their reference counts:
+    growing spends its time here.
     """
-    a, b, c = first[0] + second[0], first[1] + second[1], first[2] + second[2]
-    d, e, f = first[3] + second[3], first[4] + second[4], first[5] + second[5]
-    p, q, r = first[6] + second[6], first[7] + second[7], first[8] + second[8]
-    square = first[CHI2] + second[CHI2]
+    a, b = moments[k, 0] + moments[m, 0], moments[k, 1] + moments[m, 1]
+    c, d = moments[k, 2] + moments[m, 2], moments[k, 3] + moments[m, 3]
+    e, f = moments[k, 4] + moments[m, 4], moments[k, 5] + moments[m, 5]
+    p, q = moments[k, 6] + moments[m, 6], moments[k, 7] + moments[m, 7]
+    r, square = moments[k, 8] + moments[m, 8], moments[k, CHI2] + moments[m, CHI2]
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
     determinant = a * aa + b * bb + c * cc
