@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import axes_of
+from rangeseg_ros.core.meaning.classes import GROUND
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -105,15 +106,16 @@ def _level_points(image: RangeImage, terrain: Terrain) -> _Level:
     inverse = image.inverse[::_STRIDE, ::_STRIDE].astype(np.float64)
     with np.errstate(divide='ignore', invalid='ignore'):
         place = image.rays[::_STRIDE, ::_STRIDE] @ axes_of(up)[1:].T / inverse[..., None]
+    off_ground = terrain.classes[::_STRIDE, ::_STRIDE] > GROUND
     if abs(up[0]) > abs(up[1]):  # a camera on its side
-        height, place = height.T, place.transpose(1, 0, 2)
+        height, place, off_ground = height.T, place.transpose(1, 0, 2), off_ground.T
     level = np.zeros(height.shape, np.bool_)
     for k in _BESIDE:
         with np.errstate(invalid='ignore'):
             way = np.linalg.norm(place[: -2 * k] - place[2 * k :], axis=-1)
         # Also false where one of the two is not measured.
         level[k:-k] |= np.abs(height[: -2 * k] - height[2 * k :]) < _STEEPEST * way
-    level &= np.isfinite(height) & (np.abs(height) > _RISE[0] / 2)
+    level &= off_ground & np.isfinite(height)
     return _Level(height[level], place[level])
 
 
@@ -137,7 +139,9 @@ def _levels(height: NDArray[np.float64]) -> NDArray[np.float64]:
         score = treads + on[:treads].sum() / (1 + on.sum())
         if treads > 1 and score > most:
             best, most = at[:treads], score
-    return np.array([np.median(height[np.abs(height - level) < _LEVEL / 2]) for level in best])
+    # As wide as the bins that were counted.
+    wide = _LEVEL / 2 + _BIN
+    return np.array([np.median(height[np.abs(height - level) < wide]) for level in best])
 
 
 def _staircase(points: _Level, levels: NDArray[np.float64], terrain: Terrain) -> Stairs | None:
@@ -159,12 +163,15 @@ def _staircase(points: _Level, levels: NDArray[np.float64], terrain: Terrain) ->
     # Boxes of several heights stand side by side, treads one behind the other.
     for part in parts[1:count]:
         left, right = np.quantile(part @ across, (0.02, 0.98))
-        if min(right, sides[1]) - max(left, sides[0]) < (sides[1] - sides[0]) / 2:
+        common = min(right, sides[1]) - max(left, sides[0])
+        if common < min(right - left, sides[1] - sides[0]) / 2:
             return None
     run = float(np.median(np.diff(noses)))
     start = float(np.median(noses - run * np.arange(len(noses))))
     number = np.arange(1, count + 1)
     rise = float(np.abs(levels[:count]) @ number / (number @ number))
+    if not _RISE[0] <= rise <= _RISE[1]:
+        return None
     edge = start - run if down else start
     ends = edge * ahead + np.outer(sides, across)
     return Stairs(
@@ -188,7 +195,13 @@ def _noses(along: list[NDArray[np.float64]], down: bool) -> tuple[NDArray[np.flo
     Going down, a tread's nose is its far end; the landing, whose end is elsewhere, counts as the
     last tread.
     """
-    noses = [_nose(part, down) for part in along[:2]]
+    first = _nose(along[0], down)
+    second = along[1]
+    if down:  # noise of what lies far beyond is at the same height
+        second = second[(second > first) & (second < first + 1.2 * _RUN[1])]
+    if len(second) < _FEWEST:
+        return np.array([first]), 0
+    noses = [first, _nose(second, down)]
     run = noses[1] - noses[0]
     if down and len(along) == 2:  # the second one may be the landing
         run = noses[0] - _nose(along[0], False)
@@ -198,7 +211,6 @@ def _noses(along: list[NDArray[np.float64]], down: bool) -> tuple[NDArray[np.flo
     count = 2
     for part in along[2:]:
         ahead = part - noses[-1]
-        # Down, noise of what lies far beyond is at the same height.
         near = ahead < 1.5 * run if down else ahead > (1 - _UNEVEN) * run
         here = part[near & (ahead > 0)]
         if len(here) < _FEWEST:
