@@ -20,12 +20,10 @@ from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
     cell_heights,
     ground_field,
-    height_in_row,
-    planes_of_row,
 )
 from rangeseg_ros.core.meaning.growth import grown
+from rangeseg_ros.core.meaning.pixels import Said, pixels_of
 from rangeseg_ros.core.meaning.under_robot import FEWEST, TILT, Stand, stand
-from rangeseg_ros.core.runtime.threads import strips
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -173,11 +171,8 @@ def _terrain(
     foot = _feet(cell_heights(cells, field, size), steep, rise, steps.least, turned)
     said[foot] = OBSTACLE
     doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
-    classes = np.zeros(image.shape, np.uint8)
-    heights = np.full(image.shape, np.nan, np.float32)
     bounds = limits.obstacle / 2, limits.drop / 2
-    strips(_classify, len(said), image.inverse, image.rays, field, size, said, doubt, unsure,
-           bounds, classes, heights)  # fmt: skip
+    classes, heights = pixels_of(image, field, size, Said(said, doubt, unsure), bounds)
     return Terrain(classes, heights, under, field)
 
 
@@ -263,55 +258,6 @@ def _hang(
                 foot[i, c] = True
             else:
                 above = False
-
-
-@njit(cache=True, nogil=True)
-def _classify(
-    first: int,
-    after: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    field: GroundField,
-    size: CellSize,
-    said: NDArray[np.int8],
-    doubt: NDArray[np.float32],
-    unsure: NDArray[np.float32],
-    bounds: tuple[float, float],
-    classes: NDArray[np.uint8],
-    heights: NDArray[np.float32],
-) -> None:
-    """Heights and classes of the pixels of cells first...after along the columns.
-
-    `said` is what is known of a cell: obstacles and drops as a whole, or that it is ground, which
-    only heights beyond `doubt` contradict. For what is lower or higher than half of the least
-    obstacle or drop (`bounds`), the other one is less probable; what lies no deeper than `unsure`,
-    the noise, is no ground, and not claimed to be a drop. Twelve parameters, as a kernel
-    cannot return what several threads write.
-    """
-    line = np.empty((field.theta.shape[1], 4))
-    # Divisions would take as long as all the rest.
-    blocks, cells = 1 / field.columns, 1 / size.columns
-    for i in range(first * size.rows, min(after * size.rows, len(inverse))):
-        row = i // size.rows
-        planes_of_row(field, i, line)
-        for j in range(inverse.shape[1]):
-            value = inverse[i, j]
-            if value == 0:
-                continue
-            height = height_in_row(line, (j + 0.5) * blocks - 0.5, value, rays[i, j])
-            heights[i, j] = height
-            c = int((j + 0.5) * cells)
-            kind = said[row, c]
-            if kind > GROUND:
-                classes[i, j] = kind
-            elif kind == GROUND and abs(height) < doubt[row, c]:
-                classes[i, j] = GROUND
-            elif height > bounds[0]:
-                classes[i, j] = OBSTACLE
-            elif height < -bounds[1]:
-                classes[i, j] = DROP if height < -unsure[row, c] else UNKNOWN
-            else:
-                classes[i, j] = GROUND
 
 
 def _without_ground(
