@@ -2,8 +2,10 @@
 
 docs/terrain.png, the picture in the README: depth, planes, and what they are to a robot.
 docs/normals.png: observed normals, jump edges, and the normals that both methods reconstruct.
-docs/figures/*.png, one picture for each stage of method `planes`: of a Kinect's frame of a room
-and, on the right, of a stereo camera's.
+docs/figures/distortion.png: the fixed pattern of a simulated Kinect, what is learned of it, and
+what is left.
+The other docs/figures/*.png, one picture for each stage of method `planes`: of a Kinect's frame of
+a room and, on the right, of a stereo camera's.
 """
 
 import sys
@@ -21,6 +23,9 @@ from rangeseg_ros.core.by_planes import method
 from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weighted, whole_blocks
 from rangeseg_ros.core.by_planes.patches import patches
 from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, surfaces
+from rangeseg_ros.core.calibration.calibrate import calibrate
+from rangeseg_ros.core.calibration.sightings import gathered, sightings
+from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.regions import least_pixels, plane_regions
@@ -33,9 +38,11 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.params import read_config
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
-from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera, sensor_pattern
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 
@@ -55,6 +62,27 @@ def main():
     for name in both[0]:
         pair = [fitted(pictures[name]) for pictures in both]
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
+    write_image(folder / 'figures' / 'distortion.png', distortion(sensor_seed=1))
+
+
+def distortion(sensor_seed):
+    """Error of the inverse depth, blue to red for -0.004 to 0.004 / m: true, learned, left."""
+    camera, segmenter, seen = kinect_camera(320, 240), Segmenter(), []
+    for seed in range(4):
+        room = kinect_room(seed)
+        scene = Scene(room.solids, walk(room.poses[0], seed, 360), room.dark)
+        for k in range(0, 360, 36):
+            view = simulate_kinect(scene, camera, frame=k, seed=seed, sensor_seed=sensor_seed)
+            image = RangeImage.from_depth(view.depth, camera)
+            seen.append(sightings(segmenter.segment(image).labels, image))
+    learned = calibrate(gathered(seen), camera.shape, camera).distortion.offset
+    known = learned != 0
+    true = without_plane(QUANTUM * sensor_pattern(camera.shape, sensor_seed), known)
+    pictures = []
+    for field in (true, learned, true - learned):
+        shown = 255 * colormaps['RdBu_r'](np.clip(field / 0.008 + 0.5, 0, 1))[..., :3]
+        pictures.append(fitted(np.where(known[..., None], shown, 128).astype(np.uint8)))
+    return np.hstack(pictures)
 
 
 def normals(image):
