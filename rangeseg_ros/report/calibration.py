@@ -125,9 +125,8 @@ def _images(
     """Pictures with a title, a range and a colour map each, side by side."""
     rows = -(-len(images) // columns)
     figure = Figure(figsize=(10, 3.6 * rows), layout='constrained')
-    for axes, (title, image, low, high, colours) in zip(
-        figure.subplots(rows, columns, squeeze=False).flat, images, strict=False
-    ):
+    for place, (title, image, low, high, colours) in enumerate(images, 1):
+        axes = figure.add_subplot(rows, columns, place)
         # No more pixels than the page shows.
         step = max(image.shape[1] // 320, 1)
         drawn = axes.imshow(image[::step, ::step], vmin=low, vmax=high, cmap=colours)
