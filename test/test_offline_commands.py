@@ -39,7 +39,7 @@ def test_segment_writes_labels_overlay_and_planes(folder, run):
         'segment', 'depth/2.png', 'depth/10.png', '--camera', 'camera.yaml', '--output', 'out/here'
     )
     assert (code, error) == (0, '')
-    kinds = ('height.tiff', 'labels.png', 'overlay.png', 'planes.csv', 'terrain.png')
+    kinds = ('height.tiff', 'labels.png', 'overlay.png', 'planes.csv', 'stairs.csv', 'terrain.png')
     assert files(folder / 'out/here') == sorted(f'{n}_{kind}' for n in (2, 10) for kind in kinds)
     labels = read_labels(folder / 'out/here/2_labels.png')
     assert labels.shape == (48, 64)

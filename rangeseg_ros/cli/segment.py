@@ -81,8 +81,10 @@ def command(
         result = segmenter.segment(image)
         result = replace(result, planes=with_roles(result.planes, segmenter.config))
         write_frame(output, path.stem, image, result, files)
-        found = f'{len(result.planes)} planes' if result.planes else f'no plane: {result.reason}'
-        click.echo(f'{path}: {found}, {result.ground}')
+        if result.planes:
+            click.echo(f'{path}: {len(result.planes)} planes, {result.ground}')
+        else:
+            click.echo(f'{path}: no plane: {result.reason}')
         if result.tilt:
             click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
         if sensor:
