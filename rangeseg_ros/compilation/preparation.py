@@ -7,7 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import astuple, replace
 from threading import Condition, Thread
 from typing import Any
@@ -134,7 +134,8 @@ class Pool:
         finally:
             if discovery:
                 self._end_of_discovery()
-            worker.stdin.close()
+            with suppress(BrokenPipeError):  # what a dead worker did not take
+                worker.stdin.close()
             worker.stdout.close()
             worker.wait()
 
