@@ -151,9 +151,31 @@ class Bench:
     def segment(self, image=None, info=None):
         """Publish an image with its camera_info; the labels (H, W) that come back."""
         image = image or self.image()
-        self.camera_info.publish(info or self.info())
-        self.depth.publish(image)
+        self.send(image, info)
         return self.labels_of(image)
+
+    def send(self, image=None, info=None):
+        """Publish an image with its camera_info."""
+        self.camera_info.publish(info or self.info())
+        self.depth.publish(image or self.image())
+
+    def repeat(self, action, condition, period=0.2):
+        """Do something again and again until the condition holds; its value."""
+        due = 0.0
+
+        def found():
+            nonlocal due
+            if time.monotonic() >= due:
+                due = time.monotonic() + period
+                action()
+            return condition()
+
+        return self.until(found)
+
+    def reported(self, condition, publish):
+        """The first diagnostic status that satisfies the condition, while frames come."""
+        self.received['diagnostics'].clear()
+        return self.repeat(publish, lambda: self._reported(condition))
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
@@ -171,10 +193,11 @@ class Bench:
     def spin(self, seconds):
         self.until(lambda: False, seconds, required=False)
 
-    def until(self, condition, timeout=180.0, required=True):
+    def until(self, condition, timeout=600.0, required=True):
         """Spin until the condition holds; its value."""
         end = time.monotonic() + timeout
         while not (value := condition()) and time.monotonic() < end:
+            assert self.process.poll() is None, f'the node has ended: {self.complaints()}'
             self.executor.spin_once(timeout_sec=0.02)
         assert value or not required, f'not within {timeout} s: {self.complaints()}'
         return value
@@ -218,14 +241,11 @@ class Bench:
     def status(self, condition):
         """The first diagnostic status from now on that satisfies the condition."""
         self.received['diagnostics'].clear()
+        return self.until(lambda: self._reported(condition))
 
-        def found():
-            for report in self.received['diagnostics']:
-                if condition(report.status[0]):
-                    return report.status[0]
-            return None
-
-        return self.until(found)
+    def _reported(self, condition):
+        statuses = (report.status[0] for report in self.received['diagnostics'])
+        return next(filter(condition, statuses), None)
 
     def set_parameters(self, atomically=False, **values):
         """Set parameters by the node's service; its results."""
@@ -266,7 +286,7 @@ class Bench:
         try:
             if self.process.poll() is None:
                 self.interrupt()
-            code = self.process.wait(timeout=20)
+            code = self.process.wait(timeout=60)
         finally:
             if self.process.poll() is None:
                 os.killpg(self.process.pid, signal.SIGKILL)

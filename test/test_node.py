@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 
 from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
@@ -193,12 +193,10 @@ def test_the_example_of_the_readme_reads_the_planes(bench, tmp_path):
 
 
 def test_diagnostics_tell_where_the_time_goes(bench):
-    image = bench.image()
-    bench.segment(image)
-    status = bench.status(lambda status: status.message.startswith('2 planes'))
+    status = bench.reported(lambda s: s.message.startswith('2 planes'), bench.send)
     assert status.level == DiagnosticStatus.OK
     assert status.name == 'segment_planes: segmentation' and status.hardware_id == DEPTH
-    values = {value.key: value.value for value in status.values}
+    values = values_of(status)
     parts = ('transport', 'waiting', 'conversion', 'compute', 'publication')
     times = [float(values[f'{part} (ms)']) for part in parts]
     assert min(times) >= 0 and sum(times) == pytest.approx(float(values['latency (ms)']), abs=0.05)
@@ -212,8 +210,7 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     """Of frames that come during a long computation only the newest is segmented."""
 
     def dropped(status):
-        values = {v.key: v.value for v in status.values}
-        return int(values['frames dropped for newer ones'])
+        return int(values_of(status)['frames dropped for newer ones'])
 
     # A report from now on: the tests before may have dropped frames.
     bench.spin(1.5)
@@ -224,7 +221,7 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     images = [bench.image() for _ in range(5)]
     bench.camera_info.publish(bench.info())
     bench.depth.publish(images[0])
-    bench.spin(0.5)
+    bench.status(lambda status: 'segmenting' in values_of(status)['doing'])
     for image in images[1:]:
         bench.depth.publish(image)
     # The answer comes while the first frame is being computed.
@@ -241,7 +238,7 @@ def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
     bench.in_use()
     assert bench.set_parameters(min_pixels=160 * 120)[0].successful
     assert not bench.segment().any()
-    status = bench.status(lambda status: status.message.startswith('no planes'))
+    status = bench.reported(lambda s: s.message.startswith('no planes'), bench.send)
     assert status.level == DiagnosticStatus.WARN and len(status.message) > len('no planes: ')
     assert bench.set_parameters(min_pixels=Config().min_pixels)[0].successful
     np.testing.assert_array_equal(bench.segment(), expected)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import fields
@@ -15,6 +16,7 @@ from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
 from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.runtime.cache import writable
 from rangeseg_ros.ros.parameters import NodeConfig
 
 USAGE = """\
@@ -75,6 +77,19 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
         if name not in shared:
             raise ConfigError(problem)
         node.get_logger().warning(f'{problem} (of /**, ignored)')
+
+
+def logging_arguments() -> list[str]:
+    """What keeps rcl from writing log files where it cannot, as it would refuse to start."""
+    home = os.environ.get('ROS_HOME') or Path(os.environ.get('HOME', '~'), '.ros')
+    folder = os.environ.get('ROS_LOG_DIR') or Path(home, 'log')
+    if writable(Path(folder).expanduser()):
+        return []
+    print(
+        f'segment_planes: no log files: {folder} cannot be written to; set ROS_LOG_DIR',
+        file=sys.stderr,
+    )
+    return ['--ros-args', '--disable-external-lib-logs']
 
 
 def _described() -> Iterable[str]:

@@ -27,7 +27,7 @@ from rangeseg_ros.core.config import ConfigError
 from rangeseg_ros.messages.make import message_class
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
-from rangeseg_ros.ros.arguments import check_arguments, check_parameters
+from rangeseg_ros.ros.arguments import check_arguments, check_parameters, logging_arguments
 from rangeseg_ros.ros.depth_input import DepthInput, input_topics
 from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.gravity import IMU_TOPIC
@@ -190,7 +190,8 @@ def main() -> None:
     finished = True
     try:
         check_arguments(sys.argv)
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+        arguments = [*sys.argv, *logging_arguments()]
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     except (ConfigError, RuntimeError) as error:
         _refuse(error)
     try:

@@ -45,12 +45,12 @@ def choose_cache() -> None:
         There is none.
     """
     given = os.environ.get('NUMBA_CACHE_DIR')
-    if given and _writable(Path(given)):
+    if given and writable(Path(given)):
         return
-    if _writable(PACKAGE / 'core' / '__pycache__'):
+    if writable(PACKAGE / 'core' / '__pycache__'):
         return
     for folder in _folders():
-        if _writable(folder):
+        if writable(folder):
             os.environ['NUMBA_CACHE_DIR'] = os.fspath(folder)
             if 'numba' in sys.modules:
                 sys.modules['numba'].config.CACHE_DIR = os.fspath(folder)
@@ -99,7 +99,8 @@ def _private(folder: Path) -> bool:
     )
 
 
-def _writable(folder: Path) -> bool:
+def writable(folder: Path) -> bool:
+    """Whether files can be made in the folder, which is made where it is missing."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()

@@ -1,0 +1,124 @@
+"""The node at its start, and as it ends: arguments, kernels that are not compiled, Ctrl-C."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from ros_bench import DEPTH, INFO, Bench, values_of
+
+from rangeseg_ros.ros.parameters import NodeConfig
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+
+pytestmark = pytest.mark.ros
+
+NODE = [sys.executable, '-m', 'rangeseg_ros.ros.node']
+
+
+def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
+    monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
+    arguments = '-p', 'stall_timeout:=0.5'
+    topics = f'/first{DEPTH}', f'/first{INFO}'
+    with (
+        Bench(*arguments, namespace='first') as bench,
+        bench.listening('labels'),
+        bench.camera_on(*topics),
+    ):
+        told = r'no output for .* s: compiling kernels, \d+ of'
+        status = bench.reported(lambda s: re.match(told, s.message), bench.send)
+        assert status.level == DiagnosticStatus.ERROR
+        assert 'compiling kernels' in bench.log()
+        assert f'will subscribe to {topics[0]} and {topics[1]}' in bench.log()
+
+
+@pytest.mark.parametrize('presses', [1, 2])
+def test_interrupted_during_a_computation(presses):
+    slow = '-p', 'method:=normals', '-p', 'exact:=true'
+    with Bench(*slow, camera=kinect_camera(320, 240), namespace='busy') as bench:
+        topics = f'/busy{DEPTH}', f'/busy{INFO}'
+        with bench.listening('labels'), bench.camera_on(*topics):
+            bench.send()
+            bench.status(lambda status: 'segmenting' in values_of(status)['doing'])
+            assert not bench.received['labels'], 'the computation is over'
+            for _ in range(presses):
+                bench.interrupt()
+                time.sleep(0.05)
+            assert bench.process.wait(timeout=300) == 0
+
+
+@pytest.mark.parametrize(
+    'arguments, words',
+    [
+        (['--ros-args', '-p', 'method:=magic'], 'method'),
+        (['--ros-args', '-p', 'min_pixel:=3'], "is 'min_pixels' meant?"),
+        (['--ros-args', '-p', 'min_pixels:=many'], 'INTEGER'),
+        (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
+        (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
+        (['--ros-args', '--magic'], '--magic'),
+        (['--method', 'normals'], '--method'),
+    ],
+)
+def test_bad_arguments_end_with_one_line(arguments, words):
+    run = subprocess.run([*NODE, *arguments], capture_output=True, text=True, timeout=300)
+    assert run.returncode == 2, run.stderr
+    assert run.stderr.strip().count('\n') == 0 and words in run.stderr
+
+
+def test_parameters_of_other_nodes_in_a_shared_file_are_warned_of(tmp_path):
+    shared = tmp_path / 'shared.yaml'
+    shared.write_text('/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n')
+    with Bench('--params-file', os.fspath(shared), namespace='shared') as bench:
+        bench.until(lambda: 'will subscribe' in bench.log())
+        assert "unknown parameter 'of_another'" in bench.log()
+
+
+def test_without_a_place_for_log_files_it_starts_and_says_so(monkeypatch):
+    monkeypatch.setenv('ROS_LOG_DIR', '/proc/none')
+    with Bench(namespace='logless') as bench:
+        bench.until(lambda: 'will subscribe' in bench.log())
+        assert bench.log().count('/proc/none cannot be written to') == 1
+
+
+def test_help_names_every_parameter():
+    run = subprocess.run([*NODE, '--help'], capture_output=True, text=True, timeout=300)
+    assert run.returncode == 0 and not run.stderr
+    assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
+
+
+@pytest.mark.parametrize('delay', [0.0, 0.4, 1.2])
+@pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
+def test_interrupted_at_the_start(command, delay, tmp_path):
+    code = f'from rangeseg_ros.start import {command}; print("begun", flush=True); {command}()'
+    arguments = ['bench', '--rounds', '99'] if command == 'rangeseg' else []
+    process = subprocess.Popen(
+        [sys.executable, '-c', code, *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': os.fspath(Path(__file__).parents[1])},
+    )
+    # Before that Python itself is not ready.
+    assert process.stdout and process.stdout.readline() == 'begun\n'
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=300)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
+
+
+def test_interrupted_as_it_begins_to_spin():
+    process = subprocess.Popen(NODE, stderr=subprocess.PIPE, text=True)
+    assert process.stderr
+    assert 'will subscribe' in process.stderr.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=300)
+    assert 'Traceback' not in errors and process.returncode in (0, 130), errors
