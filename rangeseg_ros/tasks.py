@@ -239,17 +239,6 @@ def check_scheduler(address: str) -> None:
         )
 
 
-def run_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R]:
-    """Run tasks on a Dask cluster, see `attempt_on_cluster`; yields their results in order.
-
-    Raises
-    ------
-    ValueError, OSError, MemoryError
-        The first task's that fails; those that have not begun are dropped.
-    """
-    return map(_successful, attempt_on_cluster(tasks, scheduler))
-
-
 def attempt_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R | Failure]:
     """Run tasks on the workers of a Dask cluster, each to its result or `Failure`, in order.
 

@@ -1,6 +1,7 @@
 """Settings of every test."""
 
 import os
+import signal
 import sys
 
 import pytest
@@ -9,6 +10,10 @@ from hypothesis import settings
 # Systems of a few equations: threads of the linear algebra only wait for each other, for minutes
 # on a busy machine. To be set before NumPy is imported, here and in the processes tests start.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
+# A shell that starts tests in the background has them ignore interrupts, and with them the
+# processes that they start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from rangeseg_ros.cli.main import main
 

@@ -11,7 +11,7 @@ from corner_set import CAMERA, depth_and_truth, segcomp_set
 
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation import experiments, plots
+from rangeseg_ros.evaluation import experiments, plots, published
 from rangeseg_ros.evaluation.measure import Measurement, Task
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.cameras import write_camera
@@ -162,9 +162,9 @@ def test_comparison(folder, tmp_path, monkeypatch):
 
 def test_published_rows_are_named_and_drawn(tmp_path):
     ours = {'series': 'planes', 'source': 'simulated set x', 'tolerance': 0.8}
-    table = [ours | {'regions': 14.0, 'correct': 12.0}, *experiments.published_rows('perc')]
+    table = [ours | {'regions': 14.0, 'correct': 12.0}, *published.published_rows('perc')]
     assert {r['source'] for r in table[1:]} == {'real Perceptron test set, published'}
-    assert len(table) == 1 + 6 * len(experiments.PUBLISHED)
+    assert len(table) == 1 + 6 * len(published.CORRECT_PERCEPTRON)
     plots.plot_tolerances(tmp_path / 'x.png', table, 'x')
     picture(tmp_path / 'x.png')
 
@@ -206,17 +206,17 @@ def test_averages_are_over_images():
 
 
 def test_published_rows_are_those_of_the_thesis():
-    assert experiments.PUBLISHED['thesis, identified'] == (11.6, 11.5, 11.2, 10.3, 7.1, 3.6)
-    published = Config(
+    assert published.CORRECT_PERCEPTRON['thesis, identified'] == (11.6, 11.5, 11.2, 10.3, 7.1, 3.6)
+    settings = Config(
         method='normals', normal_baseline=1, jump_edges='sobel', smoothness=55.0, min_pixels=2
     )
-    assert published == experiments.THESIS
+    assert settings == published.THESIS
 
 
-@pytest.mark.parametrize('sensor', experiments.AS_PUBLISHED)
+@pytest.mark.parametrize('sensor', published.AS_PUBLISHED)
 def test_parameter_files_hold_the_published_settings(sensor):
     path = Path(__file__).parents[1] / 'params' / f'thesis_{sensor}.yaml'
-    assert read_config(path) == experiments.AS_PUBLISHED[sensor]
+    assert read_config(path) == published.AS_PUBLISHED[sensor]
     # Whatever the defaults become.
     given = set(read_params(path))
     assert {'method', 'smoothness', 'jump_edges', 'normal_baseline', 'min_pixels'} <= given

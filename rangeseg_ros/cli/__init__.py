@@ -1,1 +1,1 @@
-"""The rangeseg command."""
+"""The rangeseg command: a module for each subcommand, whose function takes all its options."""

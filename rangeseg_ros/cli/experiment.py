@@ -14,7 +14,7 @@ import yaml
 from rangeseg_ros.cli import options, sensitivity
 from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation import experiments, plots
+from rangeseg_ros.evaluation import experiments, plots, published
 from rangeseg_ros.evaluation.datasets import Case, find_cases
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.params import read_params
@@ -77,7 +77,7 @@ def experiment(function: Callable[..., None]) -> Callable[..., None]:
         jobs: int | None,
         **rest: Any,
     ) -> None:
-        base, given, params = experiments.THESIS, {'method': 'normals'}, None
+        base, given, params = published.THESIS, {'method': 'normals'}, None
         if params_file:
             given = read_params(params_file)
             base = params = Config.from_mapping({'method': 'normals', **given})
@@ -196,7 +196,7 @@ def comparison(setting: Setting, step: int) -> None:
         setting.source,
         _lambdas(step),
     )
-    rows += experiments.published_rows(sensor)
+    rows += published.published_rows(sensor)
     setting.save('comparison', rows, plots.plot_tolerances)
 
 

@@ -333,8 +333,6 @@ class Config:
             raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.warm_start and (self.method != 'normals' or self.exact):
             raise ConfigError('parameter warm_start is for method normals, without exact')
-        if self.moves == 'swap' and not (self.exact and self.method == 'normals'):
-            raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.odometry and not self.odometry_frame:
             raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:

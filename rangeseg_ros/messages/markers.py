@@ -29,47 +29,16 @@ def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     plane's, its colour that of the overlay. Every three points of a hull are a triangle,
     counter-clockwise seen from the sensor.
     """
-    markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
+    markers = _Markers(make, header)
     for plane, colour in zip(planes, colours([plane.id for plane in planes]) / 255, strict=True):
         rgb = [float(part) for part in colour]
         tip = plane.centroid + ARROW_LENGTH * plane.normal
-        markers.append(
-            _marker(
-                make,
-                header,
-                'hulls',
-                plane.id,
-                TRIANGLE_LIST,
-                colour=(*rgb, 0.6),
-                points=_triangles(make, plane),
-            )
-        )
-        markers.append(
-            _marker(
-                make,
-                header,
-                'normals',
-                plane.id,
-                ARROW,
-                scale=(0.02, 0.04, 0.06),
-                colour=(*rgb, 1.0),
-                points=_points(make, (plane.centroid, tip)),
-            )
-        )
-        markers.append(
-            _marker(
-                make,
-                header,
-                'ids',
-                plane.id,
-                TEXT_VIEW_FACING,
-                scale=(0.0, 0.0, 0.12),
-                colour=(1.0, 1.0, 1.0, 1.0),
-                position=_points(make, (tip,))[0],
-                text=f'{plane.id} {plane.role}'.strip(),
-            )
-        )
-    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+        hull = markers.add('hulls', plane.id, TRIANGLE_LIST, (1.0, 1.0, 1.0), (*rgb, 0.6))
+        hull.points = _triangles(make, plane)
+        normal = markers.add('normals', plane.id, ARROW, (0.02, 0.04, 0.06), (*rgb, 1.0))
+        normal.points = _points(make, (plane.centroid, tip))
+        markers.add_text('ids', plane.id, f'{plane.id} {plane.role}'.strip(), tip)
+    return markers.message()
 
 
 def outline_message(make: Make, header: Any, lines: Sequence[NDArray[np.floating]]) -> Any:
@@ -77,22 +46,11 @@ def outline_message(make: Make, header: Any, lines: Sequence[NDArray[np.floating
 
     Namespace `ground`, of type LINE_STRIP.
     """
-    markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
+    markers = _Markers(make, header)
     for number, line in enumerate(lines):
-        closed = np.concatenate([line, line[:1]])
-        markers.append(
-            _marker(
-                make,
-                header,
-                'ground',
-                number,
-                LINE_STRIP,
-                scale=(0.02, 0.0, 0.0),
-                colour=(0.1, 0.9, 0.1, 1.0),
-                points=_points(make, closed),
-            )
-        )
-    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+        strip = markers.add('ground', number, LINE_STRIP, (0.02, 0.0, 0.0), (0.1, 0.9, 0.1, 1.0))
+        strip.points = _points(make, np.concatenate([line, line[:1]]))
+    return markers.message()
 
 
 def stairs_message(make: Make, header: Any, staircases: Sequence[Stairs]) -> Any:
@@ -101,34 +59,12 @@ def stairs_message(make: Make, header: Any, staircases: Sequence[Stairs]) -> Any
     Namespaces `edges`, of type LINE_STRIP, and `stairs`, whose texts are such as
     'up 4 x 0.17 / 0.28 m': direction, treads in sight, rise and run.
     """
-    markers = [_marker(make, header, '', 0, ARROW, action=DELETEALL)]
+    markers = _Markers(make, header)
     for number, stairs in enumerate(staircases):
-        markers.append(
-            _marker(
-                make,
-                header,
-                'edges',
-                number,
-                LINE_STRIP,
-                scale=(0.04, 0.0, 0.0),
-                colour=(1.0, 0.6, 0.0, 1.0),
-                points=_points(make, stairs.edge),
-            )
-        )
-        markers.append(
-            _marker(
-                make,
-                header,
-                'stairs',
-                number,
-                TEXT_VIEW_FACING,
-                scale=(0.0, 0.0, 0.12),
-                colour=(1.0, 1.0, 1.0, 1.0),
-                position=_points(make, stairs.edge.mean(axis=0, keepdims=True))[0],
-                text=str(stairs),
-            )
-        )
-    return make('visualization_msgs/msg/MarkerArray', markers=markers)
+        edge = markers.add('edges', number, LINE_STRIP, (0.04, 0.0, 0.0), (1.0, 0.6, 0.0, 1.0))
+        edge.points = _points(make, stairs.edge)
+        markers.add_text('stairs', number, str(stairs), stairs.edge.mean(axis=0))
+    return markers.message()
 
 
 def _points(make: Make, coordinates: ArrayLike) -> list[Any]:
@@ -147,51 +83,71 @@ def _triangles(make: Make, plane: Plane) -> list[Any]:
     return corners
 
 
-def _marker(
-    make: Make,
-    header: Any,
-    namespace: str,
-    number: int,
-    kind: int,
-    *,
-    action: int = ADD,
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    colour: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0),
-    points: Sequence[Any] = (),
-    position: Any = None,
-    text: str = '',
-) -> Any:
-    """visualization_msgs/Marker with every field, as not all makers have defaults."""
-    time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
-    untextured = make(
-        'sensor_msgs/msg/CompressedImage',
-        header=make('std_msgs/msg/Header', stamp=time, frame_id=''),
-        format='',
-        data=np.empty(0, np.uint8),
-    )
-    return make(
-        'visualization_msgs/msg/Marker',
-        header=header,
-        ns=namespace,
-        id=number,
-        type=kind,
-        action=action,
-        pose=make(
-            'geometry_msgs/msg/Pose',
-            position=position or make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0),
-            orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-        ),
-        scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', scale, strict=True))),
-        color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour, strict=True))),
-        lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
-        frame_locked=False,
-        points=list(points),
-        colors=[],
-        texture_resource='',
-        texture=untextured,
-        uv_coordinates=[],
-        text=text,
-        mesh_resource='',
-        mesh_file=make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8)),
-        mesh_use_embedded_materials=False,
-    )
+class _Markers:
+    """The markers of a message: the first one removes all that are older."""
+
+    def __init__(self, make: Make, header: Any) -> None:
+        self._make = make
+        self._header = header
+        self._markers: list[Any] = []
+        self.add('', 0, ARROW, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)).action = DELETEALL
+
+    def message(self) -> Any:
+        """visualization_msgs/MarkerArray."""
+        return self._make('visualization_msgs/msg/MarkerArray', markers=self._markers)
+
+    def add_text(
+        self, namespace: str, number: int, text: str, position: NDArray[np.floating]
+    ) -> None:
+        """Add white letters of 12 cm that face whoever looks."""
+        size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
+        marker = self.add(namespace, number, TEXT_VIEW_FACING, size, white)
+        (marker.pose.position,) = _points(self._make, position[None])
+        marker.text = text
+
+    def add(
+        self,
+        namespace: str,
+        number: int,
+        kind: int,
+        scale: tuple[float, float, float],
+        colour: tuple[float, ...],
+    ) -> Any:
+        """Add a visualization_msgs/Marker with every field, as not all makers have defaults."""
+        make = self._make
+        time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
+        untextured = make(
+            'sensor_msgs/msg/CompressedImage',
+            header=make('std_msgs/msg/Header', stamp=time, frame_id=''),
+            format='',
+            data=np.empty(0, np.uint8),
+        )
+        mesh = make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8))
+        marker = make(
+            'visualization_msgs/msg/Marker',
+            header=self._header,
+            ns=namespace,
+            id=number,
+            type=kind,
+            action=ADD,
+            pose=make(
+                'geometry_msgs/msg/Pose',
+                position=make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0),
+                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
+            ),
+            scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', scale, strict=True))),
+            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour, strict=True))),
+            lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
+            frame_locked=False,
+            points=[],
+            colors=[],
+            texture_resource='',
+            texture=untextured,
+            uv_coordinates=[],
+            text='',
+            mesh_resource='',
+            mesh_file=mesh,
+            mesh_use_embedded_materials=False,
+        )
+        self._markers.append(marker)
+        return marker
