@@ -5,7 +5,6 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-import yaml
 
 pytest.importorskip('rclpy')
 
@@ -17,7 +16,6 @@ from rclpy.parameter import Parameter
 
 from rangeseg_ros import Config, ConfigError
 from rangeseg_ros.io.params import read_config, read_params
-from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.parameters import NodeConfig, bind
 
 PARAMS = Path(__file__).parents[1] / 'params' / 'segment_planes.yaml'
@@ -129,27 +127,3 @@ def test_every_parameter_file_undoes_any_other():
     assert len(names) > 4
     for name, found in names.items():
         assert found == names['segment_planes.yaml'], name
-
-
-def test_launch_file_describes_the_node():
-    pytest.importorskip('launch_ros')
-    from launch import LaunchContext
-    from launch.actions import DeclareLaunchArgument
-    from launch.launch_description_sources import get_launch_description_from_python_launch_file
-
-    path = PARAMS.parents[1] / 'launch' / 'segment_planes.launch.py'
-    entities = get_launch_description_from_python_launch_file(os.fspath(path)).entities
-    arguments = {entity.name for entity in entities if isinstance(entity, DeclareLaunchArgument)}
-    assert {'namespace', 'name', 'depth', 'input', 'params_file', 'rviz'} <= arguments
-    context = LaunchContext()
-    values = dict.fromkeys(arguments, '')
-    context.launch_configurations.update(values, rviz='true', log_level='info', name='planes')
-    nodes = entities[-1].execute(context)
-    assert [node.node_executable for node in nodes] == ['segment_planes', 'rviz2']
-
-
-def test_rviz_shows_topics_that_there_are():
-    config = yaml.safe_load((PARAMS.parents[1] / 'rviz' / 'segment_planes.rviz').read_text())
-    displays = config['Visualization Manager']['Displays']
-    topics = {display['Topic']['Value'] for display in displays if 'Topic' in display}
-    assert topics <= {f'/segment_planes/{name}' for name in OUTPUTS} and len(topics) == 4

@@ -1,0 +1,146 @@
+"""The launch file and the RViz configuration: they name what the node has."""
+
+import os
+import runpy
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+import yaml
+
+from rangeseg_ros.messages.outputs import OUTPUTS
+
+ROOT = Path(__file__).parents[1]
+LAUNCH_FILE = ROOT / 'launch/segment_planes.launch.py'
+RVIZ_FILE = ROOT / 'rviz/segment_planes.rviz'
+
+# What a display of RViz shows.
+SHOWN_BY = {
+    'rviz_default_plugins/Image': 'sensor_msgs/msg/Image',
+    'rviz_default_plugins/MarkerArray': 'visualization_msgs/msg/MarkerArray',
+    'rviz_default_plugins/PointCloud2': 'sensor_msgs/msg/PointCloud2',
+}
+
+
+def displays():
+    config = yaml.safe_load(RVIZ_FILE.read_text())
+    return [d for d in config['Visualization Manager']['Displays'] if 'Topic' in d]
+
+
+def test_rviz_shows_topics_of_the_node_by_displays_of_their_types():
+    assert len(displays()) >= 4
+    for display in displays():
+        namespace, _, name = display['Topic']['Value'].rpartition('/')
+        assert namespace == '/segment_planes'
+        assert SHOWN_BY[display['Class']] == OUTPUTS[name].kind
+        # As the node offers it: reliable, nothing kept for late listeners.
+        assert display['Topic']['Reliability Policy'] == 'Reliable'
+        assert display['Topic']['Durability Policy'] == 'Volatile'
+
+
+@pytest.fixture
+def launched(monkeypatch):
+    """Settings of the nodes that the launch file starts, by values of its arguments.
+
+    There is no wheel of launch: what the file uses of it only keeps its arguments here.
+    """
+
+    class Kept(SimpleNamespace):
+        def __init__(self, *arguments, **settings):
+            super().__init__(arguments=arguments, settings=settings)
+
+    class LaunchConfiguration(Kept):
+        def perform(self, context):
+            return context[self.arguments[0]]
+
+    def provide(name, *kept):
+        module = ModuleType(name)
+        vars(module).update({kind: type(kind, (Kept,), {}) for kind in kept})
+        monkeypatch.setitem(sys.modules, name, module)
+        return module
+
+    provide('launch', 'LaunchDescription')
+    provide('launch.actions', 'DeclareLaunchArgument', 'OpaqueFunction')
+    substitutions = provide('launch.substitutions', 'EnvironmentVariable', 'PathJoinSubstitution')
+    substitutions.LaunchConfiguration = LaunchConfiguration
+    provide('launch_ros')
+    provide('launch_ros.actions', 'Node')
+    provide('launch_ros.substitutions', 'FindPackageShare')
+
+    def launch(**given):
+        (description,) = runpy.run_path(os.fspath(LAUNCH_FILE))[
+            'generate_launch_description'
+        ]().arguments
+        *declared, function = description
+        values = {d.arguments[0]: d.settings['default_value'] for d in declared}
+        assert set(given) <= set(values)
+        assert all(d.settings['description'] for d in declared)
+        values['params_file'] = os.fspath(ROOT / 'params/segment_planes.yaml')
+        values['fastdds_profile'] = os.fspath(ROOT / 'params/fastdds_large_images.xml')
+        nodes = function.settings['function'](values | given)
+        return [node.settings for node in nodes]
+
+    return launch
+
+
+def test_rviz_is_remapped_to_the_node_wherever_it_is(launched):
+    (node,) = launched()
+    assert node['executable'] == 'segment_planes'
+    node, rviz = launched(rviz='true', namespace='robot', name='planes')
+    assert (node['namespace'], node['name']) == ('robot', 'planes')
+    shown = {display['Topic']['Value'] for display in displays()}
+    assert dict(rviz['remappings']) == {
+        topic: topic.replace('/segment_planes', '/robot/planes') for topic in shown
+    }
+
+
+@pytest.mark.ros
+def test_the_node_starts_with_what_the_launch_file_gives_it(launched, tmp_path, monkeypatch):
+    pytest.importorskip('rclpy')
+    from ros_bench import Bench
+
+    extra = tmp_path / 'extra.yaml'
+    extra.write_text('/**:\n  ros__parameters:\n    min_pixels: 77\n')
+    (node,) = launched(
+        namespace='robot',
+        name='planes',
+        depth='camera/depth/image_rect',
+        imu='camera/imu',
+        use_imu='true',
+        extra_params_file=os.fspath(extra),
+        log_level='debug',
+    )
+    # As launch_ros puts it together.
+    arguments = [*node['ros_arguments'], '-r', f'__node:={node["name"]}']
+    for source, target in node['remappings']:
+        arguments += ['-r', f'{source}:={target}']
+    for parameters in node['parameters']:
+        if isinstance(parameters, dict):
+            file = tmp_path / 'given.yaml'
+            file.write_text(yaml.safe_dump({'/**': {'ros__parameters': parameters}}))
+            parameters = os.fspath(file)
+        arguments += ['--params-file', parameters]
+    for name, value in node['additional_env'].items():
+        monkeypatch.setenv(name, value)
+    with Bench(*arguments, namespace=node['namespace']) as bench:
+        bench.until(lambda: 'will subscribe' in bench.log())
+    log = bench.log()
+    assert '/robot/camera/depth/image_rect and /robot/camera/depth/camera_info' in log
+    assert '/robot/camera/imu' in log and 'unknown' not in log
+
+
+def test_launch_itself_takes_the_file():
+    pytest.importorskip('launch_ros')
+    from launch import LaunchContext
+    from launch.actions import DeclareLaunchArgument
+    from launch.launch_description_sources import get_launch_description_from_python_launch_file
+
+    entities = get_launch_description_from_python_launch_file(os.fspath(LAUNCH_FILE)).entities
+    context = LaunchContext()
+    for entity in entities:
+        if isinstance(entity, DeclareLaunchArgument):
+            entity.execute(context)
+    context.launch_configurations.update(rviz='true', name='planes')
+    nodes = entities[-1].execute(context)
+    assert [node.node_executable for node in nodes] == ['segment_planes', 'rviz2']
