@@ -11,11 +11,11 @@ from hypothesis import settings
 # on a busy machine. To be set before NumPy is imported, here and in the processes tests start.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from rangeseg_ros.cli.main import main
+
 # A shell that starts tests in the background has them ignore interrupts, and with them the
 # processes that they start and interrupt.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-
-from rangeseg_ros.cli.main import main
 
 # The same examples on every run, and no timed tests: machines are busy.
 settings.register_profile('rangeseg', deadline=None, derandomize=True)

@@ -12,30 +12,18 @@ from contextlib import contextmanager
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from visualization_msgs.msg import MarkerArray
 
+from rangeseg_ros.messages.make import message_class
+from rangeseg_ros.messages.motion import ODOMETRY
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
-TYPES = {
-    'labels': Image,
-    'planes': PointCloud2,
-    'markers': MarkerArray,
-    'overlay': Image,
-    'normals': Image,
-    'edges': Image,
-    'terrain': Image,
-    'ground': PointCloud2,
-    'obstacles': PointCloud2,
-    'drops': PointCloud2,
-    'unseen': PointCloud2,
-    'outline': MarkerArray,
-    'odometry': Odometry,
-}
+TYPES = {name: message_class(output.kind) for name, output in OUTPUTS.items()}
+TYPES['odometry'] = message_class(ODOMETRY)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
@@ -64,6 +52,7 @@ class Bench:
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
         command = command or [sys.executable, '-m', 'rangeseg_ros.ros.node']
         self.inputs = set()
+        self.spins = False
         self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115
         self.process = subprocess.Popen(
             [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *arguments],
@@ -270,6 +259,7 @@ class Bench:
     def _on_diagnostics(self, report):
         # Other nodes report there, too.
         if report.status[0].name.startswith(f'{self.name}:'):
+            self.spins = True
             self.received['diagnostics'].append(report)
 
     def log(self):
@@ -285,6 +275,8 @@ class Bench:
         """Stop the node, which must end well."""
         try:
             if self.process.poll() is None:
+                # Interrupted before it spins it would end with another code.
+                self.until(lambda: self.spins)
                 self.interrupt()
             code = self.process.wait(timeout=60)
         finally:

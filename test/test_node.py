@@ -193,7 +193,10 @@ def test_the_example_of_the_readme_reads_the_planes(bench, tmp_path):
 
 
 def test_diagnostics_tell_where_the_time_goes(bench):
-    status = bench.reported(lambda s: s.message.startswith('2 planes'), bench.send)
+    # On a machine that is so busy that the image came seconds late, there is no transport.
+    status = bench.reported(
+        lambda s: s.message.startswith('2 planes') and 'transport (ms)' in values_of(s), bench.send
+    )
     assert status.level == DiagnosticStatus.OK
     assert status.name == 'segment_planes: segmentation' and status.hardware_id == DEPTH
     values = values_of(status)

