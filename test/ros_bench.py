@@ -47,7 +47,7 @@ def values_of(status):
 class Bench:
     """Starts `segment_planes` and talks to it."""
 
-    def __init__(self, *arguments, camera=None, namespace='', command=None):
+    def __init__(self, *arguments, camera=None, namespace='', name='segment_planes', command=None):
         self.camera = camera or kinect_camera(160, 120)
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
         command = command or [sys.executable, '-m', 'rangeseg_ros.ros.node']
@@ -64,7 +64,7 @@ class Bench:
         self.node = rclpy.create_node('bench', context=self.context)
         self.executor = rclpy.executors.SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        self.name = f'{namespace}/segment_planes'.lstrip('/')
+        self.name = f'{namespace}/{name}'.lstrip('/')
         self.node.create_subscription(
             DiagnosticArray, '/diagnostics', self._on_diagnostics, RELIABLE
         )

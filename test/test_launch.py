@@ -123,7 +123,7 @@ def test_the_node_starts_with_what_the_launch_file_gives_it(launched, tmp_path, 
         arguments += ['--params-file', parameters]
     for name, value in node['additional_env'].items():
         monkeypatch.setenv(name, value)
-    with Bench(*arguments, namespace=node['namespace']) as bench:
+    with Bench(*arguments, namespace=node['namespace'], name=node['name']) as bench:
         bench.until(lambda: 'will subscribe' in bench.log())
     log = bench.log()
     assert '/robot/camera/depth/image_rect and /robot/camera/depth/camera_info' in log
