@@ -224,7 +224,8 @@ class Segmenter:
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)
         laps = watch.laps
-        tilt = tilt_of(planes, survey.up, config.role_tolerance, config.role_area)
+        limits = config.role_tolerance, config.role_area, config.ground_slope
+        tilt = tilt_of(planes, survey.up, *limits)
         return Segmentation(labels, planes, laps, reason, sensor, labelling, jumps, survey, tilt)
 
     def _by_planes(

@@ -118,7 +118,8 @@ class SequenceSegmenter:
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=unit(up))
             config = self.config
-            tilt = tilt_of(planes, survey.up, config.role_tolerance, config.role_area)
+            limits = config.role_tolerance, config.role_area, config.ground_slope
+            tilt = tilt_of(planes, survey.up, *limits)
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
         if isinstance(survey, Survey):

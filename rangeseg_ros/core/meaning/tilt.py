@@ -17,7 +17,7 @@ from rangeseg_ros.core.description.planes import Plane
 # Largest tilt that is looked for, degrees: beyond 45, a floor is nearer to a wall.
 _LARGEST = 40.0
 # How many times more pixels must speak for the planes' direction alone than for the stated one.
-_CLEARLY = 3.0
+_CLEARLY = 1.5
 # Share of the pixels of all planes that must agree with the planes' direction.
 _MOST = 0.5
 
@@ -46,7 +46,11 @@ class Tilt(NamedTuple):
 
 
 def tilt_of(
-    planes: Sequence[Plane], up: NDArray[np.float64], tolerance: float, area: float
+    planes: Sequence[Plane],
+    up: NDArray[np.float64],
+    tolerance: float,
+    area: float,
+    slope: float,
 ) -> Tilt | None:
     """The tilt that the planes show; None where they agree with `up`, or do not tell.
 
@@ -60,6 +64,8 @@ def tilt_of(
         Angle up to which planes agree with what is stated, degrees.
     area : float
         Smallest plane that shows where up is, square metres.
+    slope : float
+        Of a ramp that may fill the view, degrees: no tilt up to that.
     """
     normals = np.array([plane.normal for plane in planes]).reshape(-1, 3)
     pixels = np.array([plane.count for plane in planes], np.float64)
@@ -67,7 +73,7 @@ def tilt_of(
     stated = _agree(normals, up, tolerance)
     found: list[tuple[float, int]] = []
     # Only what may be a floor tells: a lone slanted wall or ceiling stands in many rooms.
-    for k in map(int, np.flatnonzero((steep > tolerance) & (steep <= _LARGEST))):
+    for k in map(int, np.flatnonzero((steep > max(tolerance, slope)) & (steep <= _LARGEST))):
         seen = _agree(normals, normals[k], tolerance)
         # Walls that the camera would turn about agree with both.
         alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()
