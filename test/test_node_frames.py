@@ -114,6 +114,86 @@ def tf_messages():
         patch.undo()
 
 
+def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, tf_messages):
+    """At 50 Hz, out of order, late, from another publisher, and with a jump: byte for byte.
+
+    Before the other tests, whose node would listen to the same camera.
+    """
+    camera, count, late, restart, jump = kinect_camera(160, 120), 10, 4, 6, 7
+    depth = floor_depth(camera)
+    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
+    camera_turn = Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)
+    recording = Recording()
+    still = 0, 'base_footprint', 'optical', camera_turn.as_quat(), (0, 0, HEIGHT)
+    recording.add_transform(*still, static=True)
+    groups = []
+
+    def sample(n, after):
+        stamp = 10**18 + n * 60_000_000 + after
+        x = 2e-10 * (stamp - 10**18)
+        turn = Rotation.from_euler('z', 3 * x).as_quat()
+        return stamp, 'odom', 'base_footprint', turn, (x, 0.0, 0.5 * (n >= jump))
+
+    for n in range(count):
+        stamp = 10**18 + n * 60_000_000
+        recording.add_camera(stamp, 160, 120, k=k, p=np.insert(k, (3, 6, 9), 0.0))
+        recording.add_image(stamp, depth)
+        # The last one is the first to tell where the image is, whatever comes first.
+        group = sample(n, -10_000_000), sample(n - 1, 30_000_000), sample(n, 10_000_000)
+        groups.append(group)
+        for moving in group:
+            recording.add_transform(*moving)
+    recording.messages[1:] = sorted(recording.messages[1:], key=lambda message: message[0])
+    recording.write(tmp_path / 'recording')
+    settings = {**FRAMES, 'target_frame': 'odom', 'tf_timeout': 60.0}
+    topics = 'planes', 'markers'
+    outcome = Replay(tmp_path / 'recording', tmp_path, Config(**settings), topics=topics).run()
+    assert outcome.mapped == 1 and not outcome.unlocated
+    with rosbag2.Reader(tmp_path / 'bag') as bag:
+        written = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
+
+    def message(stamp, parent, child, turn, shift):
+        time = Time(nanoseconds=stamp).to_msg()
+        found = transform(parent, child, time, Rotation.from_quat(turn), shift)
+        return tf_messages(transforms=[found])
+
+    words = [word for name, value in settings.items() for word in ('-p', f'{name}:={value}')]
+    with Bench(*words, camera=camera) as bench, bench.listening(*topics), bench.camera_on():
+        static = bench.node.create_publisher(tf_messages, '/tf_static', LATCHED)
+        moving = bench.node.create_publisher(tf_messages, '/tf', 100)
+        static.publish(message(*still))
+        for n, group in enumerate(groups):
+            if n == restart:
+                bench.node.destroy_publisher(moving)
+                moving = bench.node.create_publisher(tf_messages, '/tf', 100)
+            bench.until(moving.get_subscription_count)
+            image = bench.image(depth)
+            image.header.frame_id = 'optical'
+            image.header.stamp = Time(nanoseconds=10**18 + n * 60_000_000).to_msg()
+            if n == late:
+                bench.camera_info.publish(bench.info())
+                bench.depth.publish(image)
+                bench.spin(0.3)
+                assert not bench.find('planes', image)
+            for sample in group:
+                moving.publish(message(*sample))
+            if n != late:
+                bench.camera_info.publish(bench.info())
+                bench.depth.publish(image)
+            bench.until(lambda n=n: len(bench.received['markers']) == n + 1)
+        told = f'{outcome.mapped} planes in odom, begun anew: the fixed frame has jumped'
+        bench.status(lambda status: values_of(status).get('map from') == told)
+    for name in topics:
+        kind = OUTPUTS[name].kind
+        published = [
+            # Fast CDR leaves the bytes between aligned fields undefined: write them again.
+            bytes(ROS2.serialize_cdr(ROS2.deserialize_cdr(sent, kind), kind))
+            for sent in map(serialize_message, bench.received[name])
+        ]
+        replayed = [data for topic, data in written if topic == f'/segment_planes/{name}']
+        assert len(replayed) == count and published == replayed
+
+
 @pytest.fixture(scope='module')
 def robot(tf_messages):
     bench = Bench(
@@ -220,80 +300,3 @@ def test_without_its_transforms_a_frame_waits_and_is_segmented_all_the_same(robo
     status = bench.status(lambda s: 'fixed frame odom' in s.message)
     assert status.level == DiagnosticStatus.WARN
     assert 'not known that late' in status.message
-
-
-def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, tf_messages):
-    """At 50 Hz, out of order, late, from another publisher, and with a jump: byte for byte."""
-    camera, count, late, restart, jump = kinect_camera(160, 120), 10, 4, 6, 7
-    depth = floor_depth(camera)
-    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1])
-    camera_turn = Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)
-    recording = Recording()
-    still = 0, 'base_footprint', 'optical', camera_turn.as_quat(), (0, 0, HEIGHT)
-    recording.add_transform(*still, static=True)
-    groups = []
-
-    def sample(n, after):
-        stamp = 10**18 + n * 60_000_000 + after
-        x = 2e-10 * (stamp - 10**18)
-        turn = Rotation.from_euler('z', 3 * x).as_quat()
-        return stamp, 'odom', 'base_footprint', turn, (x, 0.0, 0.5 * (n >= jump))
-
-    for n in range(count):
-        stamp = 10**18 + n * 60_000_000
-        recording.add_camera(stamp, 160, 120, k=k, p=np.insert(k, (3, 6, 9), 0.0))
-        recording.add_image(stamp, depth)
-        # The last one is the first to tell where the image is, whatever comes first.
-        group = sample(n, -10_000_000), sample(n - 1, 30_000_000), sample(n, 10_000_000)
-        groups.append(group)
-        for moving in group:
-            recording.add_transform(*moving)
-    recording.messages[1:] = sorted(recording.messages[1:], key=lambda message: message[0])
-    recording.write(tmp_path / 'recording')
-    settings = {**FRAMES, 'target_frame': 'odom', 'tf_timeout': 60.0}
-    topics = 'planes', 'markers'
-    outcome = Replay(tmp_path / 'recording', tmp_path, Config(**settings), topics=topics).run()
-    assert outcome.mapped == 1 and not outcome.unlocated
-    with rosbag2.Reader(tmp_path / 'bag') as bag:
-        written = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
-
-    def message(stamp, parent, child, turn, shift):
-        time = Time(nanoseconds=stamp).to_msg()
-        found = transform(parent, child, time, Rotation.from_quat(turn), shift)
-        return tf_messages(transforms=[found])
-
-    words = [word for name, value in settings.items() for word in ('-p', f'{name}:={value}')]
-    with Bench(*words, camera=camera) as bench, bench.listening(*topics), bench.camera_on():
-        static = bench.node.create_publisher(tf_messages, '/tf_static', LATCHED)
-        moving = bench.node.create_publisher(tf_messages, '/tf', 100)
-        static.publish(message(*still))
-        for n, group in enumerate(groups):
-            if n == restart:
-                bench.node.destroy_publisher(moving)
-                moving = bench.node.create_publisher(tf_messages, '/tf', 100)
-            bench.until(moving.get_subscription_count)
-            image = bench.image(depth)
-            image.header.frame_id = 'optical'
-            image.header.stamp = Time(nanoseconds=10**18 + n * 60_000_000).to_msg()
-            if n == late:
-                bench.camera_info.publish(bench.info())
-                bench.depth.publish(image)
-                bench.spin(0.3)
-                assert not bench.find('planes', image)
-            for sample in group:
-                moving.publish(message(*sample))
-            if n != late:
-                bench.camera_info.publish(bench.info())
-                bench.depth.publish(image)
-            bench.until(lambda n=n: len(bench.received['markers']) == n + 1)
-        told = f'{outcome.mapped} planes in odom, begun anew: the fixed frame has jumped'
-        bench.status(lambda status: values_of(status).get('map from') == told)
-    for name in topics:
-        kind = OUTPUTS[name].kind
-        published = [
-            # Fast CDR leaves the bytes between aligned fields undefined: write them again.
-            bytes(ROS2.serialize_cdr(ROS2.deserialize_cdr(sent, kind), kind))
-            for sent in map(serialize_message, bench.received[name])
-        ]
-        replayed = [data for topic, data in written if topic == f'/segment_planes/{name}']
-        assert len(replayed) == count and published == replayed
