@@ -20,17 +20,17 @@ from matplotlib.figure import Figure
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.by_planes import method
-from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weighted, whole_blocks
-from rangeseg_ros.core.by_planes.patches import patches
-from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, surfaces
+from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weigh_blocks, whole_blocks
+from rangeseg_ros.core.by_planes.patches import grow_patches
+from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, join_surfaces
 from rangeseg_ros.core.calibration.calibrate import calibrate
-from rangeseg_ros.core.calibration.sightings import gathered, sightings
+from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.sensing.blocks import Blocks, quads
-from rangeseg_ros.core.sensing.bridges import bridged
+from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -74,8 +74,8 @@ def distortion(sensor_seed):
         for k in range(0, 360, 36):
             view = simulate_kinect(scene, camera, frame=k, seed=seed, sensor_seed=sensor_seed)
             image = RangeImage.from_depth(view.depth, camera)
-            seen.append(sightings(segmenter.segment(image).labels, image))
-    learned = calibrate(gathered(seen), camera.shape, camera).distortion.offset
+            seen.append(find_sightings(segmenter.segment(image).labels, image))
+    learned = calibrate(concatenate(seen), camera.shape, camera).distortion.offset
     known = learned != 0
     true = without_plane(QUANTUM * sensor_pattern(camera.shape, sensor_seed), known)
     pictures = []
@@ -131,7 +131,7 @@ def stages(image, config):
     stated = SensorModel.from_config(config)
     sensor = measured_sensor(image, fine, stated)
     steps, slopes = jump_steps(fine, sensor)
-    bridges = bridged(image, steps, slopes)
+    bridges = bridge_holes(image, steps, slopes)
     jumps = jump_edges(bridges, config.jump_edges, steps, slopes)
     grid = weights(bridges, jumps, config.weighting)
     pictures['edges'] = with_edges(image, jumps)
@@ -144,13 +144,13 @@ def stages(image, config):
     pictures['noise'] = noise_chart(*shown, stated, sensor)
     pictures['blocks'] = over(image, whole.astype(np.intp), size)
 
-    moments = weighted(blocks, whole, sensor)
+    moments = weigh_blocks(blocks, whole, sensor)
     links = block_links(grid, size)
-    roots = patches(0, len(moments), moments, *links, _PATCH_LARGEST)
+    roots = grow_patches(0, len(moments), moments, *links, _PATCH_LARGEST)
     patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
     alone = np.bincount(patch.ravel())[patch] == 1
     pictures['patches'] = over(image, np.where(alone, 0, patch), size)
-    surface, _ = surfaces(moments, links, size, least // 2)
+    surface, _ = join_surfaces(moments, links, size, least // 2)
     pictures['surfaces'] = over(image, surface, size)
 
     labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)

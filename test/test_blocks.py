@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
+from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks, block_moments
 from rangeseg_ros.core.sensing.grid import Grid
@@ -96,7 +96,7 @@ def test_weights_count_in_variances_of_the_sensor():
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
     plain = block_moments(inverse, rays, 4)
     facing = Blocks.planes(plain, rays, 4)._replace(slope=np.zeros(plain.shape[:2]))
-    blocks = weighted(facing, np.ones(plain.shape[:2], bool), sensor)
+    blocks = weigh_blocks(facing, np.ones(plain.shape[:2], bool), sensor)
     theta, residual = fit_all(blocks.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.reshape(-1, SIZE))
     np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)

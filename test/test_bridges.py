@@ -5,7 +5,7 @@ import pytest
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.bridges import bridged
+from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -54,7 +54,7 @@ def test_a_shadow_beside_a_jump_stays(gap):
     inverse = np.where(COLUMNS < 80, 1.0, 0.5)
     inverse[:, 80 : 80 + gap] = 0
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    whole = bridged(image, *steps_and_slopes(0.01, 0.001))
+    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.001))
     np.testing.assert_array_equal(whole.inverse, image.inverse)
 
 
@@ -62,7 +62,7 @@ def test_what_is_bridged_lies_between_its_neighbours():
     inverse, _ = crease(0.0)
     holes = HOLES['every fourth column']
     image = RangeImage(CAMERA.rays, np.where(holes, 0, inverse).astype(np.float32), CAMERA)
-    whole = bridged(image, *steps_and_slopes(0.01, 0.01))
+    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
     inner = holes & (COLUMNS < 159) & (np.abs(COLUMNS - 79.5) > 2)
     np.testing.assert_allclose(whole.inverse[inner], inverse[inner], atol=1e-5)
     np.testing.assert_array_equal(whole.inverse[~holes], image.inverse[~holes])
@@ -72,14 +72,14 @@ def test_wide_holes_stay():
     inverse, _ = crease(0.0)
     inverse[40:60, 20:40] = 0
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    whole = bridged(image, *steps_and_slopes(0.01, 0.01))
+    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
     assert not whole.inverse[42:58, 22:38].any()
 
 
 def test_an_image_without_holes_is_itself():
     inverse, _ = crease()
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    assert bridged(image, *steps_and_slopes(0.01, 0.01)) is image
+    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
 
 
 @pytest.mark.parametrize('size', [(32, 24), (160, 120), (424, 240), (1280, 720)])

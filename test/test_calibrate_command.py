@@ -8,7 +8,7 @@ from click.testing import CliRunner
 
 from rangeseg_ros import Config
 from rangeseg_ros.cli.calibrate import command
-from rangeseg_ros.core.calibration.sightings import sightings
+from rangeseg_ros.core.calibration.sightings import find_sightings
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
@@ -61,7 +61,7 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
     output = tmp_path / 'map.tiff'
     arguments = [folder / 'depth', '--camera', folder / 'camera.yaml', '--output', output]
     segmented = []
-    real = sightings
+    real = find_sightings
 
     def counting(labels, image):
         segmented.append(1)

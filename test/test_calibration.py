@@ -9,13 +9,13 @@ from rangeseg_ros.core.calibration.bands import column_profile
 from rangeseg_ros.core.calibration.calibrate import CalibrationError, calibrate
 from rangeseg_ros.core.calibration.field import solve
 from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
-from rangeseg_ros.core.calibration.sightings import cell_grid, gathered, sightings
+from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.simulation.fields import smooth_field
 
 
 def seen(count, error, **options):
-    return gathered([sightings(*frame) for frame in frames(count, error, **options)])
+    return concatenate([find_sightings(*frame) for frame in frames(count, error, **options)])
 
 
 @pytest.mark.parametrize('count', [15, 40])
@@ -35,7 +35,7 @@ def test_gauge_is_the_plane_over_what_was_seen():
         labels[45:] = 0
         return labels, image
 
-    cells = gathered([sightings(*bottom_unseen(f)) for f in frames(20, true_map())])
+    cells = concatenate([find_sightings(*bottom_unseen(f)) for f in frames(20, true_map())])
     offset = calibrate(cells, CAMERA.shape).distortion.offset.astype(float)
     known = np.zeros(CAMERA.shape, bool)
     known[:45] = True
@@ -155,7 +155,7 @@ def test_views_of_one_corner_are_refused():
         labels[20:] = 0
         return labels, image
 
-    cells = gathered([sightings(*corner(f)) for f in frames(20, true_map())])
+    cells = concatenate([find_sightings(*corner(f)) for f in frames(20, true_map())])
     with pytest.raises(CalibrationError, match='too few positions: planes cover'):
         calibrate(cells, CAMERA.shape)
 
@@ -163,7 +163,7 @@ def test_views_of_one_corner_are_refused():
 def test_clouds_are_seen_as_depth_images_are():
     labels, image = next(frames(1, true_map()))
     cloud = RangeImage.from_points(image.points)
-    one, other = sightings(labels, image), sightings(labels, cloud)
+    one, other = find_sightings(labels, image), find_sightings(labels, cloud)
     assert np.array_equal(one.cell, other.cell)
     assert other.inverse == pytest.approx(one.inverse, rel=1e-5)
     assert other.ray == pytest.approx(one.ray, abs=1e-5)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.curvature import curved
+from rangeseg_ros.core.by_planes.curvature import find_curved
 from rangeseg_ros.core.by_planes.plane_energy import Problem
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
@@ -39,7 +39,7 @@ def verdict(inverse, regions, distortion=0.0, seed=0):
     inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     problem = Problem.of(image, SENSOR, weights(image), 4)
-    return curved(problem, regions.astype(np.uint16), SENSOR)
+    return find_curved(problem, regions.astype(np.uint16), SENSOR)
 
 
 def test_planes_are_not_curved():

@@ -10,7 +10,7 @@ from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.sensor import resized, slopes, unseen_from_the_right
+from rangeseg_ros.simulation.sensors.sensor import resize, slopes, unseen_from_the_right
 from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense
 from rangeseg_ros.simulation.sensors.time_of_flight import TimeOfFlight
 from rangeseg_ros.simulation.solids import box, half_space
@@ -78,7 +78,7 @@ def test_residuals_by_block_size_are_like_those_of_real_frames(name):
 
 @pytest.mark.parametrize('name', SENSORS)
 def test_same_seeds_same_frame_and_truth_where_depth_is(name):
-    camera = resized(SENSORS[name](0).camera, 160, 120)
+    camera = resize(SENSORS[name](0).camera, 160, 120)
 
     def render(sensor_seed, seed):
         return simulate(kinect_room(1), SENSORS[name](sensor_seed), camera, seed=seed)
@@ -95,7 +95,7 @@ def test_same_seeds_same_frame_and_truth_where_depth_is(name):
 
 @pytest.mark.parametrize('name', SENSORS)
 def test_nothing_is_measured_where_nothing_is(name):
-    camera = resized(SENSORS[name](0).camera, 160, 120)
+    camera = resize(SENSORS[name](0).camera, 160, 120)
     depth = np.full(camera.shape, np.inf)
     assert not SENSORS[name](0).measure(depth, camera, np.random.default_rng(0)).any()
 

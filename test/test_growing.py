@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
-from rangeseg_ros.core.by_planes.surfaces import surfaces
+from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -34,8 +34,8 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     model = SensorModel.from_config(Config(**sensor))
     blocks = Blocks.of(image)
     blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
-    blocks = weighted(blocks, whole_blocks(image.inverse, edges, 4), model)
-    return surfaces(blocks, block_links(edges, 4), 4, least)
+    blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, 4), model)
+    return join_surfaces(blocks, block_links(edges, 4), 4, least)
 
 
 def covered(labels, label):
@@ -137,7 +137,7 @@ def test_clutter_is_no_surface():
 
 
 def test_nothing_to_grow_from():
-    labels, moments = surfaces(
+    labels, moments = join_surfaces(
         np.zeros((5, 7, 13)), (np.ones((5, 6), bool), np.ones((4, 7), bool)), 4
     )
     assert not labels.any() and labels.shape == (5, 7)

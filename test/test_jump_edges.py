@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.jump_edges import beside, bridged, plane_deviation, sobel
+from rangeseg_ros.core.sensing.jump_edges import beside, bridge_edges, plane_deviation, sobel
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 STEP = 0.0044
@@ -128,15 +128,15 @@ def test_bridging_joins_neighbours_that_do_not_touch():
     """The example in the documentation of MATLAB's bwmorph(..., 'bridge')."""
     edges = np.array([[1, 0, 0], [1, 0, 1], [0, 0, 1]], bool)
     expected = np.array([[1, 1, 0], [1, 1, 1], [0, 1, 1]], bool)
-    np.testing.assert_array_equal(bridged(edges), expected)
+    np.testing.assert_array_equal(bridge_edges(edges), expected)
 
 
 def test_bridging_leaves_touching_neighbours_alone():
     edges = np.zeros((7, 7), bool)
     edges[1:6, 3] = edges[3, 3:6] = True
     corner = np.eye(7, dtype=bool)
-    np.testing.assert_array_equal(bridged(corner), corner)
-    assert bridged(edges)[edges].all()
+    np.testing.assert_array_equal(bridge_edges(corner), corner)
+    assert bridge_edges(edges)[edges].all()
 
 
 def test_edge_pixels_lose_all_their_edges():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, CameraError, Config, RangeImage, Segmenter
 from rangeseg_ros.core.sensing.camera import CameraWarning
-from rangeseg_ros.core.sensing.lens import undistorted
+from rangeseg_ros.core.sensing.lens import undistort
 
 K = [[300, 0, 159.5], [0, 310, 119.5], [0, 0, 1]]
 P = [[290, 0, 160, 0], [0, 290, 120, 0], [0, 0, 1, 0]]
@@ -23,7 +23,7 @@ def lens(model, *d, **changes):
 def undistorted_radius(model, *d):
     """Radii of the points that appear at RADII, for lenses of radial distortion alone."""
     direction = np.array([0.6, 0.8])
-    x, y = undistorted(RADII * direction[0], RADII * direction[1], model, d)
+    x, y = undistort(RADII * direction[0], RADII * direction[1], model, d)
     known = ~np.isnan(x)
     np.testing.assert_allclose(x[known] * direction[1], y[known] * direction[0], atol=1e-12)
     return np.where(known, np.hypot(x, y), np.nan)

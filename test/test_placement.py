@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import fit_planes
-from rangeseg_ros.core.mapping.placement import moved_planes, placed
+from rangeseg_ros.core.mapping.placement import find_placement, moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -31,7 +31,7 @@ def known(**frames):
 
 def test_up_and_height_come_from_the_gravity_frame():
     lookup = known(pairs={('base_footprint', 'camera'): MOUNT})
-    found = placed(Config(gravity_frame='base_footprint'), 'camera', lookup)
+    found = find_placement(Config(gravity_frame='base_footprint'), 'camera', lookup)
     np.testing.assert_allclose(found.up, UP, atol=1e-12)
     assert found.height == 1 and found.sources == {'up': 'base_footprint'}
     assert not found.missing and not found.may_come
@@ -41,14 +41,14 @@ def test_the_accelerometer_takes_its_place_and_then_the_parameters():
     config = Config(gravity_frame='base_footprint', fixed_frame='odom')
     turned = Transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.ones(3))
     lookup = known(pairs={('camera', 'imu'): turned})
-    found = placed(config, 'camera', lookup, ('imu', np.array([0, 9.8, 0])))
+    found = find_placement(config, 'camera', lookup, ('imu', np.array([0, 9.8, 0])))
     np.testing.assert_allclose(found.up, (-9.8, 0, 0), atol=1e-12)
     assert found.sources['up'].startswith('imu in imu; no base_footprint')
     assert found.may_come and found.height is None and found.pose is None
     assert set(found.missing) == {'up', 'fixed frame'}
     # In the frame of the images no transform is needed; in an unknown one, parameters hold.
-    assert placed(Config(), 'camera', known(), ('camera', np.ones(3))).up is not None
-    found = placed(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
+    assert find_placement(Config(), 'camera', known(), ('camera', np.ones(3))).up is not None
+    found = find_placement(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
     assert found.up is None and not found.may_come
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
 

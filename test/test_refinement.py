@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
-from rangeseg_ros.core.by_planes.blocks import block_links, weighted, whole_blocks
+from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
-from rangeseg_ros.core.by_planes.surfaces import surfaces
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.energy import link_costs
@@ -241,8 +241,8 @@ def small_room(seed=900):
     edges = weights(image)
     blocks = Blocks.of(image)
     blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
-    blocks = weighted(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
-    found = surfaces(blocks, block_links(edges, BLOCK), BLOCK)
+    blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
+    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK)
     return Problem.of(image, sensor, edges, BLOCK), (found[0], blocks, found[1]), sensor
 
 

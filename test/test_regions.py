@@ -7,10 +7,10 @@ from scipy.sparse.csgraph import connected_components as graph_components
 
 from rangeseg_ros.core.regions import (
     connected_components,
+    drop_regions,
     is_noise,
     merge,
     plane_regions,
-    without,
 )
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -77,7 +77,7 @@ def test_merge_keeps_noise_that_touches_nothing():
 
 def test_regions_left_keep_their_order():
     regions = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
-    found = without(regions, np.array([True, False, True, False, False]))
+    found = drop_regions(regions, np.array([True, False, True, False, False]))
     assert found.tolist() == [[1, 1, 1, 1], [0, 0, 0, 2], [2, 3, 0, 0]]
     assert found.dtype == np.uint16
 

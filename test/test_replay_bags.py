@@ -14,7 +14,7 @@ from recordings import ROS2, Recording, record
 from replays import DELAY, read, record_walls, replay, results, walls
 from rosbags import rosbag2
 
-from rangeseg_ros.batch.replay import Replay, segmented
+from rangeseg_ros.batch.replay import Replay, segment_frames
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -85,7 +85,7 @@ def test_messages_are_those_of_the_node(done):
     written = [data for *_, data in read(done / 'plain/bag')]
     published = []
     with DepthBag(done / 'recording') as source:
-        for _, frame, image, result in segmented(source, SequenceSegmenter(Config())):
+        for _, frame, image, result in segment_frames(source, SequenceSegmenter(Config())):
             sec, nanosec = divmod(frame.stamp, 10**9)
             stamp = make_rclpy('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
             header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id='optical')

@@ -16,12 +16,12 @@ from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import resized
+from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, Piece, Terrain, slab
 
-CAMERA = resized(Kinect().camera, 320, 240)
+CAMERA = resize(Kinect().camera, 320, 240)
 FLOOR = slab(-3, 12, 0, 0, ALL)
 
 

@@ -13,13 +13,13 @@ from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
-from rangeseg_ros.simulation.sensors.sensor import resized
+from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import ALL, Piece, Terrain, slab
 
-CAMERA = resized(Kinect().camera, 320, 240)
+CAMERA = resize(Kinect().camera, 320, 240)
 HEIGHT = 1.0
 FLOOR = slab(-3, 12, 0, 0, ALL)
 
@@ -261,7 +261,7 @@ def test_images_of_any_size(shape, value):
 @pytest.mark.parametrize('kind', KINDS)
 def test_every_kind_of_scene_can_be_made(kind):
     terrain = terrain_scene(kind, 3)
-    camera = resized(CAMERA, 80, 60)
+    camera = resize(CAMERA, 80, 60)
     frame, again = (simulate_terrain(terrain, Kinect(), camera, 3) for _ in range(2))
     for one, other in zip(frame, again, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.runtime.threads import aside, halves, strips
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows, submit
 
 
 @pytest.fixture(params=[1, 2, 7])
@@ -26,12 +26,12 @@ def test_every_row_is_in_one_strip(threads, rows):
     def kernel(first, after, step):
         visits[first:after] += step
 
-    strips(kernel, rows, 3)
+    run_rows(kernel, rows, 3)
     assert (visits == 3).all()
 
 
 def test_halves_do_not_depend_on_the_number_of_threads(threads):
-    assert halves(lambda first, after, name: (first, after, name), 9, 'x') == (
+    assert map_halves(lambda first, after, name: (first, after, name), 9, 'x') == (
         (0, 4, 'x'),
         (4, 9, 'x'),
     )
@@ -41,13 +41,13 @@ def test_halves_do_not_depend_on_the_number_of_threads(threads):
 def test_strips_are_worked_on_at_the_same_time(threads):
     """Each waits for another; alone they would for ever."""
     barrier = threading.Barrier(min(threads, 4), timeout=20)
-    strips(lambda first, after: barrier.wait(), 100)
+    run_rows(lambda first, after: barrier.wait(), 100)
 
 
 @pytest.mark.parametrize('threads', [1], indirect=True)
 def test_one_thread_is_the_callers_own(threads):
     workers = set()
-    strips(lambda first, after: workers.add(threading.get_ident()), 100)
+    run_rows(lambda first, after: workers.add(threading.get_ident()), 100)
     assert workers == {threading.get_ident()}
 
 
@@ -56,18 +56,18 @@ def test_errors_come_back():
         raise ValueError(str(first))
 
     with pytest.raises(ValueError, match='0'):
-        strips(kernel, 100)
+        run_rows(kernel, 100)
     with pytest.raises(ValueError, match='late'):
-        aside(lambda: (time.sleep(0.05), int('late'))).result()
+        submit(lambda: (time.sleep(0.05), int('late'))).result()
 
 
 def total(queue):
-    queue.put(sum(halves(lambda first, after: after - first, 100)))
+    queue.put(sum(map_halves(lambda first, after: after - first, 100)))
 
 
 @pytest.mark.skipif('fork' not in multiprocessing.get_all_start_methods(), reason='no fork')
 def test_threads_are_started_anew_in_a_forked_process():
-    assert sum(halves(lambda first, after: after - first, 100)) == 100
+    assert sum(map_halves(lambda first, after: after - first, 100)) == 100
     context = multiprocessing.get_context('fork')
     queue = context.Queue()
     child = context.Process(target=total, args=(queue,), daemon=True)

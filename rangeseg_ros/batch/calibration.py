@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.calibrate import CalibrationError
 from rangeseg_ros.core.calibration.residuals import products
-from rangeseg_ros.core.calibration.sightings import Sightings, sightings
+from rangeseg_ros.core.calibration.sightings import Sightings, find_sightings
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
@@ -139,7 +139,7 @@ class SightingsOfPart:
                 raise CalibrationError(f'{self.source.path}: images of several sizes')
             shape, camera = image.shape, image.camera
             image = corrected(image, self.config)
-            frames.append(sightings(segmenter.segment(image).labels, image))
+            frames.append(find_sightings(segmenter.segment(image).labels, image))
         if shape is None:
             raise CalibrationError(f'{self.source.path}: no frames')
         seen = Seen(frames, shape, camera)

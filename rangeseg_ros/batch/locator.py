@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import Placement, placed
+from rangeseg_ros.core.mapping.placement import Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.messages.frames import DepthFrame
@@ -41,6 +41,6 @@ class Locator:
         def lookup(target: str, source: str) -> Transform:
             return self._recorded.lookup(target, source, frame.stamp, frame.time)
 
-        self.last = found = placed(self._config, frame.frame_id, lookup)
+        self.last = found = find_placement(self._config, frame.frame_id, lookup)
         self.problems.update(f'{what} {why}' for what, why in found.missing.items())
         return found

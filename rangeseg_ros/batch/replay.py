@@ -154,7 +154,7 @@ class Replay:
             tilts: list[Tilt] = []
 
             def results() -> Iterator[Timed]:
-                found = segmented(source, sequence, located.place, progress)
+                found = segment_frames(source, sequence, located.place, progress)
                 for index, frame, image, result in found:
                     stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                     stem = f'{index:06d}_{stamp}'
@@ -227,7 +227,7 @@ class Replay:
         return digest.hexdigest()[:16]
 
 
-def segmented(
+def segment_frames(
     source: DepthBag,
     sequence: SequenceSegmenter,
     place: Callable[[DepthFrame], Placement] = lambda frame: Placement(),

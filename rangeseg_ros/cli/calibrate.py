@@ -15,7 +15,7 @@ from rangeseg_ros.batch.calibration import ResidualsOfFrame, Seen, Source, parts
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.calibration.calibrate import Calibration, calibrate
 from rangeseg_ros.core.calibration.residuals import randomness
-from rangeseg_ros.core.calibration.sightings import Sightings, gathered
+from rangeseg_ros.core.calibration.sightings import Sightings, concatenate
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.io.cameras import read_camera
@@ -156,7 +156,7 @@ def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
     if len({part.camera for part in seen}) > 1:
         raise click.UsageError('recordings of several cameras')
     frames = [frame for part in seen for frame in part.frames]
-    return gathered(frames), seen[0].shape, seen[0].camera
+    return concatenate(frames), seen[0].shape, seen[0].camera
 
 
 def _tell(result: Calibration) -> None:

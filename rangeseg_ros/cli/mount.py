@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from rangeseg_ros.batch.replay import segmented
+from rangeseg_ros.batch.replay import segment_frames
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.mapping.mount import Mount, mount_of
 from rangeseg_ros.core.mapping.placement import Placement
@@ -39,7 +39,7 @@ def command(
     still = Placement(pose=Transform.identity())
     frames, name = 0, ''
     with DepthBag(recording) as source:
-        for _, frame, _, _ in segmented(source, sequence, lambda frame: still):
+        for _, frame, _, _ in segment_frames(source, sequence, lambda frame: still):
             frames, name = frames + 1, frame.frame_id
     mount = mount_of(sequence.map.planes, frames)
     if mount is None:

@@ -34,7 +34,7 @@ from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.segcomp_truth import ground_truth, region_angles
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
-from rangeseg_ros.simulation.sensors.sensor import resized
+from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
@@ -127,7 +127,7 @@ def rooms(
     The files are those of `simulate kinect`. Another width keeps the horizontal field of view.
     """
     camera = SENSORS[sensor](sensor_seed).camera
-    camera = resized(camera, width or camera.width, height or camera.height)
+    camera = resize(camera, width or camera.width, height or camera.height)
 
     def see(scene: Scene, frame: int, scene_seed: int) -> Frame:
         if sensor == 'kinect':

@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from rangeseg_ros.batch.locator import Locator
-from rangeseg_ros.batch.replay import segmented
+from rangeseg_ros.batch.replay import segment_frames
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.segmenter import Segmentation
@@ -81,7 +81,7 @@ def command(
         log.log('camera', rerun.ViewCoordinates.RDF, static=True)
         count = 0
         show = partial(options.progress, unit='frame')
-        for index, frame, image, result in segmented(source, sequence, located.place, show):
+        for index, frame, image, result in segment_frames(source, sequence, located.place, show):
             log.set_time('frame', sequence=index)
             log.set_time('stamp', timestamp=np.datetime64(frame.stamp, 'ns'))
             if sequence.pose:

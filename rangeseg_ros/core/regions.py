@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 
 VGA = 640 * 480
@@ -55,7 +55,7 @@ def plane_regions(
             area = np.bincount(regions.ravel(), minlength=len(area))
         area = np.where(noise, 0, area)
     area[0] = 0
-    return translated(regions, by_falling_size(np.where(area < min_pixels, 0, area)))
+    return relabel(regions, by_falling_size(np.where(area < min_pixels, 0, area)))
 
 
 def connected_components(
@@ -162,7 +162,7 @@ def _thin(area: NDArray[np.int64], perimeter: NDArray[np.int64]) -> NDArray[np.b
 def _measures(regions: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Number of pixels of each region, and of those that touch another or the border."""
     count = int(regions.max(initial=0)) + 1
-    (upper, upper_rim), (lower, lower_rim) = halves(_counts, len(regions), regions, count)
+    (upper, upper_rim), (lower, lower_rim) = map_halves(_counts, len(regions), regions, count)
     return upper + lower, upper_rim + lower_rim
 
 
@@ -229,11 +229,11 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
     return framed.reshape(height + 2, row)[1:-1, 1:-1].copy()
 
 
-def without(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
+def drop_regions(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
     kept = ~dropped
     kept[0] = False
-    return translated(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
+    return relabel(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
 
 
 def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
@@ -245,7 +245,7 @@ def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
 
 
 @njit(cache=True)
-def translated(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+def relabel(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Regions (H, W) by another name: `table` (M + 1,) uint16 has the new number of each."""
     result = np.empty(regions.shape, np.uint16)
     for i in range(regions.shape[0]):

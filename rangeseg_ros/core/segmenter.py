@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import Plane, described
+from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
@@ -24,7 +24,7 @@ from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.bridges import bridged
+from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.jump_edges import GridEdges, jump_edges, pixels_beside
@@ -202,18 +202,18 @@ class Segmenter:
         if config.edge_step > 0:
             steps = np.full_like(steps, config.edge_step)
         # What was measured tells the planes; where they end is told with small holes bridged.
-        whole = bridged(image, steps, slopes)
+        whole = bridge_holes(image, steps, slopes)
         jumps = jump_edges(whole, config.jump_edges, steps, slopes)
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
         regions, labelling = method(whole, blocks, grid, sensor, watch)
         if config.method == 'planes':
-            regions, fits = by_planes.united(regions, image, blocks, sensor, grid)
+            regions, fits = by_planes.unite_regions(regions, image, blocks, sensor, grid)
         else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             fits = Fits.of(regions, image, SensorModel.from_config(config), blocks)
-        planes = described(regions, whole, fits)
+        planes = describe_regions(regions, whole, fits)
         if len(planes) < regions.max():
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
             kept = np.zeros(int(regions.max()) + 1, np.uint16)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from rclpy.node import Node
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import Placement, placed
+from rangeseg_ros.core.mapping.placement import Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.gravity import Gravity
@@ -60,7 +60,7 @@ class Locator:
                 raise TransformError('tf is not read')
             return transforms.lookup(target, source, frame.stamp)
 
-        return placed(config, frame.frame_id, lookup, gravity.reading if gravity else None)
+        return find_placement(config, frame.frame_id, lookup, gravity.reading if gravity else None)
 
     def delay(self, config: Config, frame: DepthFrame, waited: float) -> float:
         """Seconds for which a frame is to wait for transforms after `waited` seconds."""

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +73,7 @@ def cast(
     first = 0
     for solid in solids:
         quadric = _NONE if solid.quadric is None else solid.quadric
-        strips(
+        run_rows(
             _enter,
             len(directions),
             origins,

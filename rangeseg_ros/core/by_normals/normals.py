@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -62,7 +62,7 @@ def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
         NaN where the pixel or one of its neighbours was not measured or lies outside the image.
     """
     normals = np.empty(image.rays.shape, np.float32)
-    strips(_cross_product, len(normals), image.inverse, image.rays, baseline, normals)
+    run_rows(_cross_product, len(normals), image.inverse, image.rays, baseline, normals)
     return normals
 
 

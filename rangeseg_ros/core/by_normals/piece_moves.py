@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_normals.angles import UNIT
 from rangeseg_ros.core.by_normals.piece_graph import Graph
 from rangeseg_ros.core.graphcut.cut import ROUNDING
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 
 
 @njit(cache=True)
@@ -64,7 +64,7 @@ def relabel_regions(labels: NDArray[np.int32], costs: NDArray[np.uint16], graph:
     region, order, first = np.empty(n, np.int32), np.empty(n, np.int32), np.empty(n + 1, np.int32)
     regions = _regions(labels, graph, region, order, first)
     total = np.empty((regions, count), np.int32)
-    strips(_sum_up, count, costs, region, total)
+    run_rows(_sum_up, count, costs, region, total)
     _relabel(labels, region, order, first, total, graph)
 
 

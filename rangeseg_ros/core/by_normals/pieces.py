@@ -24,7 +24,7 @@ from rangeseg_ros.core.by_normals.tiles import (
     load,
     mark_splits,
 )
-from rangeseg_ros.core.runtime.threads import aside, halves, strips
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows, submit
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Borders of pieces run in steps: so much shorter are those that pixels draw in the end.
@@ -71,16 +71,16 @@ def pieces(
     """
     table, nearest = angle_table(directions.astype(np.float32).tobytes(), len(directions))
     cells = np.empty(normals.shape[:2], np.int32)
-    strips(find_cells, len(cells), normals, cells)
+    run_rows(find_cells, len(cells), normals, cells)
     image = np.full(cells.shape, -1, np.int32)
     tiles = -(-len(cells) // TILE)
-    above, under = halves(_cut, tiles, cells, normals, table, nearest, grid, smoothness, image)
+    above, under = map_halves(_cut, tiles, cells, normals, table, nearest, grid, smoothness, image)
     below = image[tiles // 2 * TILE :]
     np.add(below, len(above), out=below, where=below >= 0)
     votes = np.concatenate([above, under])
-    graph = aside(adjacency, image, len(votes), grid, STAIRCASE_FACTOR * smoothness)
+    graph = submit(adjacency, image, len(votes), grid, STAIRCASE_FACTOR * smoothness)
     costs = np.empty((len(votes), len(directions)), np.uint16)
-    strips(_sum_up, tiles, image, cells, table, costs)
+    run_rows(_sum_up, tiles, image, cells, table, costs)
     return Pieces(image, costs, votes, graph.result())
 
 

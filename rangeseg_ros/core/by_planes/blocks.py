@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.regions import VGA
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SLOPE
@@ -54,7 +54,7 @@ def whole_blocks(inverse: NDArray[np.float32], grid: Grid, size: int) -> NDArray
     """
     height, width = inverse.shape
     result = np.zeros((-(-height // size), -(-width // size)), np.bool_)
-    strips(_find_whole, len(result), inverse, grid, size, result)
+    run_rows(_find_whole, len(result), inverse, grid, size, result)
     return result
 
 
@@ -120,7 +120,9 @@ def block_links(grid: Grid, size: int) -> Links:
 
 
 @njit(cache=True)
-def weighted(blocks: Blocks, whole: NDArray[np.bool_], sensor: SensorModel) -> NDArray[np.float64]:
+def weigh_blocks(
+    blocks: Blocks, whole: NDArray[np.bool_], sensor: SensorModel
+) -> NDArray[np.float64]:
     """Moments with weights according to the sensor, and the ratios of its variances.
 
     Parameters

@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.plane_energy import Problem, region_moments
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -30,7 +30,7 @@ _X, _Y = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 _INLIER = 4.0
 
 
-def curved(
+def find_curved(
     problem: Problem, regions: NDArray[np.uint16], sensor: SensorModel
 ) -> NDArray[np.bool_]:
     """Test the second-order part of each region's residuals.
@@ -58,7 +58,7 @@ def curved(
     theta, _ = fit_all(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
     limit = _INLIER * np.sqrt(1 + 4 * ratio)
-    parts = halves(
+    parts = map_halves(
         _normal_equations,
         len(regions),
         regions,

@@ -27,7 +27,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
-from rangeseg_ros.core.runtime.threads import aside, strips
+from rangeseg_ros.core.runtime.threads import run_rows, submit
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # An improvement smaller than this is rounding.
@@ -129,7 +129,7 @@ def _in_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
     result is the same for any number of threads.
     """
     middle = height // 2
-    lower = aside(kernel, (min(middle + 1, height), height), *arguments)
+    lower = submit(kernel, (min(middle + 1, height), height), *arguments)
     kernel((0, max(middle - 1, 0)), *arguments)
     lower.result()
     kernel((max(middle - 2 * _BAND, 0), min(middle + 2 * _BAND, height)), *arguments)
@@ -159,7 +159,7 @@ def _descended(
     exact = surfaces.astype(np.float32)
     least = cv2.erode(exact, window)
     settled = (least > 0) & (least == cv2.dilate(exact, window))
-    strips(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
+    run_rows(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
     _in_halves(_descend, len(labels) // problem.width, labels, cost, problem, models)
     return labels, cost
 

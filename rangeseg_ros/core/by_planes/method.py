@@ -10,18 +10,18 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.blocks import (
     block_links,
     block_size,
-    weighted,
+    weigh_blocks,
     whole_blocks,
 )
-from rangeseg_ros.core.by_planes.curvature import curved
+from rangeseg_ros.core.by_planes.curvature import find_curved
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
-from rangeseg_ros.core.by_planes.surfaces import surfaces
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.coplanar import parts, touching
+from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.regions import VGA, by_falling_size, least_pixels, translated, without
-from rangeseg_ros.core.runtime.threads import aside
+from rangeseg_ros.core.regions import VGA, by_falling_size, drop_regions, least_pixels, relabel
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, block_moments, quads
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -61,7 +61,7 @@ class Labelling:
 
     def flat(self, regions: NDArray[np.uint16]) -> NDArray[np.uint16]:
         """Regions (H, W) of the labelling without those that bend, numbered anew."""
-        return without(regions, curved(self._problem, regions, self.sensor))
+        return drop_regions(regions, find_curved(self._problem, regions, self.sensor))
 
 
 def segment(
@@ -99,12 +99,12 @@ def segment(
     whole = whole_blocks(image.inverse, grid, size)
     whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)
     lap('blocks')
-    pending = aside(Problem.of, image, sensor, grid, size)
+    pending = submit(Problem.of, image, sensor, grid, size)
     # A region may gain as much again from pixels that no block could take.
     least = max(least_pixels(config.min_pixels, image.shape) // 2, 1)
     enlarged = image.inverse.size / VGA
-    weights = weighted(blocks, whole, sensor)
-    surface, moments = surfaces(weights, block_links(grid, size), size, least, enlarged)
+    weights = weigh_blocks(blocks, whole, sensor)
+    surface, moments = join_surfaces(weights, block_links(grid, size), size, least, enlarged)
     problem = pending.result()
     lap('surfaces')
     labels, models = refine(
@@ -114,7 +114,7 @@ def segment(
     return Labelling(labels.reshape(image.shape), sensor, problem, models)
 
 
-def united(
+def unite_regions(
     regions: NDArray[np.uint16],
     image: RangeImage,
     blocks: Blocks,
@@ -136,11 +136,11 @@ def united(
     """
     fits = Fits.of(regions, image, sensor, blocks)
     count = len(fits.theta)
-    group = parts(fits, touching(regions, grid, count, fits.inner))
+    group = group_coplanar(fits, find_borders(regions, grid, count, fits.inner))
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)
     np.add.at(pixels, group, fits.pixels)
     pixels[0] = 0
     table = by_falling_size(pixels)[group]
-    return translated(regions, table), fits.united(table, image.camera is not None)
+    return relabel(regions, table), fits.united(table, image.camera is not None)

@@ -23,7 +23,7 @@ _ROUGH = 10.0
 
 
 @njit(cache=True, nogil=True)
-def patches(
+def grow_patches(
     first: int,
     after: int,
     moments: NDArray[np.float64],
@@ -234,11 +234,11 @@ def _grow(
                 tail[a] = tail[partner]
             version[a] += 1
             heappush(heap, (residual[a] / moments[a, COUNT], a, version[a]))
-    return roots(parent)
+    return find_roots(parent)
 
 
 @njit(cache=True)
-def roots(parent: NDArray[np.intp]) -> NDArray[np.intp]:
+def find_roots(parent: NDArray[np.intp]) -> NDArray[np.intp]:
     """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
     root = np.empty(len(parent), np.intp)
     for a in range(len(parent)):

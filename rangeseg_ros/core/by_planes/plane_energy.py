@@ -17,7 +17,7 @@ from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.regions import VGA
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -182,7 +182,9 @@ def region_moments(
     (count, 13) float64
         Zeros for label 0.
     """
-    upper, lower = halves(_sum_moments, len(labels), labels, count, inverse, rays, weight, sensor)
+    upper, lower = map_halves(
+        _sum_moments, len(labels), labels, count, inverse, rays, weight, sensor
+    )
     return upper + lower
 
 

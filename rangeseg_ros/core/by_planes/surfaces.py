@@ -18,8 +18,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Links
-from rangeseg_ros.core.by_planes.patches import misfit, patches, roots
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, common_residual, fit
 
 DISTORTION_PIXELS = 2000.0
@@ -33,7 +33,7 @@ _BLOCKS_OF_PATCH = 3
 _PATCH_LARGEST = 1504
 
 
-def surfaces(
+def join_surfaces(
     moments: NDArray[np.float64],
     links: Links,
     block: int,
@@ -67,17 +67,17 @@ def surfaces(
     # No patch reaches over the middle, but neither does any reach across a large surface.
     # Not even in a small image is one smaller than four blocks.
     largest = max(enlarged * _PATCH_LARGEST, 4 * block**2)
-    roots = halves(patches, shape[0], moments, *links, largest)
-    patch, moments = _renumbered(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
+    roots = map_halves(grow_patches, shape[0], moments, *links, largest)
+    patch, moments = _renumber(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))
-    surface, moments = _renumbered(
+    surface, moments = _renumber(
         _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, least
     )
     return surface[patch].reshape(shape), moments
 
 
 @njit(cache=True)
-def _renumbered(
+def _renumber(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
@@ -171,4 +171,4 @@ def _join(
             border[b, c] = border[c, b] = 0
             if border[a, c] > 0:
                 heappush(heap, (strain[a, c] / border[a, c], min(a, c), max(a, c)))
-    return roots(parent)
+    return find_roots(parent)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from rangeseg_ros.core.calibration.sightings import fitted, plane_pixels
+from rangeseg_ros.core.calibration.sightings import fit_plane, plane_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # Distances of pixels that are compared: dense where noise, sparse where distortion correlates.
@@ -44,9 +44,9 @@ def products(labels: NDArray[np.uint16], image: RangeImage) -> NDArray[np.float6
         mask = inner & (labels == label)
         if np.count_nonzero(mask) < _FEWEST:
             continue
-        error = inverse[mask] - rays[mask] @ fitted(rays[mask], inverse[mask])
+        error = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
         mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
-        residual[mask] = inverse[mask] - rays[mask] @ fitted(rays[mask], inverse[mask])
+        residual[mask] = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
         used |= mask
     return _along_rows(residual, used, labels) + _along_rows(residual.T, used.T, labels.T)
 

@@ -78,7 +78,7 @@ def cell_grid(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // size), -(-shape[1] // size)
 
 
-def sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
+def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     """Planes of one frame.
 
     Parameters
@@ -98,7 +98,7 @@ def sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
         mask = inner & (labels == label)
         if np.count_nonzero(mask) < _FEWEST * size * size:
             continue
-        error = inverse[mask] - rays[mask] @ fitted(rays[mask], inverse[mask])
+        error = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
         mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
         count = np.bincount(cells[mask], minlength=rows * columns)
         # Where half of a cell is the plane's, its mean stands for the cell.
@@ -106,7 +106,7 @@ def sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
         if len(kept) < _FEWEST:
             continue
         own, y, ray = cells[mask], inverse[mask], rays[mask]
-        residual[mask] = y - ray @ fitted(ray, y)
+        residual[mask] = y - ray @ fit_plane(ray, y)
         sums = [np.bincount(own, part, len(count))[kept] for part in (y, *ray.T)]
         found.append((kept, np.stack(sums, axis=1) / count[kept, None]))
     step = np.where(labels[:, 1:] == labels[:, :-1], np.diff(residual, axis=1), np.nan)
@@ -134,13 +134,13 @@ def plane_pixels(
     return inner, inverse / along, rays / along[..., None]
 
 
-def fitted(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+def fit_plane(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least-squares plane theta . ray = inverse depth of pixels (N, 3), (N,)."""
     theta, *_ = np.linalg.lstsq(rays.T @ rays, rays.T @ inverse, rcond=None)
     return np.asarray(theta, np.float64)
 
 
-def gathered(frames: Sequence[Sightings]) -> Sightings:
+def concatenate(frames: Sequence[Sightings]) -> Sightings:
     """Sightings of several frames, numbered one after the other."""
     first = np.cumsum([0, *(len(part.jumps) for part in frames)])
     counts = np.concatenate([np.diff(part.start) for part in frames])

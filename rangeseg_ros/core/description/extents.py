@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -44,7 +44,7 @@ def areas_and_axes(
         Unit vector in the plane of the largest second moment of the area; x >= 0.
     """
     arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents, inner
-    upper, lower = halves(_area_moments, len(labels), *arrays)
+    upper, lower = map_halves(_area_moments, len(labels), *arrays)
     sums = upper + lower
     # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
     area = sums[:, 0] * np.linalg.norm(theta, axis=1)
@@ -85,7 +85,7 @@ def rectangles(
     camera = image.camera
     half = (0.5 / camera.fx, 0.5 / camera.fy) if camera and camera.pinhole else (0.0, 0.0)
     arrays = labels, image.inverse, image.rays, theta, axes, inner
-    upper, lower = halves(_limits, len(labels), *arrays, *half)
+    upper, lower = map_halves(_limits, len(labels), *arrays, *half)
     # Smallest and largest.
     return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
 

@@ -101,11 +101,11 @@ class Plane:
 
 
 def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> list[Plane]:
-    """Plane of every region, as `described`, fitted as by `Fits.of`."""
-    return described(labels, image, Fits.of(labels, image, sensor))
+    """Plane of every region, as `describe_regions`, fitted as by `Fits.of`."""
+    return describe_regions(labels, image, Fits.of(labels, image, sensor))
 
 
-def described(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:
+def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:
     """Uncertainty, place and shape of every region's plane.
 
     Parameters

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.interior import rows_of_blocks
-from rangeseg_ros.core.runtime.threads import halves
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -101,7 +101,7 @@ class Cells(NamedTuple):
         inner = np.where(taken[inner], inner, np.uint16(0))
         cells = cls(box, border, size, columns, start, inner, np.zeros((start[-1], RECORD)))
         arrays = labels, image.inverse, image.rays, blocks
-        upper, lower = halves(_sums, len(labels), *arrays, cells, sensor, central)
+        upper, lower = map_halves(_sums, len(labels), *arrays, cells, sensor, central)
         return cells._replace(sums=upper + lower)
 
     def without_doubtful(
@@ -128,7 +128,7 @@ class Cells(NamedTuple):
         """
         central = image.camera is not None
         arrays = labels, image.inverse, image.rays, blocks
-        parts = halves(_doubtful, len(labels), *arrays, self, sensor, theta, central)
+        parts = map_halves(_doubtful, len(labels), *arrays, self, sensor, theta, central)
         (pixels, outliers, rims), outlying, rim = (a + b for a, b in zip(*parts, strict=True))
         region = np.repeat(np.arange(len(self.size)), np.diff(self.start))
         few = 2 * outliers <= pixels

@@ -14,7 +14,7 @@ from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_variance
 
-# Pairs of regions and how much links them, see `touching`.
+# Pairs of regions and how much links them, see `find_borders`.
 Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 # Quantile 0.99 of chi-squared with the three degrees of freedom of a plane, and what the parts of
@@ -56,7 +56,7 @@ def common_surfaces(fits: Fits) -> NDArray[np.intp]:
 
 
 @njit(cache=True, nogil=True)
-def touching(
+def find_borders(
     regions: NDArray[np.uint16],
     grid: Grid,
     count: int,
@@ -122,7 +122,7 @@ def _tell(k: int, m: int, links: int, count: int, pairs: list[int], balance: lis
         balance.append(links)
 
 
-def parts(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
+def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """Group regions that touch and whose planes agree, as `common_surfaces` does.
 
     What lies within a region, and on average no higher or deeper, is a part of it however its
@@ -135,7 +135,7 @@ def parts(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     fits : Fits
         Of M + 1 regions.
     stretches : two (N,) int
-        Of their borders, see `touching`.
+        Of their borders, see `find_borders`.
 
     Returns
     -------

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 
 
@@ -25,7 +25,7 @@ def interior(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """
     height, width = labels.shape
     filled = np.zeros((-(-height // BLOCK), -(-width // BLOCK)), np.uint16)
-    strips(_fill, height // BLOCK, labels, filled)
+    run_rows(_fill, height // BLOCK, labels, filled)
     inner = np.zeros_like(filled)
     _shrink(filled, inner)
     return inner

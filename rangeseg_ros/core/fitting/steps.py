@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.noise import ROUGH
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -40,7 +40,7 @@ def jump_steps(
     shape = blocks.squared.shape
     steps, slopes = np.empty(shape, np.float32), np.empty(shape, np.float32)
     factor = 25 * 0.72 * sensor.agreement
-    strips(_find_steps, shape[0], blocks, sensor, factor, steps, slopes)
+    run_rows(_find_steps, shape[0], blocks, sensor, factor, steps, slopes)
     return steps, slopes
 
 

@@ -91,11 +91,11 @@ def fronts(
                 if p >= first:
                     beside[found], sites[found] = labels[q], p
                     found += 1
-    return grouped(beside[:found], sites[:found], count)
+    return group_sites(beside[:found], sites[:found], count)
 
 
 @njit(cache=True, nogil=True)
-def grouped(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
+def group_sites(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
     """Sort sites (N,) by their labels (N,), which are below `count`; of a label in order."""
     start = np.zeros(count + 2, np.int64)
     for label in labels:

@@ -56,7 +56,7 @@ def areas(shape: shapely.Geometry) -> Polygon | MultiPolygon:
     return MultiPolygon(parts)
 
 
-def united(
+def unite_outlines(
     outline: Polygon | MultiPolygon, seen: Polygon | MultiPolygon, resolution: float
 ) -> Polygon | MultiPolygon:
     """Union of outlines without details smaller than `resolution` (metres).
@@ -65,10 +65,10 @@ def united(
     border is followed within a quarter of it; where it has many corners still, less closely.
     """
     grown = outline.union(seen).buffer(resolution / 2, join_style='mitre')
-    return rounded(grown.buffer(-resolution / 2, join_style='mitre'), resolution)
+    return simplify(grown.buffer(-resolution / 2, join_style='mitre'), resolution)
 
 
-def rounded(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPolygon:
+def simplify(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPolygon:
     """An outline without details smaller than `resolution`, of a bounded number of corners."""
     least = resolution**2
     while True:

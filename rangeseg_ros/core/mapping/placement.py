@@ -49,7 +49,7 @@ class Placement:
     may_come: bool = False
 
 
-def placed(
+def find_placement(
     config: Config,
     frame: str,
     lookup: Lookup,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.evidence import see
-from rangeseg_ros.core.mapping.map_outlines import areas, polygon_of, rounded, united
+from rangeseg_ros.core.mapping.map_outlines import areas, polygon_of, simplify, unite_outlines
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, described
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -20,7 +20,7 @@ from rangeseg_ros.core.mapping.observations import (
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
-from rangeseg_ros.core.mapping.sightings import THERE, sightings
+from rangeseg_ros.core.mapping.sightings import THERE, find_sightings
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -223,9 +223,9 @@ class PlaneMap:
     def _grow(self, k: int, part: shapely.Geometry) -> None:
         record, resolution = self._records[k], self.config.map_resolution
         if record.outline.is_empty:
-            record.outline = rounded(part, resolution)
+            record.outline = simplify(part, resolution)
         else:
-            record.outline = united(record.outline, part, resolution)
+            record.outline = unite_outlines(record.outline, part, resolution)
         record.evidence.follow(record.outline)
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
@@ -246,7 +246,7 @@ class PlaneMap:
         points, sigma = filters.places(owner, at)
         points = (points - pose.shift) @ pose.rotation
         spread = noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
-        found = sightings(
+        found = find_sightings(
             points,
             (filters.normal @ pose.rotation)[owner],
             np.sqrt(sigma**2 + spread),

@@ -16,7 +16,7 @@ _GATE = 4.0
 _GRAZING = 0.05
 
 
-def sightings(
+def find_sightings(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],
     sigma: NDArray[np.float64],

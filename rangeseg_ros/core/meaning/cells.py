@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
@@ -91,7 +91,7 @@ def cells_of(
         np.zeros((*shape, 2), np.float32),
     )
     axes = axes_of(up).astype(np.float32)
-    strips(_means, shape[0], image.inverse, image.rays, size, axes, sensor, cells)
+    run_rows(_means, shape[0], image.inverse, image.rays, size, axes, sensor, cells)
     return cells
 
 

@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
 BASELINES = (1, 2, 4, 8, 16)
@@ -89,11 +89,11 @@ def surfaces_of(
         Where a step is between a cell and the next measured one below.
     """
     steep, broken = (np.zeros(cells.error.shape, np.bool_) for _ in range(2))
-    strips(_mark, cells.error.shape[1], cells, steps, steep, broken)
+    run_rows(_mark, cells.error.shape[1], cells, steps, steep, broken)
     # Noise hides parts of a step.
     closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 7), np.uint8))
     steep = closed.view(np.bool_)
-    return *joined(cells, steps, steep, broken), steep, broken
+    return *join_cells(cells, steps, steep, broken), steep, broken
 
 
 @njit(cache=True, nogil=True)
@@ -162,7 +162,7 @@ def _step(
 
 
 @njit(cache=True, nogil=True)
-def joined(
+def join_cells(
     cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], int]:
     """Surfaces of the cells that are not steep, along links that are not broken; their number."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.classes import DROP, GROUND
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.ground_field import GroundField, plane_at
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.rays import completed_rays
 
@@ -22,7 +22,7 @@ _TOLERANCE = 2.0
 _SHORTEST = 24
 
 
-def crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> NDArray:
+def find_crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> NDArray:
     """Points where rays cross the ground continued.
 
     Parameters
@@ -40,19 +40,19 @@ def crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> 
         ray, NaN where nothing was.
     """
     inverse = np.zeros(image.shape, np.float32)
-    strips(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
+    run_rows(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
     chosen = where & (inverse > 0)
     points = image.rays[chosen] / inverse[chosen, None]
     return np.column_stack([points, terrain.height[chosen]]).astype(np.float32)
 
 
 def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
-    """Crossings (N, 4) of the rays that end in a drop, as `crossings`."""
-    return crossings(image, terrain, terrain.classes == DROP)
+    """Crossings (N, 4) of the rays that end in a drop, as `find_crossings`."""
+    return find_crossings(image, terrain, terrain.classes == DROP)
 
 
 def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
-    """Crossings (N, 4) of rays without a measurement, as `crossings`.
+    """Crossings (N, 4) of rays without a measurement, as `find_crossings`.
 
     As far as ground is seen and not nearer: no sensor sees below its own nearest or farthest
     range. Not where the robot's own body is in the way. Single pixels do not count: sensors miss
@@ -70,7 +70,7 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
             return np.zeros((0, 4), np.float32)
         image = replace(image, rays=completed[0])
         opened[~completed[1]] = 0
-    found = crossings(image, terrain, opened > 0)
+    found = find_crossings(image, terrain, opened > 0)
     nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
     # Clouds measure along their rays, images along the optical axis.
     depth = found[:, 2] if image.camera else np.linalg.norm(found[:, :3], axis=1)
@@ -82,7 +82,7 @@ def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
     ground = (terrain.classes == GROUND).astype(np.uint8)
     rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     inverse = np.zeros(image.shape, np.float32)
-    strips(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
+    run_rows(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
     lines = []
     for ring in rings:
         if len(ring) >= _SHORTEST:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, cells_of
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.continuity import Steps, joined, noise_of, surfaces_of
+from rangeseg_ros.core.meaning.continuity import Steps, join_cells, noise_of, surfaces_of
 from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
     cell_heights,
@@ -148,7 +148,7 @@ def _terrain(
     # What remains is judged surface by surface, by its height beside the ground.
     field = GroundField.of(ground_field(cells, ground, under.theta), size, up)
     height = cell_heights(cells, field, size)
-    surface, count = joined(cells, steps, steep | ground, broken)
+    surface, count = join_cells(cells, steps, steep | ground, broken)
     large = np.flatnonzero(np.bincount(surface.ravel(), minlength=count + 1) >= FEWEST)
     large = large[large > 0]
     side = _sides(height, surface, _around(ground), large)

@@ -14,7 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells, CellSize
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 
 # Cells of a block, which is about square.
 _ROWS, _COLUMNS = 16, 2
@@ -162,7 +162,7 @@ class GroundField(NamedTuple):
 def cell_heights(cells: Cells, field: GroundField, size: CellSize) -> NDArray[np.float32]:
     """Heights of cells above the ground, metres along up; NaN where nothing is measured."""
     result = np.full(cells.inverse.shape, np.nan, np.float32)
-    strips(_cell_heights, len(result), cells, field, size, result)
+    run_rows(_cell_heights, len(result), cells, field, size, result)
     return result
 
 

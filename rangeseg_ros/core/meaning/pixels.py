@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.cells import CellSize
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.ground_field import GroundField, height_in_row, planes_of_row
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
@@ -62,7 +62,7 @@ def pixels_of(
     """
     classes = np.zeros(image.shape, np.uint8)
     heights = np.full(image.shape, np.nan, np.float32)
-    strips(_classify, len(said.kind), image.inverse, image.rays, field, size, said, bounds,
+    run_rows(_classify, len(said.kind), image.inverse, image.rays, field, size, said, bounds,
            classes, heights)  # fmt: skip
     return classes, heights
 

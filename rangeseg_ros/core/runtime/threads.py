@@ -33,7 +33,7 @@ if hasattr(os, 'register_at_fork'):  # not on Windows, which does not fork
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
-def strips(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
+def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     """Run kernel(first, after, *arguments) on strips of the rows at the same time.
 
     What one strip writes no other may touch: then the result is the same for any number of
@@ -49,17 +49,17 @@ def strips(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
         other.result()
 
 
-def halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T, T]:
+def map_halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T, T]:
     """Results of kernel(first, after, *arguments) for the upper and the lower half of the rows.
 
     These halves, whatever the number of threads: sums over them always round alike.
     """
     middle = rows // 2
-    lower = aside(kernel, middle, rows, *arguments)
+    lower = submit(kernel, middle, rows, *arguments)
     return kernel(0, middle, *arguments), lower.result()
 
 
-def aside(task: Callable[..., T], *arguments: Any) -> Future[T]:
+def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:
     """Start a task that has no subtasks here, beside what the caller does until `result()`."""
     if cv2.getNumThreads() > 1:
         return _pool().submit(task, *arguments)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, SIZE, fit
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -48,7 +48,7 @@ class Blocks(NamedTuple):
         """Planes of the blocks of `size` pixels with these moments."""
         squared = moments[..., CHI2] / np.maximum(moments[..., COUNT], 1)
         slope, residual = np.zeros_like(squared), np.zeros_like(squared)
-        strips(_fit_blocks, len(moments), moments, rays, size, slope, residual)
+        run_rows(_fit_blocks, len(moments), moments, rays, size, slope, residual)
         return cls(moments, squared, slope, residual)
 
 
@@ -70,7 +70,7 @@ def block_moments(
     """
     height, width = inverse.shape
     moments = np.zeros((-(-height // size), -(-width // size), SIZE))
-    strips(_sum_blocks, len(moments), inverse, rays, size, moments)
+    run_rows(_sum_blocks, len(moments), inverse, rays, size, moments)
     return moments
 
 

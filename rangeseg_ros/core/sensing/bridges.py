@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import strips
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -17,7 +17,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 _SPAN = 4
 
 
-def bridged(
+def bridge_holes(
     image: RangeImage, steps: NDArray[np.float32], slopes: NDArray[np.float32]
 ) -> RangeImage:
     """The image with small holes interpolated.
@@ -42,7 +42,7 @@ def bridged(
     # A camera has rays everywhere; those of a cloud lie between its points.
     known = np.zeros((0, 0, 3), np.float32) if image.camera is not None else image.rays
     rays = known.copy()
-    strips(_bridge, len(inverse), image.inverse, known, steps, slopes, inverse, rays)
+    run_rows(_bridge, len(inverse), image.inverse, known, steps, slopes, inverse, rays)
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.lens import checked_lens, undistorted
+from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
@@ -248,7 +248,7 @@ class Camera:
         """
         x, y = self._distorted(np.asarray(u, float), np.asarray(v, float))
         if self.distortion_model:
-            x, y = undistorted(x, y, self.distortion_model, self.d)
+            x, y = undistort(x, y, self.distortion_model, self.d)
             shown = (np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST)
             x, y, z = (np.where(shown, value, np.nan) for value in (x, y, np.ones_like(x)))
         else:

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.runtime.threads import aside, strips
+from rangeseg_ros.core.runtime.threads import run_rows, submit
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -65,7 +65,7 @@ def sobel(image: RangeImage) -> GridEdges:
     # Infinite where nothing can be told.
     threshold = 2 * np.sqrt(strength[complete].mean()) if complete.any() else np.float32(np.inf)
     ridge = _ridges(strength, np.abs(gx) >= np.abs(gy)) & (strength > threshold**2)
-    pixels = bridged(ridge | ~valid) & valid
+    pixels = bridge_edges(ridge | ~valid) & valid
     horizontal, vertical = beside(pixels)
     # A step between two columns or rows responds with the sum of the kernel's one side.
     step = threshold / _SOBEL_GAIN
@@ -112,7 +112,7 @@ def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
 _RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
 
 
-def bridged(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def bridge_edges(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
     kernel = np.zeros((3, 3), np.float32)
     for bit, position in enumerate(_RING):
@@ -161,15 +161,15 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     blocks = -(-image.shape[0] // BLOCK), -(-image.shape[1] // BLOCK)
     limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
     clear = _CLEAR * limits + 2 * np.asarray(slope, np.float32)
-    wide = aside(_window_sums, inverse, 2 * _WINDOW + 1)
+    wide = submit(_window_sums, inverse, 2 * _WINDOW + 1)
     height, width = image.shape
     mean = np.full((height + 2 * _MARGIN, width + 2 * _MARGIN), np.float32(np.nan))
-    strips(_find_means, height, inverse, mean)
+    run_rows(_find_means, height, inverse, mean)
     strong = np.zeros((height, width), np.bool_)
-    strips(_find_strong, height, mean, limits, strong)
+    run_rows(_find_strong, height, mean, limits, strong)
     horizontal = np.zeros((height, width - 1), np.bool_)
     vertical = np.zeros((height - 1, width), np.bool_)
-    strips(
+    run_rows(
         _find_crossings,
         height,
         inverse,

@@ -77,7 +77,7 @@ def checked_lens(model: str, coefficients: Sequence[float]) -> tuple[str, tuple[
     return (model, d[:12]) if any(d) else ('', ())
 
 
-def undistorted(
+def undistort(
     x: NDArray[np.float64], y: NDArray[np.float64], model: str, d: Sequence[float]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points in the plane z = 1 that appear at the distorted points (x, y).

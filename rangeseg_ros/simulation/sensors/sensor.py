@@ -42,7 +42,7 @@ class Sensor(Protocol):
         """
 
 
-def resized(camera: Camera, width: int, height: int) -> Camera:
+def resize(camera: Camera, width: int, height: int) -> Camera:
     """Camera whose image of the same horizontal field of view has another size."""
     focal = camera.fx * width / camera.width
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
