@@ -161,10 +161,10 @@ class Bench:
 
         return self.until(found)
 
-    def reported(self, condition, publish):
+    def reported(self, condition, publish, period=0.2):
         """The first diagnostic status that satisfies the condition, while frames come."""
         self.received['diagnostics'].clear()
-        return self.repeat(publish, lambda: self._reported(condition))
+        return self.repeat(publish, lambda: self._reported(condition), period)
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
@@ -182,7 +182,7 @@ class Bench:
     def spin(self, seconds):
         self.until(lambda: False, seconds, required=False)
 
-    def until(self, condition, timeout=600.0, required=True):
+    def until(self, condition, timeout=180.0, required=True):
         """Spin until the condition holds; its value."""
         end = time.monotonic() + timeout
         while not (value := condition()) and time.monotonic() < end:

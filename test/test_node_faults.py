@@ -207,6 +207,7 @@ def test_lost_images_are_noticed(node):
         status = node.reported(
             lambda s: s.level == DiagnosticStatus.WARN and 'lost on' in s.message,
             lambda: node.send(image, node.info(camera)),
+            period=0.03,  # at 5 Hz none is
         )
         assert 'fastdds_large_images.xml' in status.message
     with node.listening('labels'), node.camera_on():
