@@ -69,7 +69,7 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return real(labels, image)
 
-    monkeypatch.setattr('rangeseg_ros.batch.calibration.sightings', counting)
+    monkeypatch.setattr('rangeseg_ros.batch.calibration.find_sightings', counting)
     assert run(*arguments, '--jobs', 1).exit_code != 0
     assert not output.exists()
     result = run(*arguments, '--jobs', 1)

@@ -66,7 +66,7 @@ def join_surfaces(
     blocks = moments.reshape(-1, SIZE)
     # No patch reaches over the middle, but neither does any reach across a large surface.
     # Not even in a small image is one smaller than four blocks.
-    largest = max(enlarged * _PATCH_LARGEST, 4 * block**2)
+    largest = max(enlarged * _PATCH_LARGEST, 4.0 * block**2)
     roots = map_halves(grow_patches, shape[0], moments, *links, largest)
     patch, moments = _renumber(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
     border = _borders(patch.reshape(shape), *links, len(moments))

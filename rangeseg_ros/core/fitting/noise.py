@@ -127,7 +127,8 @@ class _Scale(NamedTuple):
         # `known` adds no floor to that of `least`.
         shown = np.maximum(shown - (known.at(squared, tilt) - FLOOR), least.at(squared, tilt))
         # What faces the sensor first: noise makes slopes of its own, that would explain it.
-        facing = slice(None, None, self.sets.slopes)
+        # Indices and no slice: kernels are compiled for layouts, and a slice's follows the size.
+        facing = np.arange(0, len(shown), self.sets.slopes)
         terms = np.ones(len(squared)), squared**2
         # A sensor errs in disparity or in range: of both together a few blocks tell nothing.
         nothing = np.zeros(len(shown))
@@ -168,7 +169,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     variance = scale.variance_ratio(coarse, 1.0)
     noise = scale.errors(variance, _QUANTILE, (0, 1), rounded, none)
     level = noise.at(coarse.squared, coarse.slope).repeat(2, axis=0).repeat(2, axis=1)
-    level = level[: blocks.squared.shape[0], : blocks.squared.shape[1]]
+    # A copy, for the same reason as in `errors`.
+    level = level[: blocks.squared.shape[0], : blocks.squared.shape[1]].copy()
     count = blocks.moments[..., COUNT]
     # Six pixels leave three degrees of freedom.
     flat = (count >= 6) & (blocks.residual < ROUGH * level * np.maximum(count - 3, 1))
