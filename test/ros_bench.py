@@ -148,7 +148,7 @@ class Bench:
         self.camera_info.publish(info or self.info())
         self.depth.publish(image or self.image())
 
-    def repeat(self, action, condition, period=0.2):
+    def repeat(self, action, condition, period=0.2, **waiting):
         """Do something again and again until the condition holds; its value."""
         due = 0.0
 
@@ -159,12 +159,12 @@ class Bench:
                 action()
             return condition()
 
-        return self.until(found)
+        return self.until(found, **waiting)
 
-    def reported(self, condition, publish, period=0.2):
+    def reported(self, condition, publish, period=0.2, **waiting):
         """The first diagnostic status that satisfies the condition, while frames come."""
         self.received['diagnostics'].clear()
-        return self.repeat(publish, lambda: self._reported(condition), period)
+        return self.repeat(publish, lambda: self._reported(condition), period, **waiting)
 
     def stream(self):
         """Publish images until one comes back, as best effort has no promise for the first."""
