@@ -69,6 +69,15 @@ def test_coarse_to_fine_and_exact_agree_on_a_corner():
     assert fast.energy == pytest.approx(full.energy, rel=0.005)
 
 
+def test_exact_goes_on_until_no_move_helps():
+    swap = replace(NORMALS, exact=True, moves='swap', direction_count=17, normal_baseline=1)
+    energies = [
+        segment(corner(0.1), replace(swap, smoothness=60.0, **rounds)).energy
+        for rounds in ({'cycles': 5}, {}, {'cycles': 1000})
+    ]
+    assert energies[0] > energies[1] == energies[2]
+
+
 @pytest.mark.parametrize(
     'options',
     [

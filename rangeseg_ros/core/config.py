@@ -113,10 +113,10 @@ class Config:
         choices=('expansion', 'swap'),
     )
     cycles: int = option(
-        5,
-        'method normals with exact: rounds of moves at most, fewer when none helps; nothing else '
-        'reads it',
-        low=1,
+        0,
+        'method normals with exact: rounds of moves at most; 0 goes on until no move helps; '
+        'nothing else reads it',
+        low=0,
         high=1000,
     )
     exact: bool = option(
