@@ -23,12 +23,13 @@ demo: $(VENV)/installed
 # A simulated camera at 10 Hz, the node, and a node that prints its planes, for 20 s.
 demo-ros: export ROS_AUTOMATIC_DISCOVERY_RANGE = LOCALHOST
 demo-ros: export FASTRTPS_DEFAULT_PROFILES_FILE = $(CURDIR)/params/fastdds_large_images.xml
+demo-ros: FOR_A_WHILE = timeout --kill-after=10 20
 demo-ros: $(VENV)/installed
 	rm -rf demo/ros
 	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 60 --seed 1 --output demo/ros
-	timeout 20 $(BIN)/rangeseg play demo/ros/bag --rate 0.3333 --loop & \
-	timeout 20 $(BIN)/segment_planes & \
-	timeout 20 $(BIN)/python examples/print_planes.py; \
+	$(FOR_A_WHILE) $(BIN)/rangeseg play demo/ros/bag --rate 0.3333 --loop & \
+	$(FOR_A_WHILE) $(BIN)/segment_planes & \
+	$(FOR_A_WHILE) $(BIN)/python examples/print_planes.py; \
 	wait
 
 lint: $(VENV)/linters

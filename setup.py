@@ -71,7 +71,13 @@ setup(
     ],
     extras_require={
         # PyMaxflow is what the minimum cuts are compared with, mcap what the bags are read by.
-        'test': ['PyMaxflow>=1.3', 'hypothesis>=6.90', 'mcap>=1.2.1', 'pytest>=7.4'],
+        'test': [
+            'PyMaxflow>=1.3',
+            'hypothesis>=6.90',
+            'mcap>=1.2.1',
+            'pytest>=7.4',
+            'pytest-timeout>=2.2',
+        ],
         'dask': ['distributed>=2023.1'],
         'view': ['rerun-sdk>=0.23'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],

@@ -79,8 +79,11 @@ class CollisionObjects(Node):
 
 if __name__ == '__main__':
     rclpy.init()
+    node = CollisionObjects()
     try:
-        rclpy.spin(CollisionObjects())
+        # rclpy.spin may sleep on when a signal ends the context between two of its waits.
+        while rclpy.ok():
+            rclpy.spin_once(node, timeout_sec=1.0)
     except (KeyboardInterrupt, Exception):
         # A signal ends rclpy between any two of its steps, with any of its errors.
         if rclpy.ok():
