@@ -4,9 +4,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rangeseg_ros.core.config import Config, ConfigError
+    from rangeseg_ros.core.config import Config
     from rangeseg_ros.core.description.planes import Plane
     from rangeseg_ros.core.meaning.roles import ROLES
+    from rangeseg_ros.core.options import ConfigError
     from rangeseg_ros.core.segmenter import Segmentation, Segmenter
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
@@ -33,9 +34,10 @@ __all__ = [
 
 # Imported when used: `rangeseg --help`, and an interrupt at the start, need not wait for numba.
 _HOMES = {
-    'core.config': ('Config', 'ConfigError'),
+    'core.config': ('Config',),
     'core.description.planes': ('Plane',),
     'core.meaning.roles': ('ROLES',),
+    'core.options': ('ConfigError',),
     'core.segmenter': ('Segmentation', 'Segmenter'),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rangeseg_ros import Config
-from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.options import ConfigError
 
 FIELDS = {f.name: f for f in fields(Config)}
 

@@ -8,10 +8,11 @@ from recordings import Recording
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel

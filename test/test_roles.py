@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.config import Config, ConfigError
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.meaning.roles import ROLES, RolesError, roles
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 

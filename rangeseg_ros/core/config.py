@@ -3,34 +3,15 @@
 from __future__ import annotations
 
 import math
-import numbers
-import reprlib
 import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
-import numpy as np
+from rangeseg_ros.core.options import ConfigError, checked, option
 
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
 PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
-
-
-class ConfigError(ValueError):
-    """A parameter that does not exist, or a value outside its range."""
-
-
-def option(
-    default: bool | int | float | str,
-    description: str,
-    *,
-    low: float | None = None,
-    high: float | None = None,
-    choices: tuple[str, ...] = (),
-) -> Any:
-    """Declare a `Config` field; `low` and `high` are inclusive."""
-    metadata = {'description': description, 'low': low, 'high': high, 'choices': choices}
-    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -326,7 +307,7 @@ class Config:
 
     def __post_init__(self) -> None:
         for option_field in fields(self):
-            value = _checked(option_field, getattr(self, option_field.name))
+            value = checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
         check_directions(self.directions, self.direction_count)
         if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
@@ -413,21 +394,3 @@ def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
                 stacklevel=3,
             )
     return result
-
-
-def _checked(option_field: Any, value: Any) -> Any:
-    """Return `value` in the type of the field's default, or raise ConfigError."""
-    name, kind = option_field.name, type(option_field.default)
-    low, high = option_field.metadata['low'], option_field.metadata['high']
-    choices = option_field.metadata['choices']
-    shown = reprlib.repr(value)
-    # Numbers of numpy are numbers; True is none.
-    kinds: dict[type, Any] = {int: numbers.Integral, float: numbers.Real, bool: (bool, np.bool_)}
-    accepted = kinds.get(kind, kind)
-    if not isinstance(value, accepted) or (kind is not bool and isinstance(value, bool)):
-        raise ConfigError(f'parameter {name} must be of type {kind.__name__}, not {shown}')
-    if choices and value not in choices:
-        raise ConfigError(f'parameter {name} must be one of {", ".join(choices)}, not {shown}')
-    if low is not None and not low <= value <= high:
-        raise ConfigError(f'parameter {name} must be in [{low:g}, {high:g}], not {shown}')
-    return kind(value)

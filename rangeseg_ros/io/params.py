@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rangeseg_ros.core.config import Config, ConfigError, known_name
+from rangeseg_ros.core.config import Config, known_name
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
 NODE = 'segment_planes'

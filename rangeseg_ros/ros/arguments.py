@@ -15,7 +15,7 @@ import yaml
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.runtime.cache import writable
 from rangeseg_ros.ros.parameters import NodeConfig
 

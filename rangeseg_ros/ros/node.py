@@ -23,7 +23,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
-from rangeseg_ros.core.config import ConfigError
+from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.messages.make import message_class
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS

@@ -15,7 +15,8 @@ from rcl_interfaces.msg import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from rangeseg_ros.core.config import Config, ConfigError, option
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.options import ConfigError, option
 
 
 @dataclass(frozen=True)
