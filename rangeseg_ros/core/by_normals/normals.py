@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
@@ -126,12 +127,13 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
         _means(p, radius) for p in (a * a, a * b, a * c, b * b, b * c, c * c)
     )
     aw, bw, cw = (_means(p, radius) for p in (a * w, b * w, c * w))
+    aaa, aab, aac, abb, abc, acc, _ = cofactors(aa, ab, ac, bb, bc, cc)
     # Cramer's rule, without the determinant: the result is normalised anyhow.
     normal = np.stack(
         [
-            (bb * cc - bc * bc) * aw + (ac * bc - ab * cc) * bw + (ab * bc - ac * bb) * cw,
-            (ac * bc - ab * cc) * aw + (aa * cc - ac * ac) * bw + (ab * ac - aa * bc) * cw,
-            (ab * bc - ac * bb) * aw + (ab * ac - aa * bc) * bw + (aa * bb - ab * ab) * cw,
+            aaa * aw + aab * bw + aac * cw,
+            aab * aw + abb * bw + abc * cw,
+            aac * aw + abc * bw + acc * cw,
         ],
         axis=-1,
     )

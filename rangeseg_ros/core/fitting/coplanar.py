@@ -11,7 +11,7 @@ from rangeseg_ros.core.fitting.fits import Fits, symmetric
 from rangeseg_ros.core.fitting.uncertainty import pairs
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_variance
 
 # Pairs of regions and how much links them, see `find_borders`.
@@ -245,10 +245,7 @@ def _chi_squared(difference: NDArray[np.float64], covariance: NDArray[np.float64
     # A sensor without errors still rounds: to 1e-9 / m.
     a, d, f = covariance[0, 0] + 1e-18, covariance[1, 1] + 1e-18, covariance[2, 2] + 1e-18
     b, c, e = covariance[0, 1], covariance[0, 2], covariance[1, 2]
-    # By cofactors.
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * aa + b * bb + c * cc
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
     if determinant <= 0:
         return np.inf
     p, q, r = difference[0], difference[1], difference[2]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells, CellSize
 from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.moments import cofactors
 
 # Cells of a block, which is about square.
 _ROWS, _COLUMNS = 16, 2
@@ -118,9 +119,7 @@ def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np
             x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
             y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
             z = g[8] - g[2] * p[0] - g[4] * p[1] - g[5] * p[2]
-            aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-            dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-            determinant = a * aa + b * bb + c * cc
+            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
             if determinant <= 1e-13 * a * d * f:
                 continue
             theta[i, j, 0] += (aa * x + bb * y + cc * z) / determinant

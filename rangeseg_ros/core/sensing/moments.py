@@ -10,13 +10,28 @@ sums of squares thus count random variances.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 SIZE = 13
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
 """Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
+
+
+@register_jitable
+def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]:
+    """Cofactors of the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]], and its determinant.
+
+    Of numbers in kernels, and of arrays. The cofactors are in the order of the arguments; over
+    the determinant they are the inverse.
+    """
+    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
+    return aa, bb, cc, dd, ee, ff, a * aa + b * bb + c * cc
 
 
 @njit(cache=True)
@@ -36,10 +51,7 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     """
     a, b, c, d, e, f = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
     p, q, r = moments[6], moments[7], moments[8]
-    # Cofactors of the symmetric 3x3 matrix.
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * aa + b * bb + c * cc
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
     if determinant <= 1e-13 * a * d * f:
         theta[:] = 0
         return moments[CHI2]
@@ -70,9 +82,7 @@ def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
     e, f = moments[k, 4] + moments[m, 4], moments[k, 5] + moments[m, 5]
     p, q = moments[k, 6] + moments[m, 6], moments[k, 7] + moments[m, 7]
     r, square = moments[k, 8] + moments[m, 8], moments[k, CHI2] + moments[m, CHI2]
-    aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
-    dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
-    determinant = a * aa + b * bb + c * cc
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
     if determinant <= 1e-13 * a * d * f:
         return square
     explained = p * (aa * p + 2 * (bb * q + cc * r)) + q * (dd * q + 2 * ee * r) + ff * r * r
