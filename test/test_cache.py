@@ -109,3 +109,44 @@ def test_what_was_compiled_into_the_package_is_taken_along(tmp_path, monkeypatch
         cache._copy_compiled(folder)
     subfolder = _CacheLocator.get_suitable_cache_subpath(compiled.parents[1] / 'grid.py')
     assert [p.relative_to(folder) for p in folder.rglob('*.*')] == [Path(subfolder, compiled.name)]
+
+
+KERNEL_OF = 'from numba import njit\n@njit(cache=True)\ndef {}(): return {}\n'
+MODULES = {
+    '__init__': '',
+    'core/__init__': '',
+    'core/a': KERNEL_OF.format('f', 1),
+    'core/b': 'from pack.core.a import f\n' + KERNEL_OF.format('g', 'f()'),
+    'core/c': 'from pack.core import b\n' + KERNEL_OF.format('h', 'b.g()'),
+    'core/d': KERNEL_OF.format('k', 3),
+}
+CALL = """
+from pathlib import Path
+from rangeseg_ros.core.runtime.outdated import drop_outdated
+drop_outdated(Path('pack'))
+from pack.core.c import h
+from pack.core.d import k
+print(h(), k(), sum(h.stats.cache_hits.values()), sum(k.stats.cache_hits.values()))
+"""
+
+
+def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
+    """numba by itself goes on with what was compiled into a kernel."""
+    package = tmp_path / 'pack'
+    (package / 'core' / '__pycache__').mkdir(parents=True)
+    for name, text in MODULES.items():
+        (package / f'{name}.py').write_text(text)
+
+    def call():
+        environment = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
+        environment['PYTHONPATH'] = os.fspath(ROOT)
+        command = [sys.executable, '-c', CALL]
+        done = subprocess.run(
+            command, capture_output=True, text=True, cwd=tmp_path, env=environment
+        )
+        return done.stdout.split() or done.stderr
+
+    assert call() == ['1', '3', '0', '0']
+    assert call() == ['1', '3', '1', '1']
+    (package / 'core' / 'a.py').write_text(KERNEL_OF.format('f', 20))
+    assert call() == ['20', '3', '0', '1']

@@ -1,8 +1,8 @@
 """How far a constant of the core may move before results get worse.
 
 A constant is compiled into the kernels that read it, and into those that call them. So each trial
-runs `rangeseg evaluate` in a copy of the package in which that one expression is changed. Compiled
-code is taken along only of modules that import nothing of the changed one.
+runs `rangeseg evaluate` in a copy of the package in which that one expression is changed, with all
+compiled code: the copy itself sees which of it is outdated.
 """
 
 from __future__ import annotations
@@ -101,35 +101,12 @@ def write_changed(constant: Constant, factor: float, folder: Path) -> None:
     start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
     end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
     copy.write_text(text[:start] + repr(_scaled(constant.value, factor)) + text[end:], 'utf-8')
-    for touched in _dependents(path):
-        compiled = folder / touched.parent.relative_to(PACKAGE.parent) / '__pycache__'
-        for file in compiled.glob(f'{touched.stem}.*'):
-            file.unlink()
 
 
 def _scaled(value: Any, factor: float) -> Any:
     if isinstance(value, tuple):
         return tuple(_scaled(entry, factor) for entry in value)
     return round(value * factor) if isinstance(value, int) else value * factor
-
-
-def _dependents(changed: Path) -> set[Path]:
-    """`changed` and all modules that import it, or one that does."""
-    imports = {}
-    for path in PACKAGE.rglob('*.py'):
-        tree = ast.parse(path.read_text(encoding='utf-8'))
-        imports[path] = {
-            name
-            for node in ast.walk(tree)
-            if isinstance(node, ast.ImportFrom) and node.module
-            for name in (node.module, *(f'{node.module}.{item.name}' for item in node.names))
-        }
-    found, last = {changed}, 0
-    while len(found) > last:
-        last = len(found)
-        names = {_dotted(path) for path in found}
-        found |= {path for path, imported in imports.items() if imported & names}
-    return found
 
 
 @dataclass(frozen=True)

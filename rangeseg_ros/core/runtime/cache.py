@@ -6,6 +6,7 @@ may write to neither: in containers with a read-only root, for users without a h
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import stat
@@ -15,6 +16,8 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from rangeseg_ros.core.runtime.outdated import drop_outdated, stamps
 
 PACKAGE = Path(__file__).parents[2]
 
@@ -46,15 +49,14 @@ def choose_cache() -> None:
     """
     given = os.environ.get('NUMBA_CACHE_DIR')
     if given and writable(Path(given)):
+        _keep_in(Path(given))
         return
     if writable(PACKAGE / 'core' / '__pycache__'):
+        drop_outdated(PACKAGE)
         return
     for folder in _folders():
         if writable(folder):
-            os.environ['NUMBA_CACHE_DIR'] = os.fspath(folder)
-            if 'numba' in sys.modules:
-                sys.modules['numba'].config.CACHE_DIR = os.fspath(folder)
-            _copy_compiled(folder)
+            _copy_compiled(_keep_in(folder))
             return
     warnings.warn(
         'compiled kernels cannot be kept, so that every start compiles them: no folder can be '
@@ -63,6 +65,20 @@ def choose_cache() -> None:
         stacklevel=2,
     )
     _only_read()
+
+
+def _keep_in(folder: Path) -> Path:
+    """Have numba keep kernels in a folder within `folder`, one for each state of the sources."""
+    state = hashlib.sha256(repr(stamps(PACKAGE)).encode()).hexdigest()
+    name = f'rangeseg_ros-{state[:16]}'
+    # Other than a process that was told of it by the one that started it.
+    if folder.name != name:
+        folder /= name
+        folder.mkdir(exist_ok=True)
+    os.environ['NUMBA_CACHE_DIR'] = os.fspath(folder)
+    if 'numba' in sys.modules:
+        sys.modules['numba'].config.CACHE_DIR = os.fspath(folder)
+    return folder
 
 
 def _folders() -> Iterator[Path]:
@@ -116,7 +132,7 @@ def _copy_compiled(folder: Path) -> None:
     for compiled in PACKAGE.rglob('__pycache__/*.nb[ic]'):
         source = compiled.parents[1] / '__init__.py'
         target = folder / _CacheLocator.get_suitable_cache_subpath(source) / compiled.name
-        if target.exists() and target.stat().st_mtime >= compiled.stat().st_mtime:
+        if target.exists():
             continue
         target.parent.mkdir(exist_ok=True)
         part = target.with_name(f'{target.name}.{os.getpid()}')
