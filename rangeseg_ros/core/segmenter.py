@@ -26,8 +26,8 @@ from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid, weights
-from rangeseg_ros.core.sensing.jump_edges import GridEdges, jump_edges, pixels_beside
+from rangeseg_ros.core.sensing.grid import Grid, GridEdges, weights
+from rangeseg_ros.core.sensing.jump_edges import jump_edges, pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
 

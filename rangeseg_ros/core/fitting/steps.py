@@ -55,21 +55,21 @@ def _find_steps(
     slopes: NDArray[np.float32],
 ) -> None:
     rows, columns = steps.shape
-    # Slopes of the flat blocks of three rows of blocks.
+    # Slopes of the flat blocks of three rows of blocks in turn.
     slope = np.full((3, columns + 2), np.inf)
     for i in range(first - 1, after + 1):
-        slope[:2] = slope[1:]
-        slope[2] = np.inf
         for j in range(columns):
-            if 0 <= i < rows and _is_flat(i, j, blocks, sensor):
-                slope[2, j + 1] = blocks.slope[i, j]
+            is_flat = 0 <= i < rows and _is_flat(i, j, blocks, sensor)
+            slope[i % 3, j + 1] = blocks.slope[i, j] if is_flat else np.inf
         if i <= first:
             continue
         for j in range(columns):
-            squared, own = blocks.squared[i - 1, j], slope[1, j + 1]
+            squared, own = blocks.squared[i - 1, j], slope[(i - 1) % 3, j + 1]
             # The slope of a block that a jump crosses is the jump's: its neighbours' then.
             if own == np.inf:
-                own = slope[:, j : j + 3].min()
+                for k in range(3):
+                    for m in range(j, j + 3):
+                        own = min(own, slope[k, m])
             if own == np.inf:
                 own = 0.0
             variance = random_variance(sensor, squared) + sensor.pixel_noise**2 * own

@@ -59,9 +59,21 @@ def _bridge(
 ) -> None:
     """Bridge the holes of some rows."""
     height, width = measured.shape
+    # Whether something was measured in a column near the row, and near the pixel: most holes are
+    # far from all that was.
+    column = np.empty(width + 2 * _SPAN, np.bool_)
+    near = np.empty(width, np.bool_)
     for i in range(first, after):
+        column[:] = False
+        for k in range(max(i - _SPAN + 1, 0), min(i + _SPAN, height)):
+            for j in range(width):
+                column[j + _SPAN] |= measured[k, j] > 0
+        near[:] = False
+        for k in range(1, 2 * _SPAN):
+            for j in range(width):
+                near[j] |= column[j + k]
         for j in range(width):
-            if measured[i, j] > 0:
+            if measured[i, j] > 0 or not near[j]:
                 continue
             step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
             best, value = 2 * _SPAN, np.float32(0)

@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.jump_edges import GridEdges
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
+
+# (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
+GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 class Grid(NamedTuple):
@@ -43,19 +47,40 @@ def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 
     -------
     Grid
     """
-    valid = image.valid
-    horizontal = (valid[:, 1:] & valid[:, :-1]).astype(np.float32)
-    vertical = (valid[1:] & valid[:-1]).astype(np.float32)
+    height, width = image.shape
+    if jumps is None:
+        jumps = np.zeros((height, width - 1), np.bool_), np.zeros((height - 1, width), np.bool_)
+    horizontal, vertical = (np.empty(edges.shape, np.float32) for edges in jumps)
+    run_rows(_connect, height, image.inverse, *jumps, horizontal, vertical)
     if weighting == 'distance':
         points = image.points
         across = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
         down = np.linalg.norm(points[1:] - points[:-1], axis=2)
-        known = np.concatenate([across[horizontal > 0], down[vertical > 0]])
+        known = np.concatenate([across[np.isfinite(across)], down[np.isfinite(down)]])
         median = np.median(known) if known.size else np.float32(1)
         with np.errstate(invalid='ignore'):
             horizontal = np.where(horizontal > 0, 2 * median / (median + across), 0)
             vertical = np.where(vertical > 0, 2 * median / (median + down), 0)
-    if jumps is not None:
-        horizontal[jumps[0]] = 0
-        vertical[jumps[1]] = 0
     return Grid(horizontal, vertical)
+
+
+@njit(cache=True, nogil=True)
+def _connect(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    across: NDArray[np.bool_],
+    down: NDArray[np.bool_],
+    right: NDArray[np.float32],
+    below: NDArray[np.float32],
+) -> None:
+    """Give 1 to edges of some rows between measured pixels that do not jump, 0 to others."""
+    height, width = inverse.shape
+    for i in range(first, after):
+        for j in range(width - 1):
+            both = (inverse[i, j] > 0) & (inverse[i, j + 1] > 0)
+            right[i, j] = both & ~across[i, j]
+        if i + 1 < height:
+            for j in range(width):
+                both = (inverse[i, j] > 0) & (inverse[i + 1, j] > 0)
+                below[i, j] = both & ~down[i, j]

@@ -1,0 +1,250 @@
+"""Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.blocks import BLOCK
+from rangeseg_ros.core.sensing.grid import GridEdges
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+_WINDOW = 3
+# The farthest window that a boundary looks at, and rows of means that those of one row need.
+_MARGIN = 2 * _WINDOW - 1
+_ROWS = 2 * _MARGIN
+# A step between two pixels that needs no look at their surroundings, in units of `step`
+# and of the slope: steeper than all but planes seen edge-on from centimetres away.
+_CLEAR = 5
+
+
+def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) -> GridEdges:
+    """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
+
+    In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
+    adjoining 3 x 3 windows is compared to the steps on either side of it: on a plane all three
+    are equal, over a crease the middle one lies between the others, and only a jump exceeds both.
+    Where the deviation exceeds `step`, the boundary runs where the inverse range changes from
+    above its local mean to below: the zero crossing, which closes contours by itself.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    step : float or (rows, columns) float
+        Deviation that makes a jump, 1/m, of all or of every block of 4 x 4 pixels.
+    slope : float or (rows, columns) float
+        Change of the inverse range from pixel to pixel on surfaces, 1/m.
+
+    Returns
+    -------
+    horizontal, vertical : (H, W-1), (H-1, W) bool
+        Never true beside a pixel that was not measured.
+    """
+    height, width = image.shape
+    blocks = -(-height // BLOCK), -(-width // BLOCK)
+    limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
+    clear = _CLEAR * limits + 2 * np.asarray(slope, np.float32)
+    horizontal = np.zeros((height, width - 1), np.bool_)
+    vertical = np.zeros((height - 1, width), np.bool_)
+    run_rows(_find_jumps, height, image.inverse, limits, clear, horizontal, vertical)
+    return horizontal, vertical
+
+
+@njit(cache=True, nogil=True)
+def _find_jumps(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    steps: NDArray[np.float32],
+    clear: NDArray[np.float32],
+    horizontal: NDArray[np.bool_],
+    vertical: NDArray[np.bool_],
+) -> None:
+    """Jumps to the right of and below the pixels of some rows.
+
+    One row after the other, so that what they are told by stays in the cache. A boundary that
+    runs along the rows shows in the columns alone, the risers of its staircase too: what counts,
+    and makes a pixel strong, is its deviation in either direction.
+    """
+    height, width = inverse.shape
+    mean = np.full((_ROWS, width + 2 * _MARGIN), np.float32(np.nan))
+    # Of every second row of blocks in turn: the smallest deviation, and the clear step.
+    limit, bound = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
+    across = np.zeros(width, np.bool_)
+    # Of every second row in turn.
+    down, strong = np.zeros((2, width), np.bool_), np.zeros((2, width), np.bool_)
+    side = np.zeros((2, width), np.bool_)
+    for k in range(max(first - _MARGIN, 0), min(first + _MARGIN - 1, height)):
+        _find_means(k, inverse, mean[k % _ROWS])
+    for i in range(first - 1, min(after + 1, height)):
+        ahead = i + _MARGIN
+        if ahead < height:
+            _find_means(ahead, inverse, mean[ahead % _ROWS])
+        else:
+            mean[ahead % _ROWS] = np.float32(np.nan)
+        block = max(i, 0) // BLOCK
+        if i % BLOCK == 0 or i < first:
+            for j in range(width):
+                limit[block % 2, j] = steps[block, j // BLOCK]
+                bound[block % 2, j] = clear[block, j // BLOCK]
+        # Boundaries with the next row: the windows around the last row but one and so on.
+        if 0 <= i < height - 1:
+            _leave(
+                mean[(i - 4) % _ROWS, _MARGIN:],
+                mean[(i - 1) % _ROWS, _MARGIN:],
+                mean[(i + 2) % _ROWS, _MARGIN:],
+                mean[(i + 5) % _ROWS, _MARGIN:],
+                limit[block % 2],
+                down[i % 2],
+            )
+        else:
+            down[i % 2] = False
+        if i < first:
+            continue
+        row = mean[i % _ROWS, _MARGIN - 4 :]
+        _leave(row, row[3:], row[6:], row[9:], limit[block % 2], across[: width - 1])
+        strong[i % 2, 0] = down[0, 0] | down[1, 0] | across[0]
+        for j in range(1, width):
+            strong[i % 2, j] = down[0, j] | down[1, j] | across[j] | across[j - 1]
+        for j in range(width):
+            if strong[i % 2, j]:
+                side[i % 2, j] = _is_above_mean(i, j, inverse)
+        if i < after:
+            _cross_right(i, inverse, strong, side, limit, bound, horizontal[i])
+        if i > first:
+            _cross_down(i - 1, inverse, strong, side, limit, bound, vertical[i - 1])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _find_means(i: int, inverse: NDArray[np.float32], mean: NDArray[np.float32]) -> None:
+    """Means of windows of 3 x 3 pixels around those of a row, NaN where nothing was measured.
+
+    `mean` has a margin, in which it keeps what it holds.
+    """
+    height, width = inverse.shape
+    total, count = np.zeros(width + 2, np.float32), np.zeros(width + 2, np.float32)
+    for k in range(max(i - 1, 0), min(i + 2, height)):
+        for j in range(width):
+            total[j + 1] += inverse[k, j]
+            count[j + 1] += np.float32(inverse[k, j] > 0)
+    for j in range(width):
+        # 0 / 0 where there is none.
+        mean[_MARGIN + j] = (total[j] + total[j + 1] + total[j + 2]) / (
+            count[j] + count[j + 1] + count[j + 2]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _leave(
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    c: NDArray[np.float32],
+    d: NDArray[np.float32],
+    step: NDArray[np.float32],
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the steps from b to c lie outside those from a to b and from c to d so far.
+
+    A side that was not measured (NaN) is left out.
+    """
+    # Without branches, so that the compiler takes many at a time.
+    for j in range(len(result)):
+        limit = step[j]
+        here = c[j] - b[j]
+        before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
+        first, last = before != before, after != after
+        above = ((before > limit) | first) & ((after > limit) | last)
+        below = ((before < -limit) | first) & ((after < -limit) | last)
+        result[j] = (above | below) & ~(first & last)
+
+
+@njit(cache=True, nogil=True)
+def _is_above_mean(i: int, j: int, inverse: NDArray[np.float32]) -> bool:
+    """Whether a pixel is nearer than the mean of the 7 x 7 around it."""
+    height, width = inverse.shape
+    # In float64, in which no order of the sum rounds.
+    total, count = 0.0, 0
+    for k in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, height)):
+        for m in range(max(j - _WINDOW, 0), min(j + _WINDOW + 1, width)):
+            total += np.float64(inverse[k, m])
+            count += inverse[k, m] > 0
+    return bool(inverse[i, j] * np.float32(count) > np.float32(total))
+
+
+# Boundaries are crossed between strong pixels on unlike sides of the local mean, and at every
+# clear step, because where three surfaces meet, two may lie on the same side of the mean. At
+# corners, where the windows hold little of one surface, contours would have gaps: beside strong
+# pixels, the pixels by themselves are looked at as the windows are.
+
+
+@njit(cache=True, nogil=True)
+def _cross_right(
+    i: int,
+    inverse: NDArray[np.float32],
+    strong: NDArray[np.bool_],
+    side: NDArray[np.bool_],
+    limit: NDArray[np.float32],
+    bound: NDArray[np.float32],
+    result: NDArray[np.bool_],
+) -> None:
+    """Jumps between the pixels of a row."""
+    width = inverse.shape[1]
+    row, now = inverse[i], i % 2
+    step, clear = limit[i // BLOCK % 2], bound[i // BLOCK % 2]
+    for j in range(width - 1):
+        here, there = row[j], row[j + 1]
+        result[j] = (here > 0) & (there > 0) & (abs(here - there) > clear[j])
+    for j in range(width - 1):
+        if not (strong[now, j] | strong[now, j + 1]) or row[j] == 0 or row[j + 1] == 0:
+            continue
+        before = row[j - 1] if j > 0 else np.float32(0)
+        after = row[j + 2] if j + 2 < width else np.float32(0)
+        both = strong[now, j] & strong[now, j + 1]
+        result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
+            before, row[j], row[j + 1], after, step[j]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _cross_down(
+    i: int,
+    inverse: NDArray[np.float32],
+    strong: NDArray[np.bool_],
+    side: NDArray[np.bool_],
+    limit: NDArray[np.float32],
+    bound: NDArray[np.float32],
+    result: NDArray[np.bool_],
+) -> None:
+    """Jumps between the pixels of a row and those below."""
+    height, width = inverse.shape
+    row, below = inverse[i], inverse[i + 1]
+    step, clear = limit[i // BLOCK % 2], bound[i // BLOCK % 2]
+    for j in range(width):
+        here, there = row[j], below[j]
+        result[j] = (here > 0) & (there > 0) & (abs(here - there) > clear[j])
+    for j in range(width):
+        if not (strong[0, j] | strong[1, j]) or row[j] == 0 or below[j] == 0:
+            continue
+        before = inverse[i - 1, j] if i > 0 else np.float32(0)
+        after = inverse[i + 2, j] if i + 2 < height else np.float32(0)
+        both = strong[0, j] & strong[1, j]
+        result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
+            before, row[j], below[j], after, step[j]
+        )
+
+
+@njit(cache=True, nogil=True)
+def _stands_out(a: np.float32, b: np.float32, c: np.float32, d: np.float32, step: float) -> bool:
+    """Whether the step from b to c leaves those from a to b and c to d by more than `step`.
+
+    On the same side of both; one that was not measured (0) is left out.
+    """
+    here = c - b
+    if a == 0 and d == 0:
+        return False
+    before = here - (b - a) if a > 0 else here - (d - c)
+    after = here - (d - c) if d > 0 else before
+    return bool(min(before, after) > step or max(before, after) < -step)
