@@ -19,6 +19,9 @@ def rangeseg() -> None:
 
 def segment_planes() -> None:
     """Run the node."""
+    from rangeseg_ros.core.runtime.memory import share_memory
+
+    share_memory()  # before rclpy starts its threads
     from rangeseg_ros.ros.node import main
 
     main()

@@ -27,6 +27,11 @@ TYPES['odometry'] = message_class(ODOMETRY)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
+NODE = [
+    sys.executable,
+    '-c',
+    'from rangeseg_ros.start import segment_planes; segment_planes()',
+]
 FRAME = 'camera_depth_optical_frame'
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
@@ -50,7 +55,7 @@ class Bench:
     def __init__(self, *arguments, camera=None, namespace='', name='segment_planes', command=None):
         self.camera = camera or kinect_camera(160, 120)
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
-        command = command or [sys.executable, '-m', 'rangeseg_ros.ros.node']
+        command = command or NODE
         self.inputs = set()
         self.spins = False
         self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115

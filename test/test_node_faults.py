@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import sys
 import time
 from array import array
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
+from ros_bench import BEST_EFFORT, DEPTH, INFO, NODE, Bench, corner_depth, values_of
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from rangeseg_ros import planes_from_message
@@ -226,7 +225,7 @@ def test_lost_images_are_noticed(node):
 def test_losses_while_sizes_change_cost_no_memory():
     """Large and small best-effort images in turn: Fast DDS then reports 2^31 - 1 lost ones."""
     limited = 'ulimit -v 6000000; exec "$0" "$@"'
-    command = ['/bin/sh', '-c', limited, sys.executable, '-m', 'rangeseg_ros.ros.node']
+    command = ['/bin/sh', '-c', limited, *NODE]
     cameras = [kinect_camera(640, 480), kinect_camera(160, 120)]
     topics = f'/limited{DEPTH}', f'/limited{INFO}'
     with Bench(command=command, namespace='limited') as bench:
@@ -289,11 +288,11 @@ def test_sizes_from_small_to_12_megapixels_whose_memory_comes_back(bench):
     for _ in range(20):
         segment(320, 240)
         bench.spin(0.1)  # it is given back after the frame was published
-        if resident() < before + 200:
+        if resident() < before + 100:
             break
-    # Of 440 MB and more. What stays is the middleware's: its queues keep the size of the largest
-    # message, 25 MB of an image or of labels, several times.
-    assert resident() < before + 200
+    # Of 440 MB and more. What stays is the middleware's: its queues of images and of labels keep
+    # the size of the largest message, 25 MB each.
+    assert resident() < before + 100
 
 
 def test_an_empty_cloud_is_refused_in_words(node):

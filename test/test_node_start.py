@@ -14,14 +14,12 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import DEPTH, INFO, Bench, values_of
+from ros_bench import DEPTH, INFO, NODE, Bench, values_of
 
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
-
-NODE = [sys.executable, '-m', 'rangeseg_ros.ros.node']
 
 
 def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):

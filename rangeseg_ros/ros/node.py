@@ -216,7 +216,3 @@ def main() -> None:
     if not finished:
         # A thread inside a solver that takes minutes may not outlive the interpreter.
         os._exit(0)
-
-
-if __name__ == '__main__':
-    main()

@@ -40,9 +40,11 @@ def bridge_holes(
         return image
     inverse = image.inverse.copy()
     # A camera has rays everywhere; those of a cloud lie between its points.
-    known = np.zeros((0, 0, 3), np.float32) if image.camera is not None else image.rays
+    known = image.rays if image.camera is None else image.rays[:0]
     rays = known.copy()
     run_rows(_bridge, len(inverse), image.inverse, known, steps, slopes, inverse, rays)
+    # Like those it was made from, or every kernel that reads them is compiled twice.
+    rays.flags.writeable = False
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
 
 
