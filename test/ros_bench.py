@@ -49,6 +49,16 @@ def values_of(status):
     return {value.key: value.value for value in status.values}
 
 
+@contextmanager
+def ended(process):
+    """Leave no process behind, whatever comes."""
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
 class Bench:
     """Starts `segment_planes` and talks to it."""
 

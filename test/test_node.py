@@ -15,7 +15,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.qos import ReliabilityPolicy
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, ended, values_of
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 
 from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
@@ -184,11 +184,12 @@ def test_the_example_of_the_readme_reads_the_planes(bench, tmp_path):
     printed = tmp_path / 'printed'
     with printed.open('w') as errors:
         run = subprocess.Popen([sys.executable, example], stderr=errors)
-    # The walls are a square root of 2 away.
-    bench.until(lambda: bench.stream().any() and 'distance 1.41' in printed.read_text())
-    assert '2 planes in camera_depth_optical_frame' in printed.read_text()
-    run.terminate()
-    bench.until(lambda: run.poll() is not None)
+    with ended(run):
+        # The walls are a square root of 2 away.
+        bench.until(lambda: bench.stream().any() and 'distance 1.41' in printed.read_text())
+        assert '2 planes in camera_depth_optical_frame' in printed.read_text()
+        run.terminate()
+        bench.until(lambda: run.poll() is not None)
     assert run.returncode == 0 and 'Traceback' not in printed.read_text(), printed.read_text()
 
 

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import DEPTH, INFO, NODE, Bench, values_of
+from ros_bench import DEPTH, INFO, NODE, Bench, ended, values_of
 
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -105,18 +105,20 @@ def test_interrupted_at_the_start(command, delay, tmp_path):
         cwd=tmp_path,
         env={**os.environ, 'PYTHONPATH': os.fspath(Path(__file__).parents[1])},
     )
-    # Before that Python itself is not ready.
-    assert process.stdout and process.stdout.readline() == 'begun\n'
-    time.sleep(delay)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=300)
+    with ended(process):
+        # Before that Python itself is not ready.
+        assert process.stdout and process.stdout.readline() == 'begun\n'
+        time.sleep(delay)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=300)
     assert 'Traceback' not in errors and process.returncode in (0, 130), errors
 
 
 def test_interrupted_as_it_begins_to_spin():
     process = subprocess.Popen(NODE, stderr=subprocess.PIPE, text=True)
-    assert process.stderr
-    assert 'will subscribe' in process.stderr.readline()
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=300)
+    with ended(process):
+        assert process.stderr
+        assert 'will subscribe' in process.stderr.readline()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=300)
     assert 'Traceback' not in errors and process.returncode in (0, 130), errors

@@ -11,7 +11,7 @@ import click
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from rangeseg_ros.cli import options
+from rangeseg_ros.cli import interrupts, options
 
 CLOCK = '/clock'
 CLOCK_PERIOD = 0.025
@@ -68,9 +68,11 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock:
             raise click.ClickException(f'{bag}: no message of a known type')
         tell = _clock(node) if clock and CLOCK not in publishers else _silent
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
+            interrupts.check()
             time.sleep(0.05)
         time.sleep(delay)
         while True:
+            interrupts.check()  # there may be no message
             for topic, data in options.progress(
                 _timed(reader, publishers, rate, tell), reader.message_count, 'message'
             ):
@@ -150,6 +152,7 @@ def _timed(
         due = start + (stamp - reader.start_time) / 1e9 / rate
         while (left := due - time.monotonic()) > CLOCK_PERIOD:
             tell(stamp - round(left * rate * 1e9))
+            interrupts.check()
             time.sleep(CLOCK_PERIOD)
         time.sleep(max(0.0, left))
         tell(stamp)

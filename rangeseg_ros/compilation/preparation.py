@@ -46,7 +46,8 @@ def prepare(config: Config, kinds: tuple[str, ...] = KINDS, report: Report = pri
     kinds : tuple of str
         Of `rehearsal.KINDS`.
     report : callable
-        Gets the progress, 'compiling kernels, 12 of 35'; nothing when nothing is compiled.
+        Gets the progress, 'compiling kernels, 12 of 35', or where none can be kept for other
+        processes 'compiling kernels, 12 so far'; nothing when nothing is compiled.
     """
     try:
         with _nothing_compiled():
@@ -57,7 +58,8 @@ def prepare(config: Config, kinds: tuple[str, ...] = KINDS, report: Report = pri
     report('compiling kernels')
     if keeps_compiled():
         Pool(report).compile(config, kinds)
-    rehearse(config, kinds)
+    with event.install_listener('numba:compile', _Told(report)):
+        rehearse(config, kinds)
 
 
 class _NotCompiledError(Exception):
@@ -78,6 +80,23 @@ def _nothing_compiled() -> Iterator[None]:
 
     with event.install_listener('numba:compile', Refuse()):
         yield
+
+
+class _Told(event.Listener):
+    """Reports what is compiled in this process, with all that it calls as one."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        self._depth = self._done = 0
+
+    def on_start(self, event: Any) -> None:
+        self._depth += 1
+
+    def on_end(self, event: Any) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self._done += 1
+            self._report(f'compiling kernels, {self._done} so far')
 
 
 class Pool:
