@@ -13,9 +13,11 @@ os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
 from rangeseg_ros.cli.main import main
 
-# A shell that starts tests in the background has them ignore interrupts, and with them the
-# processes that they start and interrupt.
+# A shell that starts tests in the background has them ignore interrupts, nohup hang-ups, and with
+# them the processes that they start and signal. Those forget a handler, but not what is ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda number, stack: None)
 
 # The same examples on every run, and no timed tests: machines are busy.
 settings.register_profile('rangeseg', deadline=None, derandomize=True)
