@@ -53,6 +53,15 @@ def test_without_a_home_kernels_are_kept_in_a_private_temporary_folder(tmp_path)
     assert list(kept.rglob('*.nbi'))
 
 
+def test_without_a_temporary_folder_kernels_are_kept_in_shared_memory(monkeypatch):
+    def none():
+        raise FileNotFoundError
+
+    monkeypatch.setattr(cache.tempfile, 'gettempdir', none)
+    monkeypatch.setattr(cache, '_private', lambda folder: True)
+    assert list(cache._folders())[-1] == Path(f'/dev/shm/rangeseg_ros-{os.getuid()}')
+
+
 @pytest.mark.parametrize(
     'variable, folder',
     [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros'), ('ROS_HOME', 'rangeseg_ros')],

@@ -14,6 +14,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +39,9 @@ def choose_cache() -> None:
     """Give numba a folder for compiled kernels, before the first kernel is defined.
 
     The first that can be written to: `NUMBA_CACHE_DIR`, the package, the user's cache folder,
-    `ROS_HOME`, a folder of the user's own in the temporary directory. Kernels that were compiled
-    into a package which is read-only now are copied there. Where there is none they are read from
-    the package, and what is missing is compiled at every start.
+    `ROS_HOME`, a folder of the user's own in the temporary directory or in shared memory. Kernels
+    that were compiled into a package which is read-only now are copied there. Where there is none
+    they are read from the package, and what is missing is compiled at every start.
 
     Warns
     -----
@@ -88,14 +89,19 @@ def _folders() -> Iterator[Path]:
         yield (Path(cache) if cache else Path(home or '', '.cache')) / 'rangeseg_ros'
     if ros_home := os.environ.get('ROS_HOME'):
         yield Path(ros_home) / 'rangeseg_ros'
-    try:
-        temporary = Path(tempfile.gettempdir())
-    except FileNotFoundError:
-        return
-    if hasattr(os, 'getuid'):
+    for temporary in _temporary_folders():
         own = temporary / f'rangeseg_ros-{os.getuid()}'
         if _private(own):
             yield own
+
+
+def _temporary_folders() -> Iterator[Path]:
+    if not hasattr(os, 'getuid'):
+        return
+    with suppress(FileNotFoundError):
+        yield Path(tempfile.gettempdir())
+    # Memory: containers with a read-only root have it, too, and it lasts as long as they do.
+    yield Path('/dev/shm')
 
 
 def _private(folder: Path) -> bool:
