@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -73,6 +74,13 @@ CACHE = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'rang
     is_flag=True,
     help='Also other sizes of image: ' + ', '.join(f'{w}x{h}' for w, h in SIZES) + '.',
 )
+@click.option(
+    '--budget',
+    'budgets',
+    type=click.FloatRange(0, 1),
+    multiple=True,
+    help='Also with this `work_budget`; may be repeated.',
+)
 @measures.json_file
 def command(
     depth: tuple[Path, ...],
@@ -86,6 +94,7 @@ def command(
     exact: bool,
     cache: Path,
     scaling: bool,
+    budgets: tuple[float, ...],
     json_file: Path | None,
 ) -> None:
     """Measure the time and memory of each stage on DEPTH images, or on simulated rooms.
@@ -97,6 +106,7 @@ def command(
     if depth and scaling:
         raise click.UsageError('--scaling is for simulated images, not for DEPTH')
     config = read_config(params_file, **({'method': method} if method else {}))
+    within = {f'{budget:g}': replace(config, work_budget=budget) for budget in budgets}
     progress = partial(options.progress, unit='frame')
     with scratch_folder('rangeseg_bench') as folder:
         if camera_file:
@@ -112,6 +122,13 @@ def command(
             figures['scaling'] = _series(folder, figures, config, scenes, rounds, threads)
             click.echo()
             click.echo(benchmark.scaling_table(figures['scaling']))
+        if within:
+            figures['budgets'] = {
+                budget: benchmark.measure(frames, less, rounds, threads=threads)
+                for budget, less in within.items()
+            }
+            click.echo()
+            click.echo(benchmark.budget_table(figures['budgets']))
     if json_file:
         measures.write_json(json_file, figures)
 

@@ -113,6 +113,13 @@ class Config:
         low=0,
         high=1000,
     )
+    work_budget: float = option(
+        1.0,
+        'method planes: share of the full work that a frame may take; below 1 fewer boundaries '
+        'are refined, below 0.8 every second row and column is looked at',
+        low=0.0,
+        high=1.0,
+    )
     warm_start: bool = option(
         False,
         'method normals: begin from the labels of the frame before, where its size and camera '
@@ -314,6 +321,8 @@ class Config:
             raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.warm_start and (self.method != 'normals' or self.exact):
             raise ConfigError('parameter warm_start is for method normals, without exact')
+        if self.work_budget < 1 and (self.method != 'planes' or self.exact):
+            raise ConfigError('parameter work_budget is for method planes, without exact')
         if self.odometry and not self.odometry_frame:
             raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -23,10 +22,13 @@ from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
+from rangeseg_ros.core.runtime.stopwatch import Stopwatch
+from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, GridEdges, weights
+from rangeseg_ros.core.sensing.halving import doubled_edges, doubled_labels
 from rangeseg_ros.core.sensing.jump_edges import jump_edges, pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -165,6 +167,7 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
+        self._coarse = _for_half_the_size(self.config)
         self.reset()
         keep_freed_memory()
 
@@ -181,7 +184,7 @@ class Segmenter:
             There is a `distortion_map` or a `mask`, and nobody has applied it: the core reads no
             files.
         """
-        config, watch = self.config, Stopwatch()
+        config = self.config
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
                 'distortion_map is not subtracted yet: segment corrected(image, config)'
@@ -190,6 +193,15 @@ class Segmenter:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
+        if Work.within(config.work_budget).every_pixel:
+            return self._segment(image, config, Stopwatch())
+        watch = Stopwatch()
+        coarse = self._segment(image.halved(), self._coarse, watch)
+        result = _told_for_all(coarse, image)
+        watch.lap('pixels')
+        return result
+
+    def _segment(self, image: RangeImage, config: Config, watch: Stopwatch) -> Segmentation:
         blocks = Blocks.of(image)
         sensor = SensorModel.from_config(config)
         if config.sensor_model == 'measured':
@@ -207,7 +219,7 @@ class Segmenter:
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
         method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, labelling = method(whole, blocks, grid, sensor, watch)
+        regions, labelling = method(whole, blocks, grid, sensor, config, watch)
         if config.method == 'planes':
             regions, fits = by_planes.unite_regions(regions, image, blocks, sensor, grid)
         else:
@@ -234,10 +246,10 @@ class Segmenter:
         blocks: Blocks,
         grid: Grid,
         sensor: SensorModel,
+        config: Config,
         watch: Stopwatch,
     ) -> tuple[NDArray[np.uint16], by_planes.Labelling]:
         """Regions and the labelling they are made from, by planes as labels."""
-        config = self.config
         least = least_pixels(config.min_pixels, image.shape)
         labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
@@ -252,10 +264,10 @@ class Segmenter:
         blocks: Blocks,
         grid: Grid,
         sensor: SensorModel,
+        config: Config,
         watch: Stopwatch,
     ) -> tuple[NDArray[np.uint16], by_normals.Labelling]:
         """The same by discretised normals as labels."""
-        config = self.config
         least = least_pixels(config.min_pixels, image.shape)
         before = self._labels_before(image)
         labelling = by_normals.segment(image, grid, config, before, watch.lap)
@@ -273,6 +285,41 @@ class Segmenter:
         return labels if camera == image.camera and labels.shape == image.shape else None
 
 
+def _for_half_the_size(config: Config) -> Config:
+    """Parameters for images of half the rows and columns: lengths and areas are in pixels."""
+    return replace(
+        config,
+        min_pixels=-(-config.min_pixels // 4),
+        noise_correlation=config.noise_correlation / 2,
+        distortion_length=config.distortion_length / 2,
+        pixel_noise=config.pixel_noise / 2,
+    )
+
+
+def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
+    """What was found in `image.halved()`, for all pixels that it stands for."""
+    labels = doubled_labels(coarse.labels, image.valid)
+    count = np.bincount(labels.ravel(), minlength=int(coarse.labels.max(initial=0)) + 1)
+    sensor = coarse.sensor
+    sensor = sensor._replace(
+        correlation=2 * sensor.correlation,
+        distortion_length=2 * sensor.distortion_length,
+        pixel_noise=2 * sensor.pixel_noise,
+        pixel_distortion=2 * sensor.pixel_distortion,
+    )
+    survey = coarse.survey
+    if isinstance(survey, Survey):
+        survey = replace(survey, image=image, sensor=sensor)
+    return replace(
+        coarse,
+        labels=labels,
+        planes=[replace(plane, count=int(count[plane.label])) for plane in coarse.planes],
+        sensor=sensor,
+        jumps=coarse.jumps and doubled_edges(coarse.jumps, image.valid),
+        survey=survey,
+    )
+
+
 def _reason(image: RangeImage, planes: list[Plane]) -> str:
     """Why there is no plane; empty when there is one."""
     if planes:
@@ -280,23 +327,3 @@ def _reason(image: RangeImage, planes: list[Plane]) -> str:
     if not image.valid.any():
         return 'no valid depth'
     return 'no flat region large enough'
-
-
-class Stopwatch:
-    """Times the stages of a run.
-
-    Attributes
-    ----------
-    laps : dict
-        Milliseconds per stage.
-    """
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """End the stage that has been running."""
-        now = time.perf_counter()
-        self.laps[stage] = 1000 * (now - self._last)
-        self._last = now

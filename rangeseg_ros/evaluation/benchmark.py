@@ -234,6 +234,19 @@ def table(figures: dict[str, Any]) -> str:
     return '\n'.join(lines)
 
 
+def budget_table(series: dict[str, dict[str, Any]]) -> str:
+    """Text of `measure` figures of several values of `work_budget`."""
+    head = ('median ms', 'p95 ms', 'cpu ms')
+    lines = [f'{"budget":<12}' + ''.join(f'{title:>11}' for title in head)]
+    for budget, figures in series.items():
+        total = figures['total']
+        lines.append(
+            f'{budget:<12}{total["median_ms"]:>11.1f}{total["p95_ms"]:>11.1f}'
+            f'{figures["cpu_ms"]:>11.1f}'
+        )
+    return '\n'.join(lines)
+
+
 def scaling_table(series: dict[str, dict[str, Any]]) -> str:
     """Text of `measure` figures of several sizes of image, each with its `ratio`."""
     head = ('median ms', 'p95 ms', 'ratio', 'cpu ms', 'peak MB')

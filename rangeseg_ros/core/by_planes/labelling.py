@@ -47,8 +47,11 @@ def refine(
     sensor: SensorModel,
     exact: bool = False,
     refits: int = 0,
+    cuts: float = 1.0,
 ) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels with the planes of surfaces.
+
+    More than seven parameters: the last three are how far to go.
 
     Parameters
     ----------
@@ -66,6 +69,8 @@ def refine(
     refits : int
         Rounds, at most, of fitting the planes to the labels and the labels to the planes again;
         fewer when a round does not lower the energy, as a fit may: it does not know of the cap.
+    cuts : float
+        Share of the pixels near boundaries that labels are expanded to when not exact.
 
     Returns
     -------
@@ -78,7 +83,7 @@ def refine(
     models = _shifted(Models.of(moments, problem.enlarged), starts, blocks, sensor)
     labels, cost = _descended(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
-    _minimise(labels, cost, problem, models, domains)
+    _minimise(labels, cost, problem, models, domains, cuts)
     value = energy(labels, problem, models) if refits else 0.0
     for _ in range(refits):
         shape = -1, problem.width
@@ -87,7 +92,7 @@ def refine(
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
         refitted = Models.of(moments, problem.enlarged)._replace(price=models.price)
         refitted, better = _shifted(refitted, starts, blocks, sensor), labels.copy()
-        _minimise(better, costs(better, problem, refitted), problem, refitted, domains)
+        _minimise(better, costs(better, problem, refitted), problem, refitted, domains, cuts)
         last, value = value, energy(better, problem, refitted)
         if value >= last - _STEP:
             break
@@ -109,16 +114,17 @@ def _minimise(
     problem: Problem,
     models: Models,
     domains: Sites | None,
+    cuts: float,
 ) -> None:
     """Expand the labels near their boundaries, or in their domains until none helps; in place."""
     if domains is None:
         labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
-        _in_halves(_expand_near, len(labels) // problem.width, labelling, problem, models)
+        _in_halves(_expand_near, len(labels) // problem.width, labelling, problem, models, cuts)
         return
     cost = costs(labels, problem, models)
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
     everywhere = 0, len(labels) // problem.width
-    while _expand_each(0, everywhere, labelling, problem, models, domains, 1):
+    while _expand_each((0, len(models.theta)), everywhere, labelling, problem, models, domains, 1):
         pass
 
 
@@ -286,20 +292,28 @@ def _descend(
 
 @njit(cache=True, nogil=True)
 def _expand_near(
-    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models
+    rows: tuple[int, int],
+    labelling: GridLabelling,
+    problem: Problem,
+    models: Models,
+    cuts: float,
 ) -> None:
     """Expand every label once in some rows, near its boundaries; in place.
 
+    In the order of the labels, until the share `cuts` of the pixels at boundaries is used up.
     Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
     """
     count = len(models.theta)
     near = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
-    _expand_each(1, rows, labelling, problem, models, near, _BAND)
+    most, after = cuts * len(near[1]), 1
+    while after < count and near[0][after + 1] <= most:
+        after += 1
+    _expand_each((1, after), rows, labelling, problem, models, near, _BAND)
 
 
 @njit(cache=True, nogil=True)
 def _expand_each(
-    first: int,
+    chosen: tuple[int, int],
     rows: tuple[int, int],
     labelling: GridLabelling,
     problem: Problem,
@@ -307,13 +321,13 @@ def _expand_each(
     near: Sites,
     reach: int,
 ) -> bool:
-    """Expand labels from `first` on once, to the pixels `near` and `reach` - 1 beyond in `rows`.
+    """Expand labels, from the first to before the second of the `chosen`, once.
 
-    In place. Whether that helped.
+    To the pixels `near` and `reach` - 1 beyond in `rows`; in place. Whether that helped.
     """
     start, sites = near
     helped = False
-    for alpha in range(first, len(models.theta)):
+    for alpha in range(*chosen):
         front = sites[start[alpha] : start[alpha + 1]]
         helped |= _expand(alpha, front, rows, reach, labelling, problem, models)
     return helped

@@ -22,6 +22,7 @@ from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.regions import VGA, by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, block_moments, quads
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -85,7 +86,7 @@ def segment(
     sensor : SensorModel
         Errors of the image.
     config : Config
-        `min_pixels`, `exact` and `refits` are read.
+        `min_pixels`, `exact`, `refits` and `work_budget` are read.
     lap : callable
         Told the name of every stage that ends.
     """
@@ -107,8 +108,9 @@ def segment(
     surface, moments = join_surfaces(weights, block_links(grid, size), size, least, enlarged)
     problem = pending.result()
     lap('surfaces')
+    cuts = Work.within(config.work_budget).cuts
     labels, models = refine(
-        problem, surface, weights, moments, sensor, config.exact, config.refits
+        problem, surface, weights, moments, sensor, config.exact, config.refits, cuts
     )
     lap('labels')
     return Labelling(labels.reshape(image.shape), sensor, problem, models)

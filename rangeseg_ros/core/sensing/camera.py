@@ -5,7 +5,7 @@ from __future__ import annotations
 import operator
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -211,6 +211,20 @@ class Camera:
     def shape(self) -> tuple[int, int]:
         """Shape of an image of this camera: (height, width)."""
         return self.height, self.width
+
+    @cached_property
+    def halved(self) -> Camera:
+        """The camera that sees every second column of every second row, from the first on."""
+        return replace(
+            self,
+            width=(self.width + 1) // 2,
+            height=(self.height + 1) // 2,
+            fx=self.fx / 2,
+            fy=self.fy / 2,
+            cx=self.cx / 2,
+            cy=self.cy / 2,
+            skew=self.skew / 2,
+        )
 
     @property
     def pinhole(self) -> bool:

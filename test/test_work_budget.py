@@ -1,0 +1,121 @@
+"""A share of the full work: what it leaves out, and what it must not."""
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.runtime.work import Work
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+
+BUDGETS = (1.0, 0.9, 0.8, 0.5, 0.36, 0.0)
+
+
+@pytest.fixture(scope='module')
+def room():
+    camera = kinect_camera(321, 241)
+    return simulate_kinect(kinect_room(2), camera, seed=2), camera
+
+
+@pytest.fixture(scope='module')
+def image(room):
+    return RangeImage.from_depth(room[0].depth, room[1])
+
+
+@pytest.fixture(scope='module')
+def results(image):
+    return {budget: Segmenter(Config(work_budget=budget)).segment(image) for budget in BUDGETS}
+
+
+def test_less_is_never_more():
+    steps = [Work.within(budget) for budget in np.linspace(1, 0, 1001)]
+    assert steps[0] == (True, 1.0) and steps[-1] == (False, 0.0)
+    for before, after in pairwise(steps):
+        assert before.every_pixel >= after.every_pixel
+        assert before.cuts >= after.cuts or before.every_pixel > after.every_pixel
+
+
+def test_fewer_cuts_leave_more_energy(results):
+    energies = [results[budget].energy for budget in (1.0, 0.9, 0.8)]
+    assert energies[0] < energies[1] < energies[2]
+    energies = [results[budget].energy for budget in (0.5, 0.36, 0.0)]
+    assert energies[0] < energies[1] < energies[2]
+
+
+@pytest.mark.parametrize('budget', BUDGETS)
+def test_results_do_not_depend_on_the_number_of_threads(image, results, budget):
+    before = cv2.getNumThreads()
+    try:
+        for threads in (1, 3):
+            cv2.setNumThreads(threads)
+            again = Segmenter(Config(work_budget=budget)).segment(image)
+            assert (again.labels == results[budget].labels).all()
+    finally:
+        cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize('budget', BUDGETS)
+def test_planes_are_those_of_the_scene(image, room, results, budget):
+    """Every wall, floor and ceiling of a twelfth of the image is found, its pixels too."""
+    result, truth = results[budget], room[0].labels
+    assert result.labels.shape == result.edges.shape == image.shape
+    assert not result.labels[~image.valid].any()
+    counts = [np.count_nonzero(result.labels == plane.label) for plane in result.planes]
+    assert counts == [plane.count for plane in result.planes]
+    for label in np.unique(truth[truth > 0]):
+        region = (truth == label) & image.valid
+        if np.count_nonzero(region) < image.valid.size / 12:
+            continue
+        found = np.bincount(result.labels[region])
+        best = result.labels == found[1:].argmax() + 1
+        assert (best & region).sum() > 0.85 * (best | region).sum()
+
+
+def test_the_sensor_is_said_in_pixels_of_the_image(results):
+    full, coarse = results[1.0].sensor, results[0.5].sensor
+    assert coarse.noise == pytest.approx(full.noise, rel=0.5)
+    assert coarse.distortion_length == full.distortion_length
+
+
+def test_no_jump_beside_what_was_not_measured(image, results):
+    across, down = results[0.5].jumps
+    valid = image.valid
+    assert across.any() and down.any()
+    assert not (across & ~(valid[:, 1:] & valid[:, :-1])).any()
+    assert not (down & ~(valid[1:] & valid[:-1])).any()
+
+
+def test_half_a_camera_sees_every_second_pixel():
+    camera = Camera(7, 5, 6.0, 6.5, 3.2, 1.9, skew=0.3)
+    assert camera.halved.shape == (3, 4)
+    assert camera.halved.rays == pytest.approx(camera.rays[::2, ::2], abs=1e-6)
+
+
+def test_clouds_and_bodies_are_halved(image):
+    cloud = RangeImage.from_points(image.points)
+    budget = Config(work_budget=0.5)
+    result = Segmenter(budget).segment(cloud)
+    assert result.labels.shape == image.shape and result.planes
+    body = np.zeros(image.shape, bool)
+    body[150:] = True
+    hidden = Segmenter(budget).segment(image.without(body))
+    assert hidden.planes and not hidden.labels[body].any()
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 9), (2, 3), (5, 1)])
+def test_tiny_images(shape):
+    height, width = shape
+    camera = Camera(width, height, 5.0, 5.0, width / 2, height / 2)
+    image = RangeImage.from_depth(np.full(shape, 1000, np.uint16), camera)
+    assert Segmenter(Config(work_budget=0.5)).segment(image).labels.shape == shape
+
+
+@pytest.mark.parametrize('other', [{'method': 'normals'}, {'exact': True}])
+def test_budgets_are_for_the_shortcuts_of_planes(other):
+    with pytest.raises(ConfigError, match='work_budget'):
+        Config(work_budget=0.9, **other)
