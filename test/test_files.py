@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
+from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.files import natural_order, replacing
 from rangeseg_ros.io.images import ImageFileError, read_depth, read_labels, write_image
@@ -227,9 +228,12 @@ def _plane(**changes):
         'normal': np.array([0.0, 0.6, -0.8]),
         'covariance': np.arange(16.0).reshape(4, 4),
         'centroid': np.array([0.1, 0.2, 1.7]),
-        'extents': np.array([2.0, 1.0]),
-        'centre': np.array([0.3, 0.4, 1.8]),
-        'orientation': np.array([0.1, 0.2, 0.3, 0.4]),
+        'shape': Shape(
+            area=1.5,
+            extents=np.array([2.0, 1.0]),
+            centre=np.array([0.3, 0.4, 1.8]),
+            orientation=np.array([0.1, 0.2, 0.3, 0.4]),
+        ),
         'outline': SimpleNamespace(hull=TRIANGLE, holes=[TRIANGLE, TRIANGLE]),
         **changes,
     }

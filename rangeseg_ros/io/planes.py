@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import fields
 from itertools import combinations_with_replacement
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -24,6 +24,12 @@ def _axes(field: str, axes: str) -> dict[str, Callable[[Any], Any]]:
     return {f'{field}_{axis}': itemgetter(index) for index, axis in enumerate(axes)}
 
 
+def _entries(attribute: str, names: Sequence[str]) -> dict[str, Callable[[Any], Any]]:
+    """Columns of an attribute, an array, of the field."""
+    get = attrgetter(attribute)
+    return {name: lambda value, k=k: get(value)[k] for k, name in enumerate(names)}
+
+
 def _points(points: NDArray) -> str:
     return ';'.join(' '.join(f'{x:.6g}' for x in point) for point in points)
 
@@ -36,9 +42,12 @@ _PARTS: dict[str, dict[str, Callable[[Any], Any]]] = {
         f'covariance_{"xyzd"[i]}{"xyzd"[j]}': itemgetter((i, j))
         for i, j in combinations_with_replacement(range(4), 2)
     },
-    'extents': {'length': itemgetter(0), 'width': itemgetter(1)},
-    'centre': _axes('centre', 'xyz'),
-    'orientation': _axes('orientation', 'xyzw'),
+    'shape': {
+        'area': attrgetter('area'),
+        **_entries('extents', ('length', 'width')),
+        **_entries('centre', ('centre_x', 'centre_y', 'centre_z')),
+        **_entries('orientation', [f'orientation_{axis}' for axis in 'xyzw']),
+    },
     'outline': {
         'hull': lambda outline: _points(outline.hull),
         'holes': lambda outline: '|'.join(map(_points, outline.holes)),

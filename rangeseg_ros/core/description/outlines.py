@@ -28,8 +28,10 @@ class Outline:
 
     Attributes
     ----------
-    mask : (h, w) bool
-        The region in its bounding box.
+    labels : (h, w) uint16
+        Those of its bounding box.
+    label : int
+        The region's.
     row, column : int
         Of the box's first pixel in the image.
     theta : (3,) float64
@@ -38,11 +40,17 @@ class Outline:
         What gives the rays: of the corners of the pixels (camera), or of their centres (cloud).
     """
 
-    mask: NDArray[np.bool_]
+    labels: NDArray[np.uint16]
+    label: int
     row: int
     column: int
     theta: NDArray[np.float64]
     rays: Camera | NDArray[np.float32]
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(h, w) the region in its bounding box."""
+        return self.labels == self.label
 
     @property
     def hull(self) -> NDArray[np.float64]:
@@ -61,12 +69,6 @@ class Outline:
 
     def exists(self) -> bool:
         """Whether there is a polygon: steep planes may lie behind the sensor at their border."""
-        if isinstance(self.rays, Camera) and self.rays.pinhole:
-            # All of the box lies ahead where its corners do.
-            height, width = self.mask.shape
-            box = np.array([(x, y) for x in (0, width) for y in (0, height)])
-            if self._ahead(self._rays(box)).all():
-                return True
         return len(self.hull) > 2 and bool(np.isfinite(self.hull).all())
 
     @cached_property
@@ -115,6 +117,29 @@ class Outline:
                 column = np.clip(corners[:, 0] + j, 0, width - 1)
                 total += self.rays[row, column] * self.mask[row, column, None]
         return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def lies_ahead(
+    boxes: NDArray[np.intp], theta: NDArray[np.float64], camera: Camera | None
+) -> NDArray[np.bool_]:
+    """Which regions surely have finite outlines (N,): those of a pinhole camera whose box does.
+
+    All of a box lies ahead where its corners do.
+
+    Parameters
+    ----------
+    boxes : (N, 4) int
+        First row and column of each region, and the ones after its last.
+    theta : (N, 3) float64
+        Planes, theta . ray = inverse range.
+    camera : Camera or None
+        None for an organised cloud.
+    """
+    if camera is None or not camera.pinhole:
+        return np.zeros(len(boxes), np.bool_)
+    rays = camera.rays_at(boxes[:, [1, 1, 3, 3]] - 0.5, boxes[:, [0, 2, 0, 2]] - 0.5)
+    level = np.einsum('nci,ni->nc', rays, theta)
+    return (level > _GRAZING * np.abs(theta).max(axis=1)[:, None]).all(axis=1)
 
 
 def triangles(

@@ -6,10 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.description.extents import areas_and_axes, rectangles
-from rangeseg_ros.core.description.outlines import Outline
+from rangeseg_ros.core.description.outlines import Outline, lies_ahead
+from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits, symmetric
@@ -53,16 +52,9 @@ class Plane:
         0...1: the share of the pixels that the plane explains, times the mean square residual that
         the sensor model expects of them over the observed one where that is larger. About 1 for
         planes, less for what is bent, rough or spills over its border.
-    area : float
-        Area of the pixels on the plane, square metres.
-    extents : (2,) float64
-        Length and width of the rectangle around the region, its sides along the principal
-        axes of the region's area, metres.
-    centre : (3,) float64
-        Centre of that rectangle, metres.
-    orientation : (4,) float64
-        Quaternion x, y, z, w of the frame whose x axis runs along the length, pointing to the
-        image's right, and whose z axis is the normal.
+    shape : Shape or RegionShape
+        What `area`, `extents`, `centre` and `orientation` are of, worked out when first asked
+        for.
     outline : Outline
         What `hull` and `holes` are made of when first asked for.
     role : str
@@ -79,12 +71,35 @@ class Plane:
     count: int
     rms: float
     confidence: float
-    area: float
-    extents: NDArray[np.float64]
-    centre: NDArray[np.float64]
-    orientation: NDArray[np.float64]
+    shape: Shape | RegionShape = field(repr=False)
     outline: Outline = field(repr=False)
     role: str = ''
+
+    @property
+    def area(self) -> float:
+        """Area of the pixels on the plane, square metres."""
+        return self.shape.area
+
+    @property
+    def extents(self) -> NDArray[np.float64]:
+        """(2,) length and width of the rectangle around the region, metres.
+
+        Its sides run along the principal axes of the region's area.
+        """
+        return self.shape.extents
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) centre of that rectangle, metres."""
+        return self.shape.centre
+
+    @property
+    def orientation(self) -> NDArray[np.float64]:
+        """(4,) quaternion x, y, z, w of the frame of that rectangle.
+
+        Its x axis runs along the length, pointing to the image's right, its z axis is the normal.
+        """
+        return self.shape.orientation
 
     @property
     def hull(self) -> NDArray[np.float64]:
@@ -147,26 +162,15 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
     confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
 
-    area, major = areas_and_axes(labels, image, theta, _tangents(normal), fits.inner)
-    axes = np.stack([major, np.cross(normal, major)], axis=1)
-    limits = rectangles(labels, image, theta, axes, fits.inner)
+    shapes = Shapes(labels, image, theta, fits.inner)
     boxes = fits.boxes()
     outlines = {k: _outline(k, labels, image, boxes[k], theta[k]) for k in found.tolist()}
-    # Steep planes may have pixels whose rays do not meet them.
-    finite = (
-        np.isfinite(limits).all(axis=(1, 2)) & np.isfinite(area) & np.isfinite(centroid).all(1)
-    )
-    shown = [outline.exists() for outline in outlines.values()]
-    found = found[finite[found] & np.array(shown)]
-    if not len(found):
-        return []
-    limits = limits[found]
-    extents = limits[..., 1] - limits[..., 0]
-    centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes[found])
-    centre -= distance[found, None] * normal[found]
-    frames = np.stack([axes[found, 0], axes[found, 1], normal[found]], axis=2)
-    orientation = Rotation.from_matrix(frames).as_quat()
-    orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
+    # Of steep planes neither need be finite.
+    doubtful = found[~lies_ahead(boxes[found], theta[found], image.camera)]
+    if len(doubtful):
+        finite = shapes.finite() & np.isfinite(centroid).all(1)
+        kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
+        found = np.setdiff1d(found, doubtful[~kept])
     return [
         Plane(
             label=int(k),
@@ -179,13 +183,10 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
             count=int(fits.pixels[k]),
             rms=float(rms[k]),
             confidence=float(confidence[k]),
-            area=float(area[k]),
-            extents=extents[index],
-            centre=centre[index],
-            orientation=orientation[index],
+            shape=RegionShape(shapes, int(k)),
             outline=outlines[int(k)],
         )
-        for index, k in enumerate(found)
+        for k in found
     ]
 
 
@@ -203,14 +204,6 @@ def _expected_square(fits: Fits) -> NDArray[np.float64]:
     return total / np.maximum(np.bincount(region, count, len(theta)), 1)
 
 
-def _tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two unit vectors across each normal, (N, 2, 3)."""
-    across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, across)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
-    return np.stack([first, np.cross(normal, first)], axis=1)
-
-
 def _outline(
     label: int,
     labels: NDArray[np.uint16],
@@ -220,4 +213,4 @@ def _outline(
 ) -> Outline:
     top, left, bottom, right = (int(edge) for edge in box)
     crop = slice(top, bottom), slice(left, right)
-    return Outline(labels[crop] == label, top, left, theta, image.camera or image.rays[crop])
+    return Outline(labels[crop], label, top, left, theta, image.camera or image.rays[crop])

@@ -10,6 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.evidence import Evidence
 from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
 from rangeseg_ros.core.mapping.transforms import quaternion
@@ -126,10 +127,12 @@ def described(
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
-        area=shape.area,
-        extents=shape.limits[:, 1] - shape.limits[:, 0],
-        centre=point + shape.limits.mean(axis=1) @ frame,
-        orientation=quaternion(np.stack([*frame, normal], axis=1)),
+        shape=Shape(
+            area=shape.area,
+            extents=shape.limits[:, 1] - shape.limits[:, 0],
+            centre=point + shape.limits.mean(axis=1) @ frame,
+            orientation=quaternion(np.stack([*frame, normal], axis=1)),
+        ),
         outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
         role=record.roles.most_common(1)[0][0],
         observations=record.observations,

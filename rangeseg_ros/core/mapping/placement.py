@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 
@@ -124,8 +125,12 @@ def moved_planes(planes: Sequence[Plane], motion: Transform) -> list[Plane]:
                 distance=float(plane.distance - normal @ shift),
                 covariance=jacobian @ plane.covariance @ jacobian.T,
                 centroid=turn @ plane.centroid + shift,
-                centre=turn @ plane.centre + shift,
-                orientation=orientation if orientation[3] >= 0 else -orientation,
+                shape=Shape(
+                    area=plane.area,
+                    extents=plane.extents,
+                    centre=turn @ plane.centre + shift,
+                    orientation=orientation if orientation[3] >= 0 else -orientation,
+                ),
                 outline=outline,  # type: ignore[arg-type]
             )
         )

@@ -78,7 +78,8 @@ def tilt_of(
         # Walls that the camera would turn about agree with both.
         alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()
         whole = pixels[seen].sum() >= _MOST * pixels.sum()
-        if planes[k].area >= area and whole and alone[0] > _CLEARLY * alone[1]:
+        # The area last: it is worked out when asked for.
+        if whole and alone[0] > _CLEARLY * alone[1] and planes[k].area >= area:
             found.append((float(alone[0]), k))
     if not found:
         return None
