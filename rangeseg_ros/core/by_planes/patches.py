@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -20,6 +18,11 @@ WITHIN_PATCH = 2.0
 """Systematic variances granted between blocks of a patch."""
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = 10.0
+# Steps of a variance by which patches are told to be flatter: the mean residual of the largest
+# patch scatters by 0.04, and less than a step is often rounding.
+_PER_VARIANCE = 256
+# Patches are nearly never rougher than their blocks.
+_LEVELS = 16 * _PER_VARIANCE
 
 
 @njit(cache=True, nogil=True)
@@ -128,35 +131,33 @@ def _quads(
     rows, columns = smooth.shape
     parent = np.arange(rows * columns)
     theta, total = np.zeros(3), np.zeros(SIZE)
-    whole, side = smooth.copy(), 1
-    while whole.any():
-        merged = np.zeros_like(whole)
+    whole, side, found = smooth.copy(), 1, True
+    while found:
+        merged, found = np.zeros_like(whole), False
         for i in range(0, rows - 2 * side + 1, 2 * side):
             for j in range(0, columns - 2 * side + 1, 2 * side):
-                middle = i + side, j + side
-                if not (whole[i, j] and whole[i, middle[1]]):
+                u, v = i + side, j + side
+                if not (whole[i, j] and whole[i, v] and whole[u, j] and whole[u, v]):
                     continue
-                if not (whole[middle[0], j] and whole[middle]):
+                linked = True
+                for k in range(2 * side):
+                    linked &= right[i + k, v - 1] and below[u - 1, j + k]
+                a, b = i * columns + j, i * columns + v
+                c, d = u * columns + j, u * columns + v
+                if not linked:
                     continue
-                if not (
-                    right[i : i + 2 * side, middle[1] - 1].all()
-                    and below[middle[0] - 1, j : j + 2 * side].all()
-                ):
-                    continue
-                apart = 0.0
-                total[:] = 0
-                for u in (i, middle[0]):
-                    for v in (j, middle[1]):
-                        total += moments[u * columns + v]
-                        apart += residual[u * columns + v]
+                for entry in range(SIZE):
+                    total[entry] = moments[a, entry] + moments[b, entry]
+                    total[entry] += moments[c, entry] + moments[d, entry]
                 together = fit(total, theta)
+                apart = residual[a] + residual[b] + residual[c] + residual[d]
                 if total[COUNT] <= largest and together - apart < _CLEAR:
-                    merged[i, j] = True
-                    a = i * columns + j
-                    moments[a], residual[a] = total, together
-                    for u in range(i, i + 2 * side):
-                        for v in range(j, j + 2 * side):
-                            parent[u * columns + v] = a
+                    merged[i, j] = found = True
+                    residual[a] = together
+                    for entry in range(SIZE):
+                        moments[a, entry] = total[entry]
+                    # What has been merged before follows its own parent.
+                    parent[b] = parent[c] = parent[d] = a
         whole, side = merged, 2 * side
     return parent
 
@@ -180,26 +181,33 @@ def _grow(
     head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
     link = np.full(2 * len(pairs), -1, np.int32)
     target = np.empty(2 * len(pairs), np.int32)
+    root = find_roots(parent)
     for e in range(2 * len(pairs)):
-        a, b = parent[pairs[e // 2, e % 2]], parent[pairs[e // 2, 1 - e % 2]]
+        a, b = root[pairs[e // 2, e % 2]], root[pairs[e // 2, 1 - e % 2]]
+        if a == b:
+            continue
         target[e], link[e] = b, head[a]
         head[a] = e
         if tail[a] < 0:
             tail[a] = e
-    version = np.zeros(count, np.int64)
-    heap = [(0.0, 0, 0)]
-    heap.pop()
+    # Those as flat wait in one chain, the first of which has waited longest.
+    first, last = np.full(_LEVELS, -1, np.int32), np.full(_LEVELS, -1, np.int32)
+    after = np.full(count, -1, np.int32)
     for a in range(count):
         if nodes[a] and parent[a] == a:
-            heappush(heap, (residual[a] / moments[a, COUNT], a, 0))
+            _wait(a, residual[a] / moments[a, COUNT], first, last, after)
     seen = np.full(count, -1, np.int32)
-    turn = 0
-    while len(heap) > 0:
-        _, a, age = heappop(heap)
-        if parent[a] != a or version[a] != age:
+    turn, level = 0, 0
+    while level < _LEVELS:
+        a = first[level]
+        if a < 0:
+            level += 1
+            continue
+        first[level] = after[a]
+        if parent[a] != a:
             continue
         turn += 1
-        best, partner = 1.0, -1
+        best, partner, together = 1.0, -1, 0.0
         before, e = -1, head[a]
         while e >= 0:
             b = target[e]
@@ -220,21 +228,39 @@ def _grow(
                 seen[b] = turn
                 before = e
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
-                    extra = common_residual(moments, a, b) - residual[a] - residual[b]
-                    apart = misfit(extra, moments, a, b, WITHIN_PATCH)
+                    common = common_residual(moments, a, b)
+                    apart = misfit(common - residual[a] - residual[b], moments, a, b, WITHIN_PATCH)
                     if apart < best:
-                        best, partner = apart, b
+                        best, partner, together = apart, b, common
             e = following
         if partner >= 0:
-            residual[a] = common_residual(moments, a, partner)
-            moments[a] += moments[partner]
+            residual[a] = together
+            for entry in range(SIZE):
+                moments[a, entry] += moments[partner, entry]
             parent[partner] = a
             if head[partner] >= 0:
                 link[tail[a]] = head[partner]
                 tail[a] = tail[partner]
-            version[a] += 1
-            heappush(heap, (residual[a] / moments[a, COUNT], a, version[a]))
+            level = min(level, _wait(a, together / moments[a, COUNT], first, last, after))
     return find_roots(parent)
+
+
+@njit(cache=True)
+def _wait(
+    a: int,
+    residual: float,
+    first: NDArray[np.int32],
+    last: NDArray[np.int32],
+    after: NDArray[np.int32],
+) -> int:
+    """Let a patch of such a mean residual wait behind those as flat; the number of its chain."""
+    level = int(min(residual * _PER_VARIANCE, _LEVELS - 1.0))
+    if first[level] < 0:
+        first[level] = a
+    else:
+        after[last[level]] = a
+    last[level], after[a] = a, -1
+    return level
 
 
 @njit(cache=True)
