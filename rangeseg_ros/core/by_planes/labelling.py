@@ -26,17 +26,19 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     shifted_cost,
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
-from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, beyond, expand, fronts
 from rangeseg_ros.core.runtime.threads import run_rows, submit
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # An improvement smaller than this is rounding.
 _STEP = 1e-6
 # Blocks from a surface in which its label may win pixels, pixels from a boundary to cut anew.
-_REACH, _BAND = 2, 4
+_REACH, _BAND = 2, 2
 # Blocks from a surface that its label is expanded to when exact. Its plane may well explain pixels
 # anywhere in the image, but these are rarely the surface's.
 _DOMAIN = 4
+# Rows on either side of the middle of the image that are looked at again.
+_SEAM = 8
 
 
 def refine(
@@ -138,7 +140,7 @@ def _in_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
     lower = submit(kernel, (min(middle + 1, height), height), *arguments)
     kernel((0, max(middle - 1, 0)), *arguments)
     lower.result()
-    kernel((max(middle - 2 * _BAND, 0), min(middle + 2 * _BAND, height)), *arguments)
+    kernel((max(middle - _SEAM, 0), min(middle + _SEAM, height)), *arguments)
 
 
 def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites:
@@ -343,9 +345,17 @@ def _expand(
     problem: Problem,
     models: Models,
 ) -> bool:
-    """Expand one label from its front."""
-    sites = band(alpha, front, reach, labelling, rows)
-    new = np.empty(len(sites), np.float32)
-    for s in range(len(sites)):
-        new[s] = data_cost(alpha, int(sites[s]), problem, models)
-    return expand(alpha, sites, new, labelling, _STEP)
+    """Expand one label from its front, and from what it wins at the far side of the band."""
+    helped = False
+    while len(front) > 0:
+        sites = band(alpha, front, reach, labelling, rows)
+        new = np.empty(len(sites), np.float32)
+        for s in range(len(sites)):
+            new[s] = data_cost(alpha, int(sites[s]), problem, models)
+        if not expand(alpha, sites, new, labelling, _STEP):
+            break
+        helped = True
+        if reach == 1:  # the sites of a domain: no band that goes along
+            break
+        front = beyond(alpha, sites, labelling, rows)
+    return helped

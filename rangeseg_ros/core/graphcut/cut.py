@@ -97,13 +97,14 @@ def minimum_cut(
         np.zeros(count, np.bool_),
     )
     orphans = np.empty(count, np.int32)
+    _push_between_neighbours(flow)
     first = last = waiting = 0
     for p in range(count):
-        if excess[p] != 0:
-            flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, excess[p] < 0, 1
+        if flow.terminal[p] != 0:
+            flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, flow.terminal[p] < 0, 1
             flow.queue[last] = p
             flow.queued[p] = True
-            last = (last + 1) % count
+            last = _next(last, count)
             waiting += 1
     time = 0
     while waiting > 0:
@@ -125,7 +126,7 @@ def minimum_cut(
                     if not flow.queued[q]:
                         flow.queue[last] = q
                         flow.queued[q] = True
-                        last = (last + 1) % count
+                        last = _next(last, count)
                         waiting += 1
                 elif flow.sink[q] != flow.sink[p]:
                     side = k
@@ -136,16 +137,17 @@ def minimum_cut(
         if side < 0:
             # Nothing more to grow here.
             flow.queued[p] = False
-            first = (first + 1) % count
+            first = _next(first, count)
             waiting -= 1
             continue
         time += 1
         found = _push(flow, p, side, orphans)
         # Orphans look for parents; those that find none leave orphans of their own.
-        done = 0
-        while done < found:
-            q = orphans[done % count]
-            done += 1
+        done, end = 0, _next(found - 1, count)
+        while found > 0:
+            q = orphans[done]
+            done = _next(done, count)
+            found -= 1
             if _adopt(flow, q, time):
                 continue
             for k in range(4):
@@ -157,17 +159,40 @@ def minimum_cut(
                 if free > 0 and not flow.queued[r]:
                     flow.queue[last] = r
                     flow.queued[r] = True
-                    last = (last + 1) % count
+                    last = _next(last, count)
                     waiting += 1
                 if flow.parent[r] == opposite:
                     flow.parent[r] = _ORPHAN
-                    orphans[found % count] = r
+                    orphans[end] = r
+                    end = _next(end, count)
                     found += 1
             flow.parent[q] = _FREE
     chosen = np.empty(count, np.bool_)
     for p in range(count):
         chosen[p] = flow.parent[p] != _FREE and flow.sink[p]
     return chosen
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _next(place: int, count: int) -> int:
+    """Place after another in a ring."""
+    return place + 1 if place + 1 < count else 0
+
+
+@njit(cache=True, nogil=True)
+def _push_between_neighbours(flow: _Flow) -> None:
+    """Push what the shortest paths can take: over one edge, which needs no trees."""
+    terminal, residual = flow.terminal, flow.residual
+    for p in range(len(terminal)):
+        for k in range(4):
+            q = flow.neighbour[p, k]
+            if q < 0 or terminal[p] <= 0 or terminal[q] >= 0:
+                continue
+            pushed = min(terminal[p], -terminal[q], residual[p, k])
+            terminal[p] -= pushed
+            terminal[q] += pushed
+            residual[p, k] -= pushed
+            residual[q, (k + 2) % 4] += pushed
 
 
 @njit(cache=True, nogil=True)

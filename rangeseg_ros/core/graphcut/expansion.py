@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
 
+# Sites that are compared at a time.
+_CHUNK = 64
+
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
@@ -75,22 +78,31 @@ def fronts(
         The first of the rows, and the one after the last.
     """
     first, after = rows[0] * width, rows[1] * width
-    beside, sites = (
-        np.empty(4 * (after - first), np.int32),
-        np.empty(4 * (after - first), np.int32),
-    )
+    room = 4 * (after - first)
+    beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
     found = 0
-    for p in range(max(first - width, 0), after):
-        here = labels[p]
-        for k in range(2):
-            q = p + (1 if k == 0 else width)
-            if q < len(labels) and labels[q] != here and links[k, p] > 0:
-                if first <= q < after:
-                    beside[found], sites[found] = here, q
-                    found += 1
-                if p >= first:
-                    beside[found], sites[found] = labels[q], p
-                    found += 1
+    begin, end = max(first - width, 0), min(after, len(labels) - width)
+    for chunk in range(begin, after, _CHUNK):
+        stop = min(chunk + _CHUNK, after)
+        # Most are alike: without branches, the compiler compares many at a time.
+        unlike = labels[chunk] ^ labels[chunk]
+        for p in range(chunk, min(stop, len(labels) - 1)):
+            unlike |= labels[p] ^ labels[p + 1]
+        for p in range(chunk, min(stop, end)):
+            unlike |= labels[p] ^ labels[p + width]
+        if unlike == 0:
+            continue
+        for p in range(chunk, stop):
+            here = labels[p]
+            for k in range(2):
+                q = p + (1 if k == 0 else width)
+                if q < len(labels) and labels[q] != here and links[k, p] > 0:
+                    if first <= q < after:
+                        beside[found], sites[found] = here, q
+                        found += 1
+                    if p >= first:
+                        beside[found], sites[found] = labels[q], p
+                        found += 1
     return group_sites(beside[:found], sites[:found], count)
 
 
@@ -158,6 +170,36 @@ def band(
                     sites[count] = q
                     count += 1
     return sites[:count]
+
+
+@njit(cache=True, nogil=True)
+def beyond(
+    alpha: int, sites: NDArray[np.int32], labelling: GridLabelling, rows: tuple[int, int]
+) -> NDArray[np.int32]:
+    """Sites beyond a band that the label has won up to its far side, in some rows.
+
+    They are next to a site of the band that has the label by now, and neither in the band nor of
+    the label themselves.
+    """
+    labels, links, position = labelling.labels, labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
+    first, after = rows[0] * labelling.width, rows[1] * labelling.width
+    for p in sites:
+        position[p] = 0
+    result = np.empty(3 * len(sites), np.int32)
+    count = 0
+    for p in sites:
+        if labels[p] != alpha:
+            continue
+        for k in range(4):
+            q = p + offsets[k]
+            linked = first <= q < after and links[k % 2, min(p, q)] > 0
+            if linked and labels[q] != alpha and position[q] < 0:
+                result[count] = q
+                count += 1
+    for p in sites:
+        position[p] = -1
+    return result[:count]
 
 
 @njit(cache=True, nogil=True)
