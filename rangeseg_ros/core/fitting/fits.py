@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells
-from rangeseg_ros.core.fitting.interior import interior
+from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
+from rangeseg_ros.core.fitting.doubtful import first_sums, sums_without_doubtful
+from rangeseg_ros.core.fitting.interior import fill, interior
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
@@ -93,13 +94,14 @@ class Fits(NamedTuple):
         blocks : Blocks, optional
             Of the image, where they are known.
         """
-        inner = interior(labels)
         blocks = blocks or Blocks.of(image)
-        cells = Cells.of(labels, image, sensor, blocks, inner)
-        sums = cells.regions()
-        pixels = sums[:, COUNT].astype(np.intp)
-        cells, outliers, explained = cells.without_doubtful(
-            labels, image, _theta(sums), sensor, blocks
+        filled = fill(labels)
+        inner = interior(filled)
+        count = int(labels.max(initial=0)) + 1
+        box, border, area = measure_regions(labels, inner, count)
+        first = _theta(first_sums(labels, image, sensor, blocks, filled, area))
+        cells, pixels, outliers, explained = sums_without_doubtful(
+            Cells.empty(box, border), labels, image, first, sensor, blocks, inner
         )
         sums = cells.regions()
         theta, inverse = _solved(sums, image.camera is not None)

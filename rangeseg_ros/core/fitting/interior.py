@@ -10,8 +10,8 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 
 
-def interior(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Region of each block of 4 x 4 pixels that it fills together with the eight blocks around it.
+def fill(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Region of each block of 4 x 4 pixels that has one label.
 
     Parameters
     ----------
@@ -21,19 +21,17 @@ def interior(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     Returns
     -------
     (ceil(H / 4), ceil(W / 4)) uint16
-        0 for the others, and for all at the border of the image.
+        0 for the others, and for those that the border of the image cuts.
     """
     height, width = labels.shape
     filled = np.zeros((-(-height // BLOCK), -(-width // BLOCK)), np.uint16)
     run_rows(_fill, height // BLOCK, labels, filled)
-    inner = np.zeros_like(filled)
-    _shrink(filled, inner)
-    return inner
+    return filled
 
 
 @njit(cache=True, nogil=True)
 def _fill(first: int, after: int, labels: NDArray[np.uint16], filled: NDArray[np.uint16]) -> None:
-    """Regions of blocks of one label."""
+    """The same of some rows of blocks."""
     for bi in range(first, after):
         top = bi * BLOCK
         for bj in range(labels.shape[1] // BLOCK):
@@ -49,8 +47,20 @@ def _fill(first: int, after: int, labels: NDArray[np.uint16], filled: NDArray[np
 
 
 @njit(cache=True)
-def _shrink(filled: NDArray[np.uint16], inner: NDArray[np.uint16]) -> None:
-    """Leave out the blocks beside others."""
+def interior(filled: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Region of each block that it fills together with the eight blocks around it.
+
+    Parameters
+    ----------
+    filled : (rows, columns) uint16
+        See `fill`.
+
+    Returns
+    -------
+    (rows, columns) uint16
+        0 for the others, and for all at the border of the image.
+    """
+    inner = np.zeros_like(filled)
     for i in range(1, len(filled) - 1):
         for j in range(1, filled.shape[1] - 1):
             label = filled[i, j]
@@ -62,6 +72,7 @@ def _shrink(filled: NDArray[np.uint16], inner: NDArray[np.uint16]) -> None:
                     alike &= filled[k, m] == label
             if alike:
                 inner[i, j] = label
+    return inner
 
 
 @njit(cache=True, inline='always')

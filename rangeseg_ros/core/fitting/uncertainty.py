@@ -236,7 +236,7 @@ def _correlation(
     result = np.empty((count_a, count_b))
     for i in range(count_a):
         for j in range(count_b):
-            lag = cells.box[a, axis] + (i + 0.5) * size_a
-            lag -= cells.box[b, axis] + (j + 0.5) * size_b
+            lag = cells.origin[a, axis] + (i + 0.5) * size_a
+            lag -= cells.origin[b, axis] + (j + 0.5) * size_b
             result[i, j] = gain * np.exp(-(lag**2) / (2 * wide))
     return result

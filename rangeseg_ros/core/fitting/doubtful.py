@@ -1,0 +1,265 @@
+"""Pixels that may not belong to their region: outliers and rims.
+
+A fit takes each pixel once: where it is surely the region's, as one that the region's first plane
+does not explain, or as one so near to another region that it may be that one's.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.fitting.cells import RECORD, Cells, add_block, add_pixels, cell_of
+from rangeseg_ros.core.fitting.interior import rows_of_blocks
+from rangeseg_ros.core.runtime.threads import map_halves
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.moments import COUNT, squares_left
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    random_variance,
+    systematic_variance,
+)
+
+# Standard deviations of random and systematic error beyond which a pixel is an outlier.
+_OUTLIER = 4.0
+# Pixels from another region up to which a pixel may be its neighbour's.
+_RIM = 2
+# Kinds of pixels.
+_SURE, _OUTLYING, _AT_RIM = 0, 1, 2
+
+
+def first_sums(
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    sensor: SensorModel,
+    blocks: Blocks,
+    filled: NDArray[np.uint16],
+    area: NDArray[np.intp],
+) -> NDArray[np.float64]:
+    """Sums over regions that tell which pixels are outliers.
+
+    Over the blocks that a region fills, where these are half of it; otherwise over all pixels.
+
+    Parameters
+    ----------
+    labels : (H, W) uint16
+        0...M.
+    image : RangeImage
+        (H, W).
+    sensor : SensorModel
+    blocks : Blocks
+        Of the image.
+    filled : (rows, columns) uint16
+        See `interior.fill`.
+    area : (M + 1,) int
+        Pixels of each region.
+
+    Returns
+    -------
+    (M + 1, 25) float64
+        As of a cell.
+    """
+    central = image.camera is not None
+    sums = np.zeros((len(area), RECORD))
+    if central:
+        sums = np.add(*map_halves(_sum_blocks, len(filled), filled, blocks, sensor, len(area)))
+    # Of a cloud, blocks do not tell the points.
+    ragged = 2 * sums[:, COUNT] < area
+    ragged[0] = False
+    if ragged.any():
+        arrays = labels, image.inverse, image.rays, ragged, sensor, central
+        pixels = np.add(*map_halves(_sum_pixels, len(labels), *arrays))
+        sums = np.where(ragged[:, None], pixels, sums)
+    return sums
+
+
+def sums_without_doubtful(
+    cells: Cells,
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    theta: NDArray[np.float64],
+    sensor: SensorModel,
+    blocks: Blocks,
+    inner: NDArray[np.uint16],
+) -> tuple[Cells, NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+    """Sum up the measured pixels but those that may not belong to regions: outliers, then rims.
+
+    Outliers are the pixels that the planes `theta` (M + 1, 3) do not explain. A region keeps them
+    where they are more than half of it, as it is then the sensor model that does not fit, and its
+    rim, where that would take the rest to less than half.
+
+    Parameters
+    ----------
+    cells : Cells
+        Empty, of M + 1 regions.
+    labels, image, sensor, blocks
+        As for `first_sums`.
+    theta : (M + 1, 3) float64
+        First planes.
+    inner : (rows, columns) uint16
+        Blocks inside regions, see `interior`.
+
+    Returns
+    -------
+    cells : Cells
+    pixels, outliers : (M + 1,) int
+        Numbers of measured pixels, and of outliers, whether left out or kept.
+    explained : (M + 1, 25) float64
+        Sums over whole regions, with their rims.
+    """
+    central = image.camera is not None
+    # Points of a cloud have rays without a z of 1, which blocks do not tell the sums of.
+    taken = np.where((cells.of_blocks() & central)[inner], inner, np.uint16(0))
+    arrays = labels, image.inverse, image.rays, blocks, taken, cells, sensor, theta, central
+    parts = map_halves(_sort, len(labels), *arrays)
+    (pixels, outliers, rims), (sure, outlying, rim) = (a + b for a, b in zip(*parts, strict=True))
+    region = np.repeat(np.arange(len(cells.size)), np.diff(cells.start))
+    kept = 2 * outliers > pixels
+    sure += rim + outlying * kept[region, None]
+    explained = cells._replace(sums=sure).regions()
+    few = 2 * (outliers + rims) <= pixels
+    sure -= rim * few[region, None]
+    return cells._replace(sums=sure), pixels, outliers, explained
+
+
+@njit(cache=True, nogil=True)
+def _sum_blocks(
+    first: int,
+    after: int,
+    filled: NDArray[np.uint16],
+    blocks: Blocks,
+    sensor: SensorModel,
+    count: int,
+) -> NDArray[np.float64]:
+    """Sums (count, 25) over the blocks of each region in some rows of blocks."""
+    sums = np.zeros((count, RECORD))
+    for i in range(first, after):
+        for j in range(filled.shape[1]):
+            if filled[i, j] > 0 and blocks.squared[i, j] > 0:
+                record = sums[filled[i, j]]
+                add_block(record, blocks.moments[i, j], blocks.squared[i, j], sensor)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _sum_pixels(
+    top: int,
+    bottom: int,
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    chosen: NDArray[np.bool_],
+    sensor: SensorModel,
+    central: bool,
+) -> NDArray[np.float64]:
+    """Sums (M + 1, 25) over the measured pixels of chosen regions in some rows."""
+    sums = np.zeros((len(chosen), RECORD))
+    width = labels.shape[1]
+    for i in range(top, bottom):
+        j = 0
+        while j < width:
+            first, label = j, labels[i, j]
+            j += 1
+            if not chosen[label]:
+                continue
+            while j < width and labels[i, j] == label:
+                j += 1
+            add_pixels(sums[label], i, first, j, inverse, rays, sensor, central)
+    return sums
+
+
+@njit(cache=True, nogil=True)
+def _sort(
+    top: int,
+    bottom: int,
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    blocks: Blocks,
+    inner: NDArray[np.uint16],
+    cells: Cells,
+    sensor: SensorModel,
+    theta: NDArray[np.float64],
+    central: bool,
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Numbers and sums of pixels of some rows by their kinds.
+
+    The numbers of all pixels, of outliers and of the rest of the rim, (3, M + 1), and the sums
+    over the sure ones, over the outliers and over that rest, (3, N, 25).
+    """
+    width = labels.shape[1]
+    count = np.zeros((3, len(theta)), np.intp)
+    sums = np.zeros((3, len(cells.sums), RECORD))
+    explained = np.zeros(inner.shape, np.bool_)
+    first_block, after_block = rows_of_blocks(top, bottom)
+    for bi in range(max(first_block - 1, 0), after_block):
+        for bj in range(inner.shape[1]):
+            label, squared = inner[bi, bj], blocks.squared[bi, bj]
+            if label == 0:
+                continue
+            variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+            # No pixel is farther off than all together.
+            left = squares_left(blocks.moments[bi, bj], theta[label])
+            explained[bi, bj] = left <= _OUTLIER**2 * variance
+            if explained[bi, bj] and bi >= first_block and squared > 0:
+                count[0, label] += int(blocks.moments[bi, bj, COUNT])
+                record = sums[_SURE, cell_of(cells, label, bi * BLOCK, bj * BLOCK)]
+                add_block(record, blocks.moments[bi, bj], squared, sensor)
+    for i in range(top, bottom):
+        within, inside = explained[i // BLOCK], inner[i // BLOCK]
+        j = 0
+        while j < width:
+            if within[j // BLOCK]:
+                j = (j // BLOCK + 1) * BLOCK
+                continue
+            first, label = j, int(labels[i, j])
+            j += 1
+            if label == 0 or inverse[i, first] == 0:
+                continue
+            kind = _kind(i, first, labels, inverse, rays, inside, sensor, theta)
+            size = cells.size[label]
+            end = min(first + size - (first - cells.origin[label, 1]) % size, width)
+            pixels = 1
+            while j < end and labels[i, j] == label and not within[j // BLOCK]:
+                if inverse[i, j] > 0:
+                    if _kind(i, j, labels, inverse, rays, inside, sensor, theta) != kind:
+                        break
+                    pixels += 1
+                j += 1
+            count[0, label] += pixels
+            if kind != _SURE:
+                count[kind, label] += pixels
+            record = sums[kind, cell_of(cells, label, i, first)]
+            add_pixels(record, i, first, j, inverse, rays, sensor, central)
+    return count, sums
+
+
+@njit(cache=True, inline='always')
+def _kind(
+    i: int,
+    j: int,
+    labels: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    inside: NDArray[np.uint16],
+    sensor: SensorModel,
+    theta: NDArray[np.float64],
+) -> int:
+    """Kind of a measured pixel; `inside` are the blocks inside regions of its row of blocks."""
+    label, y = labels[i, j], float(inverse[i, j])
+    # No views of a ray and a plane: their references would be counted for every pixel.
+    residual = y - theta[label, 0] * rays[i, j, 0] - theta[label, 1] * rays[i, j, 1]
+    residual -= theta[label, 2] * rays[i, j, 2]
+    squared = y * y
+    variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+    if residual * residual > _OUTLIER**2 * variance:
+        return _OUTLYING
+    if inside[j // BLOCK] > 0:
+        return _SURE
+    above, below = max(i - _RIM, 0), min(i + _RIM, labels.shape[0] - 1)
+    left, right = max(j - _RIM, 0), min(j + _RIM, labels.shape[1] - 1)
+    alike = labels[above, left] == label and labels[above, right] == label
+    alike = alike and labels[below, left] == label and labels[below, right] == label
+    return _SURE if alike else _AT_RIM
