@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes.curvature import find_curved
-from rangeseg_ros.core.by_planes.plane_energy import Problem
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.evaluation.overlap import Overlap
@@ -38,8 +37,7 @@ def verdict(inverse, regions, distortion=0.0, seed=0):
     bent = smooth_field(CAMERA.shape, (13.0, 22.0), random)
     inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    problem = Problem.of(image, SENSOR, weights(image), 4)
-    return find_curved(problem, regions.astype(np.uint16), SENSOR)
+    return find_curved(regions.astype(np.uint16), image, Blocks.of(image), SENSOR)
 
 
 def test_planes_are_not_curved():

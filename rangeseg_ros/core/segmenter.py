@@ -254,7 +254,7 @@ class Segmenter:
         labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
         regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-        regions = labelling.flat(regions)
+        regions = by_planes.drop_curved(regions, image, blocks, sensor)
         watch.lap('regions')
         return regions, labelling
 

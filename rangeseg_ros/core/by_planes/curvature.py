@@ -6,10 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.plane_energy import Problem, region_moments
+from rangeseg_ros.core.fitting.interior import fill
+from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, fit_all
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all, squares_left
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
@@ -23,23 +26,28 @@ _FLATNESS = 0.007
 # Nine agreeing pixels count as one; the chi-squared of three terms of curvature stays below four
 # times its mean.
 _NOISE = 9.0 * 3.0 * 4.0
+# Rows and columns from one pixel that is looked at to the next.
 _STRIDE = 2
-# Exponents of the six terms of a quadratic in the pixel coordinates x and y.
-_X, _Y = (0, 1, 0, 2, 1, 0), (0, 0, 1, 0, 1, 2)
 # Standard deviations, of noise and twice the distortion, to which a residual is the region's.
 _INLIER = 4.0
 
 
 def find_curved(
-    problem: Problem, regions: NDArray[np.uint16], sensor: SensorModel
+    regions: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
 ) -> NDArray[np.bool_]:
     """Test the second-order part of each region's residuals.
 
+    What is asked for is smooth: of a block of 4 x 4 pixels that a region fills its sums tell it,
+    elsewhere every other row and column.
+
     Parameters
     ----------
-    problem : Problem
     regions : (H, W) uint16
         0...M, 0 for no region.
+    image : RangeImage
+        (H, W).
+    blocks : Blocks
+        Of the image.
     sensor : SensorModel
 
     Returns
@@ -48,37 +56,25 @@ def find_curved(
         Never true for 0.
     """
     count = int(regions.max(initial=0)) + 1
-    # Every other row and column will do: what is asked for is smooth.
-    sparse = (slice(None, None, _STRIDE), slice(None, None, _STRIDE))
-    shape, regions = regions.shape, regions[sparse]
-    inverse = problem.inverse.reshape(shape)[sparse]
-    rays = problem.rays.reshape(*shape, 3)[sparse]
-    weight = problem.weight.reshape(shape)[sparse]
-    moments = region_moments(regions, count, inverse, rays, weight, sensor)
+    filled = fill(regions)
+    arrays = regions, filled, image.inverse, image.rays, blocks, sensor
+    moments = np.add(*map_halves(_sum_moments, len(filled), *arrays, count))
     theta, _ = fit_all(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
-    limit = _INLIER * np.sqrt(1 + 4 * ratio)
-    parts = map_halves(
-        _normal_equations,
-        len(regions),
-        regions,
-        inverse,
-        rays,
-        weight,
-        theta,
-        limit,
-    )
-    normal, right, square, area, scale = map(np.add, *parts)
-    pixels = normal[:, 0, 0]
-    size = np.maximum(pixels * _STRIDE**2, 1)
+    limit = np.square(_INLIER) * (1 + 4 * ratio)
+    slope = np.linalg.norm(theta, axis=1)
+    parts = map_halves(_normal_equations, len(filled), *arrays, theta, slope, limit)
+    normal, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
+    normal += np.triu(normal, 1).transpose(0, 2, 1)
+    size = np.maximum(normal[:, 0, 0], 1)
     # What the quadratic explains more than its constant and linear terms do.
     whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
-    bending = (whole - flat) / np.maximum(pixels, 1)
-    distortion = _SHARE * ratio * (size / (problem.enlarged * _PIXELS)) ** _EXPONENT
+    bending = (whole - flat) / size
+    distortion = _SHARE * ratio * (size / (regions.size / VGA * _PIXELS)) ** _EXPONENT
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
-    noise = np.maximum((square - whole) / np.maximum(pixels, 1), 1)
+    noise = np.maximum((square - whole) / size, 1)
     visible = bending > distortion + _NOISE * noise / size
-    result = visible & (bending * (scale / np.maximum(pixels, 1)) ** 2 > _FLATNESS**2 * area)
+    result = visible & (bending * (scale / size) ** 2 > _FLATNESS**2 * area)
     result[0] = False
     return result
 
@@ -92,77 +88,165 @@ def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> NDArr
 
 
 @njit(cache=True, nogil=True)
+def _sum_moments(
+    first: int,
+    after: int,
+    regions: NDArray[np.uint16],
+    filled: NDArray[np.uint16],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    blocks: Blocks,
+    sensor: SensorModel,
+    count: int,
+) -> NDArray[np.float64]:
+    """Moments (count, 13), weighted, of each region in some rows of blocks."""
+    height, width = regions.shape
+    total = np.zeros((count, SIZE))
+    for bi in range(first, after):
+        for bj in range(filled.shape[1]):
+            label, squared = int(filled[bi, bj]), blocks.squared[bi, bj]
+            if label > 0 and squared > 0:
+                weight = 1 / random_variance(sensor, squared)
+                pixels = blocks.moments[bi, bj, COUNT]
+                for entry in range(CHI2 + 1):
+                    total[label, entry] += weight * blocks.moments[bi, bj, entry]
+                total[label, COUNT] += pixels
+                total[label, RATIO] += pixels * weight * systematic_variance(sensor, squared)
+            if label > 0:
+                continue
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), _STRIDE):
+                    label, y = int(regions[i, j]), float(inverse[i, j])
+                    if label == 0 or y == 0:
+                        continue
+                    weight = _STRIDE**2 / random_variance(sensor, y * y)
+                    entry = 0
+                    for m in range(3):
+                        for n in range(m, 3):
+                            total[label, entry] += weight * rays[i, j, m] * rays[i, j, n]
+                            entry += 1
+                        total[label, 6 + m] += weight * rays[i, j, m] * y
+                    total[label, CHI2] += weight * y * y
+                    total[label, COUNT] += _STRIDE**2
+                    total[label, RATIO] += weight * systematic_variance(sensor, y * y)
+    return total
+
+
+@njit(cache=True, nogil=True)
 def _normal_equations(
     first: int,
     after: int,
     regions: NDArray[np.uint16],
+    filled: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
-    weight: NDArray[np.float32],
+    blocks: Blocks,
+    sensor: SensorModel,
     theta: NDArray[np.float64],
+    slope: NDArray[np.float64],
     limit: NDArray[np.float64],
-) -> tuple[
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-    NDArray[np.float64],
-]:
-    """Normal equations of a quadratic in the pixel coordinates fitted to some rows of each region.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normal equations of a quadratic in the pixel coordinates, from some rows of blocks.
 
-    What is fitted are the residuals in standard deviations of the noise, those beyond `limit`
-    left out. Also returns the sum of their squares, the area in square metres of each region, and
-    the sum over its pixels of the standard deviation in metres, both on and across its plane:
-    neither depends on how obliquely it is seen.
+    Of the symmetric matrices the upper triangles. `slope` is |theta|, 0 where there is no plane.
+    What is fitted for each region are residuals in standard deviations of the noise of a pixel,
+    of a block their mean as often as it has pixels; those of a mean square beyond `limit` are
+    left out. The third array (3, M + 1) has the sum of their squares, the area of each region in
+    square metres, and the sum over its pixels of the standard deviation in metres, both on and
+    across its plane: neither depends on how obliquely it is seen.
     """
     height, width = regions.shape
     count = len(theta)
-    normal, right = np.zeros((count, 6, 6)), np.zeros((count, 6))
-    total, area, scale = np.zeros(count), np.zeros(count), np.zeros(count)
-    for i in range(first, after):
-        y = 2 * (i - height / 2) / width
-        j = 0
-        while j < width:
-            label = regions[i, j]
-            plane = theta[label]
-            slope = np.sqrt(plane[0] ** 2 + plane[1] ** 2 + plane[2] ** 2)
-            # No region, or one of too few pixels for a plane.
-            if slope == 0:
-                j += 1
+    normal, right, total = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((3, count))
+    for bi in range(first, after):
+        for bj in range(filled.shape[1]):
+            label, squared = int(filled[bi, bj]), blocks.squared[bi, bj]
+            if label > 0:
+                # Of too few pixels there is no plane.
+                if squared == 0 or slope[label] == 0:
+                    continue
+                moments = blocks.moments[bi, bj]
+                pixels = moments[COUNT]
+                deviation = np.sqrt(random_variance(sensor, squared))
+                left = squares_left(moments, theta[label])
+                square = max(left, 0.0) / (deviation * deviation * pixels)
+                # The mean of residuals times the plane's inverse range, which hardly varies.
+                along = 0.0
+                for m in range(3):
+                    along += theta[label, m] * moments[6 + m]
+                level = max(left - moments[CHI2] + 2 * along, 1e-300)
+                residual = (along - level) / np.sqrt(level * pixels) / deviation
+                i, j = bi * BLOCK + BLOCK // 2, bj * BLOCK + BLOCK // 2
+                if square <= limit[label]:
+                    x, y = (2 * j - 1 - width) / width, (2 * i - 1 - height) / width
+                    _add_terms(normal[label], right[label], x, y, pixels, residual)
+                    mean = np.sqrt(squared)
+                    _add_size(label, i, j, mean, deviation, pixels, square, rays, slope, total)
                 continue
-            # Along a run of the row only x varies: its powers are all there is to sum.
-            distance = 1 / slope
-            p0 = p1 = p2 = p3 = p4 = v0 = v1 = v2 = squares = metres = deviations = 0.0
-            while j < width and regions[i, j] == label:
-                ray = rays[i, j]
-                value = inverse[i, j] - (plane[0] * ray[0] + plane[1] * ray[1] + plane[2] * ray[2])
-                root = np.sqrt(weight[i, j])
-                value *= root
-                if abs(value) <= limit[label]:
-                    squares += value * value
-                    # An error of the inverse leaves the plane by distance / inverse times as much.
-                    deviations += distance / (root * inverse[i, j])
-                    if i > 0 and j > 0 and inverse[i - 1, j] > 0 and inverse[i, j - 1] > 0:
-                        across, along = 0.0, 0.0
-                        for k in range(3):
-                            across += (ray[k] - rays[i, j - 1, k]) ** 2
-                            along += (ray[k] - rays[i - 1, j, k]) ** 2
-                        length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-                        # Seen face on it is smaller by the cosine, distance inverse / length.
-                        face = np.sqrt(across * along) / inverse[i, j] ** 2
-                        metres += face * length / (distance * inverse[i, j])
-                    x = 2 * j / width - 1
-                    square = x * x
-                    p0, p1, p2 = p0 + 1, p1 + x, p2 + square
-                    p3, p4 = p3 + square * x, p4 + square * square
-                    v0, v1, v2 = v0 + value, v1 + value * x, v2 + value * square
-                j += 1
-            total[label] += squares
-            area[label] += metres
-            scale[label] += deviations
-            power, response = (p0, p1, p2, p3, p4), (v0, v1, v2)
-            for a in range(6):
-                right[label, a] += y ** _Y[a] * response[_X[a]]
-                for b in range(6):
-                    normal[label, a, b] += y ** (_Y[a] + _Y[b]) * power[_X[a] + _X[b]]
-    return normal, right, total, area, scale
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), _STRIDE):
+                    label, value = int(regions[i, j]), float(inverse[i, j])
+                    if label == 0 or value == 0 or slope[label] == 0:
+                        continue
+                    deviation = np.sqrt(random_variance(sensor, value * value))
+                    residual = value
+                    for m in range(3):
+                        residual -= theta[label, m] * rays[i, j, m]
+                    residual /= deviation
+                    square, pixels = residual * residual, float(_STRIDE**2)
+                    if square <= limit[label]:
+                        x, y = (2 * j - width) / width, (2 * i - height) / width
+                        _add_terms(normal[label], right[label], x, y, pixels, residual)
+                        _add_size(
+                            label, i, j, value, deviation, pixels, square, rays, slope, total
+                        )
+    return normal, right, total
+
+
+@njit(cache=True, inline='always')
+def _add_terms(
+    normal: NDArray[np.float64],
+    right: NDArray[np.float64],
+    x: float,
+    y: float,
+    pixels: float,
+    residual: float,
+) -> None:
+    """Add so many pixels at a place to the normal equations of a quadratic."""
+    terms = (1.0, x, y, x * x, x * y, y * y)
+    for m in range(6):
+        right[m] += pixels * residual * terms[m]
+        for n in range(m, 6):
+            normal[m, n] += pixels * terms[m] * terms[n]
+
+
+@njit(cache=True, inline='always')
+def _add_size(
+    label: int,
+    i: int,
+    j: int,
+    inverse: float,
+    deviation: float,
+    pixels: float,
+    square: float,
+    rays: NDArray[np.float32],
+    slope: NDArray[np.float64],
+    total: NDArray[np.float64],
+) -> None:
+    """Add so many pixels to the third result of `_normal_equations`."""
+    total[0, label] += pixels * square
+    # An error of the inverse leaves the plane by distance / inverse times as much.
+    total[2, label] += pixels * deviation / (slope[label] * inverse)
+    if i == 0 or j == 0:
+        return
+    across = down = length = left = above = 0.0
+    for k in range(3):
+        across += (rays[i, j, k] - rays[i, j - 1, k]) ** 2
+        down += (rays[i, j, k] - rays[i - 1, j, k]) ** 2
+        length += rays[i, j, k] ** 2
+        left += rays[i, j - 1, k] ** 2
+        above += rays[i - 1, j, k] ** 2
+    # Rays of a cloud are 0 where nothing was measured.
+    if min(length, left, above) > 0:
+        # Seen face on it is smaller by the cosine, distance inverse / length.
+        total[1, label] += pixels * np.sqrt(across * down * length) * slope[label] / inverse**3

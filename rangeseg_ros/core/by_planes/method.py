@@ -60,10 +60,6 @@ class Labelling:
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""
 
-    def flat(self, regions: NDArray[np.uint16]) -> NDArray[np.uint16]:
-        """Regions (H, W) of the labelling without those that bend, numbered anew."""
-        return drop_regions(regions, find_curved(self._problem, regions, self.sensor))
-
 
 def segment(
     image: RangeImage,
@@ -114,6 +110,13 @@ def segment(
     )
     lap('labels')
     return Labelling(labels.reshape(image.shape), sensor, problem, models)
+
+
+def drop_curved(
+    regions: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
+) -> NDArray[np.uint16]:
+    """Regions (H, W) without those that bend, numbered anew; see `find_curved`."""
+    return drop_regions(regions, find_curved(regions, image, blocks, sensor))
 
 
 def unite_regions(
