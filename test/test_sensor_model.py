@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.fitting.alike import ranked
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -190,3 +191,17 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
     field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
     covariance = white * np.eye(4) + (1 - white) * field
     assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)
+
+
+def test_a_ranked_value_is_that_of_a_sort():
+    rng = np.random.default_rng(0)
+    for size in range(1, 60):
+        up = np.arange(float(size))
+        for values in (
+            rng.normal(size=size),
+            rng.integers(0, 4, size).astype(float),
+            np.concatenate([up, up[::-1]]),
+        ):
+            for quantile in (0.0, rng.random(), 1.0):
+                expected = np.sort(values)[int(quantile * (len(values) - 1))]
+                assert ranked(values.copy(), quantile) == expected
