@@ -1,16 +1,20 @@
 """Planes estimated from many observations: a Kalman filter per plane, all of them at once.
 
-The state of a plane is its error x, three numbers (`plane_errors`), and beta, of unit variance,
-which stands for what lasts of the sensor's error (`observations`). An observation differs from
-the plane by z = x + B beta + v; v is what is new in every frame, that of the camera's pose too
-(coloured noise by augmentation of the state: Bryson and Johansen, "Linear filtering for
-time-varying systems using measurements containing colored noise", IEEE TAC 1965). Without lasting
-errors this is the information filter of a constant.
+An observation differs from the plane by z = x + B beta + v: x is the error of the plane, three
+numbers (`plane_errors`); beta, of unit variance, stands for what lasts of the sensor's error
+(`observations`); v is what is new in every frame, that of the camera's pose too. The plane's error
+is kept as x = C beta + e, its covariance C C^T + Q.
+
+beta is considered, not estimated (Schmidt, "Application of state-space methods to navigation
+problems", 1966): two looks from one place differ by (B' - B) beta, but also by which pixels they
+have of a ragged border, and a filter that explains all of that by beta goes on in the same
+direction, beyond both. Without lasting errors this is the information filter of a constant.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,10 +37,10 @@ class PlaneFilters:
         The plane.
     axes : (N, 2, 3) float64
         Tangents e1, e2.
-    bias : (N, 3) float64
-        Estimated beta.
-    covariance : (N, 6, 6) float64
-        Of x and beta.
+    own : (N, 3, 3) float64
+        Q, the covariance of what x has beside the lasting error.
+    lasting : (N, 3, 3) float64
+        C, the derivative of x by beta.
     view : (N, C) float64
         Of the last observation.
     """
@@ -44,8 +48,8 @@ class PlaneFilters:
     normal: NDArray[np.float64]
     point: NDArray[np.float64]
     axes: NDArray[np.float64]
-    bias: NDArray[np.float64]
-    covariance: NDArray[np.float64]
+    own: NDArray[np.float64]
+    lasting: NDArray[np.float64]
     view: NDArray[np.float64]
 
     @classmethod
@@ -56,14 +60,8 @@ class PlaneFilters:
         point = seen.centroid - gap[:, None] * normal
         axes = tangents(normal)
         local = to_errors(axes, point)
-        lasting = local @ seen.lasting
-        covariance = np.zeros((len(normal), 6, 6))
-        covariance[:, :3, :3] = local @ seen.fresh @ local.transpose(0, 2, 1)
-        covariance[:, :3, :3] += lasting @ lasting.transpose(0, 2, 1)
-        covariance[:, :3, 3:] = -lasting
-        covariance[:, 3:, :3] = -lasting.transpose(0, 2, 1)
-        covariance[:, 3:, 3:] = np.eye(3)
-        return cls(normal, point, axes, np.zeros((len(normal), 3)), covariance, seen.view)
+        own = _turned(local, seen.fresh)
+        return cls(normal, point, axes, own, -local @ seen.lasting, seen.view)
 
     @property
     def distance(self) -> NDArray[np.float64]:
@@ -73,7 +71,7 @@ class PlaneFilters:
     def plane_covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
         """(K, 4, 4) covariance of (normal, distance) of some planes, of rank 3."""
         jacobian = from_errors(self.axes[index], self.point[index])
-        return jacobian @ self.covariance[index, :3, :3] @ jacobian.transpose(0, 2, 1)
+        return _turned(jacobian, self._covariance(index))
 
     def where(self, chosen: NDArray) -> PlaneFilters:
         """Some of the planes."""
@@ -103,23 +101,21 @@ class PlaneFilters:
             Numbers of planes and observations.
         seen : Observations
         """
-        spread, gap = self._expected(index, seen, which)[3:]
+        step = self._expected(index, seen, which)
         at = self.coordinates(index, seen.centroid[which])
-        return _chi_squared(gap, spread, at, seen.range[which])
+        return _chi_squared(step.gap, step.spread, at, seen.range[which])
 
     def update(self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]) -> None:
         """Take in observations, each plane at most one."""
-        state, fresh, design, spread, gap = self._expected(index, seen, which)
-        gain = np.linalg.solve(spread, design @ state).transpose(0, 2, 1)
-        step = (gain @ gap[..., None])[..., 0]
-        rest = np.eye(6) - gain @ design
-        self.covariance[index] = rest @ state @ rest.transpose(0, 2, 1) + gain @ fresh @ (
-            gain.transpose(0, 2, 1)
-        )
-        rho, _ = persistence(self.view[index], seen.view[which])
-        self.bias[index] = rho[:, None] * self.bias[index] + step[:, 3:]
-        self.view[index] = np.where(rho[:, None] < 1, seen.view[which], self.view[index])
-        self._shift(index, step[:, :3])
+        step = self._expected(index, seen, which)
+        state = step.own + step.before @ (step.before + step.lasting).transpose(0, 2, 1)
+        gain = np.linalg.solve(step.spread, state.transpose(0, 2, 1)).transpose(0, 2, 1)
+        rest = np.eye(3) - gain
+        self.own[index] = _turned(rest, step.own) + _turned(gain, step.fresh)
+        self.lasting[index] = rest @ step.before - gain @ step.lasting
+        other = step.rho < 1
+        self.view[index[other]] = seen.view[which[other]]
+        self._shift(index, (gain @ step.gap[..., None])[..., 0])
 
     def alike(
         self, k: int, camera: NDArray[np.float64], gate: float, widest: float, farthest: float
@@ -157,14 +153,13 @@ class PlaneFilters:
         gap, _ = self._apart(k, np.array([m]))
         local = to_errors(self.axes[[k]], self.point[[k]])[0]
         other = local @ self.plane_covariance(np.array([m]))[0] @ local.T
-        own = self.covariance[k, :3, :3]
+        own = self._covariance(np.array([k]))[0]
         sizes = np.cbrt([np.linalg.det(other), np.linalg.det(own)])
         weight = sizes / sizes.sum()
         information = [w * np.linalg.inv(c) for w, c in zip(weight, (own, other), strict=True)]
         fused = np.linalg.inv(information[0] + information[1])
-        self.covariance[k] = np.eye(6)
-        self.covariance[k, :3, :3] = fused
-        self.bias[k] = self.view[k] = 0
+        self.own[k] = fused
+        self.lasting[k] = self.view[k] = 0
         self._shift(np.array([k]), (fused @ information[1] @ gap[0])[None])
 
     def places(
@@ -173,7 +168,7 @@ class PlaneFilters:
         """Points (K, 3) at coordinates (K, 2) of planes, and their standard deviations (K,)."""
         points = self.point[index] + np.einsum('ka,kai->ki', at, self.axes[index])
         lever = np.column_stack([at, np.ones(len(at))])
-        variance = np.einsum('ki,kij,kj->k', lever, self.covariance[index, :3, :3], lever)
+        variance = np.einsum('ki,kij,kj->k', lever, self._covariance(index), lever)
         return points, np.sqrt(variance)
 
     def _apart(
@@ -182,9 +177,12 @@ class PlaneFilters:
         """What planes `m` differ by from the plane `k`, (K, 3), and its covariance (K, 3, 3)."""
         local = to_errors(self.axes[[k]], self.point[[k]])[0]
         other = np.column_stack([self.normal[m], self.distance[m]])
-        return other @ local.T, (
-            local @ self.plane_covariance(m) @ local.T + self.covariance[k, :3, :3]
-        )
+        spread = local @ self.plane_covariance(m) @ local.T + self._covariance(np.array([k]))
+        return other @ local.T, spread
+
+    def _covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
+        """(K, 3, 3) of x."""
+        return self.own[index] + _squared(self.lasting[index])
 
     def _shift(self, index: NDArray[np.intp], step: NDArray[np.float64]) -> None:
         """Take errors off planes."""
@@ -193,22 +191,54 @@ class PlaneFilters:
 
     def _expected(
         self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
-    ) -> tuple[NDArray[np.float64], ...]:
-        """Covariances of the state (K, 6, 6) and of v (K, 3, 3), [I B] and its covariance, z."""
+    ) -> _Step:
         rho, new = persistence(self.view[index], seen.view[which])
-        scale = np.ones((len(index), 6))
-        scale[:, 3:] = rho[:, None]
-        state = self.covariance[index] * scale[:, :, None] * scale[:, None]
-        state[:, [3, 4, 5], [3, 4, 5]] += 1 - rho[:, None] ** 2
+        before = self.lasting[index]
+        # What beta loses of what it was is on its own from now on.
+        own = self.own[index] + (1 - rho**2)[:, None, None] * _squared(before)
+        before = rho[:, None, None] * before
         local = to_errors(self.axes[index], self.point[index])
         lasting = local @ seen.lasting[which]
-        fresh = local @ seen.fresh[which] @ local.transpose(0, 2, 1)
-        fresh = fresh + new[:, None, None] * (lasting @ lasting.transpose(0, 2, 1))
-        design = np.concatenate([np.broadcast_to(np.eye(3), lasting.shape), lasting], axis=2)
-        spread = design @ state @ design.transpose(0, 2, 1) + fresh
-        expected = lasting @ (rho[:, None] * self.bias[index])[..., None]
-        gap = (local @ seen.plane[which][..., None] - expected)[..., 0]
-        return state, fresh, design, spread, gap
+        fresh = _turned(local, seen.fresh[which]) + new[:, None, None] * _squared(lasting)
+        spread = own + _squared(before + lasting) + fresh
+        gap = (local @ seen.plane[which][..., None])[..., 0]
+        return _Step(rho, own, before, lasting, fresh, spread, gap)
+
+
+class _Step(NamedTuple):
+    """Observations and what is known of their planes when they come.
+
+    Attributes
+    ----------
+    rho : (K,) float64
+        Correlation of beta with what it was.
+    own, before : (K, 3, 3) float64
+        Q and C by this beta.
+    lasting, fresh : (K, 3, 3) float64
+        B and the covariance of v.
+    spread : (K, 3, 3) float64
+        Covariance of z.
+    gap : (K, 3) float64
+        z.
+    """
+
+    rho: NDArray[np.float64]
+    own: NDArray[np.float64]
+    before: NDArray[np.float64]
+    lasting: NDArray[np.float64]
+    fresh: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    gap: NDArray[np.float64]
+
+
+def _squared(root: NDArray[np.float64]) -> NDArray[np.float64]:
+    square: NDArray[np.float64] = root @ root.transpose(0, 2, 1)
+    return square
+
+
+def _turned(by: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    result: NDArray[np.float64] = by @ covariance @ by.transpose(0, 2, 1)
+    return result
 
 
 def _chi_squared(
