@@ -47,7 +47,11 @@ class MapPlane(Plane):
 
 @dataclass(eq=False)
 class Record:
-    """What is kept of a plane beside its equation."""
+    """What is kept of a plane beside its equation.
+
+    `first` and `last` are stamps; `seen` and `united` are of the map's own time, which goes on
+    where stamps do not: when it was seen last, and when its outline last grew.
+    """
 
     id: int
     first: int
@@ -58,6 +62,7 @@ class Record:
     confidence: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
+    seen: int = 0
     united: int | None = None
     frames: int = 0
     looks: int = 0
@@ -68,14 +73,14 @@ class Record:
         """Whether it was seen often enough to be part of the map."""
         return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
 
-    def waited(self, stamp: int) -> float:
+    def waited(self, now: int) -> float:
         """Nanoseconds since something was added to the outline."""
-        return np.inf if self.united is None else abs(stamp - self.united)
+        return np.inf if self.united is None else now - self.united
 
-    def add(self, plane: Plane, stamp: int) -> None:
+    def add(self, plane: Plane, stamp: int, now: int) -> None:
         """Take in a plane of a frame."""
-        self.frames += self.last != stamp or self.frames == 0
-        self.last = stamp
+        self.frames += now > self.seen
+        self.last, self.seen = stamp, now
         self.observations += 1
         self.pixels += plane.count
         self.squares += plane.count * plane.rms**2
@@ -86,6 +91,7 @@ class Record:
         """Take in what is kept of a plane that turned out to be this one."""
         self.id = min(self.id, other.id)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
+        self.seen = max(self.seen, other.seen)
         self.observations += other.observations
         self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
         self.pixels += other.pixels

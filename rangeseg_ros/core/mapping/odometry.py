@@ -43,12 +43,10 @@ from rangeseg_ros.core.mapping.plane_errors import (
     to_errors,
 )
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.tracking.tracker import NOMINAL, SHIFT, TURN
 
-# Standard deviations of the velocity, radians and metres per second, those of `tracking.tracker`,
-# and seconds for which it persists: hands and heads change their minds about that often.
-_TURN, _SHIFT, _PERSISTENCE = np.radians(60.0), 0.9, 0.5
-# Seconds between frames that stamps which do not tell (the same, or none) stand for.
-_NOMINAL = 1 / 30
+# Seconds for which a velocity persists: hands and heads change their minds about that often.
+_PERSISTENCE = 0.5
 # Planes that count, the largest in the image: with 16 the motion is no better, and less is known
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
@@ -110,7 +108,7 @@ class PlaneOdometry:
         self._normal = self._point = self._bias = np.zeros((0, 3))
         self._axes = np.zeros((0, 2, 3))
         self._view = np.zeros((0, 0))
-        spread = np.repeat([0.0, 0.0, _TURN**2, _SHIFT**2], 3)
+        spread = np.repeat([0.0, 0.0, TURN**2, SHIFT**2], 3)
         self._covariance = np.diag(spread)
 
     def add(
@@ -136,7 +134,7 @@ class PlaneOdometry:
         if self._pose is None:
             self._pose = Transform(_level(np.array(up, np.float64)), np.zeros(3))
         else:
-            elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else _NOMINAL
+            elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
             self._predict(elapsed)
         self._stamp = stamp
         largest = np.argsort([-plane.count for plane in planes], kind='stable')[:_PLANES]
@@ -186,12 +184,12 @@ class PlaneOdometry:
         # 1930), for unit variance; the axes are alike, so that no rotation counts.
         path = _PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
         both, speed = _PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
-        variance = np.repeat([_TURN**2, _SHIFT**2], 3)
+        variance = np.repeat([TURN**2, SHIFT**2], 3)
         k = np.arange(6)
         self._covariance[k, k] += variance * path
         self._covariance[k + 6, k + 6] += variance * speed
         across = np.zeros((6, 6))
-        across[:3, :3], across[3:, 3:] = _TURN**2 * np.eye(3), _SHIFT**2 * turn
+        across[:3, :3], across[3:, 3:] = TURN**2 * np.eye(3), SHIFT**2 * turn
         self._covariance[:6, 6:12] += both * across
         self._covariance[6:12, :6] += both * across.T
         moved = turn @ (reach * self._velocity[3:]) + shift

@@ -21,10 +21,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.mapping.observations import Observations, persistence
 from rangeseg_ros.core.mapping.plane_errors import from_errors, shifted, tangents, to_errors
-
-# What parts of one surface differ by beyond their covariances, see `tracking.tracks`: an angle,
-# and an offset as share of the range.
-_ANGLE, _OFFSET = np.radians(1.0), 0.007
+from rangeseg_ros.core.tracking.tracks import ANGLE, OFFSET
 
 
 @dataclass
@@ -116,6 +113,11 @@ class PlaneFilters:
         other = step.rho < 1
         self.view[index[other]] = seen.view[which[other]]
         self._shift(index, (gain @ step.gap[..., None])[..., 0])
+
+    def follow_views(self, cells: int) -> None:
+        """Where images are of another size now, what comes is of other pixels than before."""
+        if self.view.shape[1] != cells:
+            self.view = np.zeros((len(self.view), cells))
 
     def alike(
         self, k: int, camera: NDArray[np.float64], gate: float, widest: float, farthest: float
@@ -255,8 +257,8 @@ def _chi_squared(
     there = np.broadcast_to(np.eye(3), spread.shape).copy()
     there[:, 2, :2] = at
     spread = there @ spread @ there.transpose(0, 2, 1)
-    spread[:, [0, 1], [0, 1]] += _ANGLE**2
-    spread[:, 2, 2] += (_OFFSET * range) ** 2
+    spread[:, [0, 1], [0, 1]] += ANGLE**2
+    spread[:, 2, 2] += (OFFSET * range) ** 2
     gap = (there @ gap[..., None])[..., 0]
     result: NDArray[np.float64]
     result = (gap * np.linalg.solve(spread, gap[..., None])[..., 0]).sum(axis=1)

@@ -24,14 +24,15 @@ from rangeseg_ros.core.mapping.sightings import THERE, find_sightings
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.tracking.tracker import NOMINAL, SURE_TURN
 
 # Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
 _GATE = 16.27
 # Nanoseconds after which what is not confirmed and not seen again is forgotten.
 _PROBATION = 3 * 10**9
-# Largest angle, and offset as share of the range, of what may be one plane: beyond is no error of
-# the sensor but another plane, however uncertain both are.
-_WIDEST, _FARTHEST = np.radians(15.0), 0.1
+# Largest offset, as share of the range, of what may be one plane: beyond is no error of the sensor
+# but another plane, however uncertain both are; so it is beyond `SURE_TURN`.
+_FARTHEST = 0.1
 # Nanoseconds between unions of an outline, and unions in a frame: twice a second follows what a
 # hand or a robot shows, and the work does not grow with the number of planes in sight.
 _UNION_INTERVAL, _UNIONS = 500_000_000, 2
@@ -63,6 +64,7 @@ class PlaneMap:
         self.begun_anew = why
         self._records: list[Record] = []
         self._filters: PlaneFilters | None = None
+        self._stamp = self._time = 0
 
     def __len__(self) -> int:
         return sum(record.confirmed for record in self._records)
@@ -91,13 +93,17 @@ class PlaneMap:
         """
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
+        self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
+        self._stamp = stamp
         if planes:
             view = views(labels, planes, config.distortion_length)
+            if self._filters is not None:
+                self._filters.follow_views(view.shape[1])
             seen = observations(planes, view, pose, noise)
             match = self._associate(planes, seen)
             self._fuse(planes, seen, match, pose, stamp)
-            self._merge(stamp, pose.shift)
-        self._contradict(image, pose, noise, stamp)
+            self._merge(pose.shift)
+        self._contradict(image, pose, noise)
 
     @property
     def planes(self) -> list[MapPlane]:
@@ -120,7 +126,7 @@ class PlaneMap:
         if filters is None:
             return match
         gap = filters.normal @ seen.centroid.T + filters.distance[:, None]
-        close = filters.normal @ seen.plane[:, :3].T > np.cos(_WIDEST)
+        close = filters.normal @ seen.plane[:, :3].T > np.cos(SURE_TURN)
         close &= np.abs(gap) < _FARTHEST * seen.range
         index, which = np.nonzero(close)
         if not len(index):
@@ -162,13 +168,13 @@ class PlaneMap:
                 self._records.append(Record(self._next, stamp, stamp))
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
-            self._records[k].add(plane, stamp)
+            self._records[k].add(plane, stamp, self._time)
         # The new ones first, then those that wait the longest.
-        waited = {k: self._records[k].waited(stamp) for k in np.unique(match).tolist()}
+        waited = {k: self._records[k].waited(self._time) for k in np.unique(match).tolist()}
         due = [k for k, time in waited.items() if time >= _UNION_INTERVAL]
         due.sort(key=lambda k: -waited[k])
         for k in due[: max(_UNIONS, len(new))]:
-            self._records[k].united = stamp
+            self._records[k].united = self._time
             for part in np.flatnonzero(match == k).tolist():
                 self._unite(k, planes[part], pose)
 
@@ -185,14 +191,14 @@ class PlaneMap:
         # Corners of pixels are finer than the map, and cost time in every step that follows.
         self._grow(k, areas(part.simplify(self.config.map_resolution / 4)))
 
-    def _merge(self, stamp: int, camera: NDArray[np.float64]) -> None:
+    def _merge(self, camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with those that have just grown."""
         filters = self._filters
         assert filters is not None
         gone: list[int] = []
-        grown = [k for k, record in enumerate(self._records) if record.united == stamp]
+        grown = [k for k, record in enumerate(self._records) if record.united == self._time]
         for k in grown:
-            for m in filters.alike(k, camera, _GATE, _WIDEST, _FARTHEST).tolist():
+            for m in filters.alike(k, camera, _GATE, SURE_TURN, _FARTHEST).tolist():
                 if m in gone or k in gone or not self._touch(k, m):
                     continue
                 kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
@@ -233,9 +239,7 @@ class PlaneMap:
         self._filters = self._filters.where(chosen)
         self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
 
-    def _contradict(
-        self, image: RangeImage, pose: Transform, noise: PoseNoise, stamp: int
-    ) -> None:
+    def _contradict(self, image: RangeImage, pose: Transform, noise: PoseNoise) -> None:
         """Take away what rays pass through."""
         filters = self._filters
         if filters is None or not self._records:
@@ -260,14 +264,14 @@ class PlaneMap:
             record = self._records[k]
             record.outline = record.evidence.remaining(record.outline)
         kept = [
-            not r.outline.is_empty and (r.confirmed or stamp - r.last < _PROBATION)
+            not r.outline.is_empty and (r.confirmed or self._time - r.seen < _PROBATION)
             for r in self._records
         ]
         if (surplus := sum(kept) - self.config.map_planes) > 0:
             # Those out of sight the longest are forgotten, and of these the ones hardly seen.
             records = self._records
             order = np.flatnonzero(kept).tolist()
-            order.sort(key=lambda k: (records[k].last, records[k].observations))
+            order.sort(key=lambda k: (records[k].seen, records[k].observations))
             for k in order[:surplus]:
                 kept[k] = False
         if not all(kept):

@@ -40,13 +40,13 @@ _UNSEEN_OVERLAP = 0.1
 _TRIAL, _ON_TRIAL = 0.32, 0.05
 # Standard deviations of the camera's motion, in radians and metres per second: of a hand as quick
 # as can be while depth is still measured. They count only where planes leave the motion open.
-_TURN, _SHIFT = np.radians(60.0), 0.9
+TURN, SHIFT = np.radians(60.0), 0.9
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for: after longer, the camera may be anywhere.
-_NOMINAL, _LONGEST = 1 / 30, 0.5
+NOMINAL, _LONGEST = 1 / 30, 0.5
 # Least intersection over union, and largest changes, of planes the motion is estimated from: the
 # equations are linear in it, and larger changes are rather another plane.
-_SURE_OVERLAP, _SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
+_SURE_OVERLAP, SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
 _MOTION_ROUNDS = 3
 # Share of the planes that a motion must explain of those that stay where they were without it.
 _AGREED = 0.5
@@ -126,7 +126,7 @@ class Tracker:
         self.contradicted = False
         if labels.shape != self._shape:
             self.reset()
-        elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else _NOMINAL
+        elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
         self._stamp, self._shape = stamp, labels.shape
         samples = samples_of(labels, planes)
         seen, known = Tracks.of(planes, samples, elapsed), self._tracks
@@ -204,8 +204,8 @@ def _camera_motion(
     angle, offset = (variance[t, s] for variance in variances(known, seen))
     start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
-    reach = min(max(elapsed, _NOMINAL), _LONGEST)
-    prior = np.diag(np.repeat([(reach * _TURN) ** -2, (reach * _SHIFT) ** -2], 3))
+    reach = min(max(elapsed, NOMINAL), _LONGEST)
+    prior = np.diag(np.repeat([(reach * TURN) ** -2, (reach * SHIFT) ** -2], 3))
     for _ in range(_MOTION_ROUNDS):
         n = start @ rotation.T
         turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
@@ -231,7 +231,7 @@ def _sure_pairs(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArra
         overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
     )
     sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < _SURE_SHIFT)
-    result: NDArray[np.bool_] = sure & (known.normal @ seen.normal.T > np.cos(_SURE_TURN))
+    result: NDArray[np.bool_] = sure & (known.normal @ seen.normal.T > np.cos(SURE_TURN))
     return result
 
 

@@ -18,7 +18,7 @@ _SAMPLES = 60
 # their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
 # distortion of a Kinect is there), and an angle, at least and for an offset over the plane's
 # radius.
-_OFFSET, _ANGLE = 0.007, np.radians(1.0)
+OFFSET, ANGLE = 0.007, np.radians(1.0)
 # Larger standard deviations do not count: what is known of such planes fits anything.
 _LARGEST_OFFSET, _LARGEST_ANGLE = 0.03, np.radians(5.0)
 # Area in square metres that a plane counts with at least, so that its radius is not 0.
@@ -137,7 +137,7 @@ def offsets(known: Tracks, seen: Tracks) -> NDArray[np.float64]:
 def variances(known: Tracks, seen: Tracks) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(T, N) variances to expect of the angles and offsets of planes of one surface."""
     ranges = np.einsum('ni,ni->n', seen.centroid, seen.centroid)
-    floor = _OFFSET**2 * ranges
+    floor = OFFSET**2 * ranges
     lever = np.column_stack([seen.centroid, np.ones(len(seen.id))])
     spread = np.einsum('ni,nj->nij', lever, lever).reshape(len(lever), 16)
     # h^T C h for the covariances of both planes: that of the known one at a centroid far from
@@ -147,7 +147,7 @@ def variances(known: Tracks, seen: Tracks) -> tuple[NDArray[np.float64], NDArray
     angle = np.add.outer(
         *(np.trace(t.covariance[:, :3, :3], axis1=1, axis2=2) for t in (known, seen))
     )
-    angle += floor * np.add.outer(known.radius**-2, seen.radius**-2) + _ANGLE**2
+    angle += floor * np.add.outer(known.radius**-2, seen.radius**-2) + ANGLE**2
     return np.minimum(angle, _LARGEST_ANGLE**2), np.minimum(offset, _LARGEST_OFFSET**2 * ranges)
 
 

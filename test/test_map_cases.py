@@ -1,0 +1,106 @@
+"""The map of planes where things are not as they should be: stamps, sizes, cameras, hours."""
+
+import numpy as np
+import pytest
+import shapely
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.evidence import Evidence
+from rangeseg_ros.core.mapping.map_outlines import unite_outlines
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+
+CONFIG = Config(min_pixels=150)
+ROOM = kinect_room(4)
+SCENE = Scene(ROOM.solids, walk(ROOM.poses[0], 4, 40), ROOM.dark)
+
+
+def seen(k, width=320, sensor=0):
+    """Image and pose of frame `k` of a walk."""
+    camera = kinect_camera(width, width * 3 // 4)
+    view = simulate_kinect(SCENE, camera, frame=k, sensor_seed=sensor)
+    pose = SCENE.poses[k]
+    return RangeImage.from_depth(view.depth, view.camera), Transform(pose.rotation, pose.position)
+
+
+def planes_of(sequence):
+    """(M, 4) planes of a map, in an order of their own."""
+    return np.array([np.append(p.normal, p.distance) for p in sequence.map.planes])
+
+
+def test_frames_without_stamps_make_a_map():
+    sequence, areas = SequenceSegmenter(CONFIG), []
+    for k, times in ((0, 3), (36, 17)):
+        image, pose = seen(k)
+        for _ in range(times):
+            sequence.segment(image, 0, pose=pose)
+        areas.append(sum(plane.area for plane in sequence.map.planes))
+    assert len(sequence.map) > 3
+    assert {plane.last_stamp for plane in sequence.map.planes} == {0}
+    assert sequence.map.begun_anew == ''
+    # Outlines grow all the same.
+    assert areas[1] > 1.02 * areas[0]
+
+
+def test_another_size_of_images_goes_on_with_the_map():
+    sequence = SequenceSegmenter(CONFIG)
+    sizes, ids = [], []
+    for n, k in enumerate(range(0, 40, 4)):
+        image, pose = seen(k, 320 if n < 5 else 240)
+        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
+        sizes.append(len(sequence.map))
+        ids.append({plane.id for plane in sequence.map.planes})
+    assert sizes[4] > 3
+    assert sizes[4] - 1 <= sizes[-1] <= sizes[4] + 3
+    assert len(ids[4] & ids[-1]) >= sizes[4] - 1
+
+
+def test_parameters_changed_while_running_keep_the_map():
+    sequence = SequenceSegmenter(CONFIG)
+    for n, k in enumerate(range(0, 40, 4)):
+        if n == 5:
+            before = {plane.id for plane in sequence.map.planes}
+            sequence.config = Config(min_pixels=300, map_resolution=0.1, distortion_length=20.0)
+        image, pose = seen(k)
+        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
+    after = {plane.id for plane in sequence.map.planes}
+    assert len(before) > 3 and len(before & after) >= len(before) - 1
+    assert sequence.map.begun_anew == ''
+    # Another frame is another map.
+    sequence.config = Config(min_pixels=300, fixed_frame='odom')
+    assert len(sequence.map) == 0 and sequence.map.begun_anew == 'its frame has changed'
+
+
+def test_two_cameras_in_one_frame_have_maps_of_their_own_that_agree():
+    one, two = SequenceSegmenter(CONFIG), SequenceSegmenter(CONFIG)
+    for k in range(0, 20, 4):
+        for sequence, frame, sensor in ((one, k, 0), (two, k + 20, 1)):
+            image, pose = seen(frame, sensor=sensor)
+            sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
+    a, b = planes_of(one), planes_of(two)
+    assert min(len(a), len(b)) > 3
+    # Floor and walls are seen by both: the same planes, though neither map knows of the other.
+    close = (a[:, :3] @ b[:, :3].T > np.cos(np.radians(3))) & (
+        np.abs(a[:, 3, None] - b[:, 3]) < 0.05
+    )
+    assert close.any(axis=1).sum() >= 3
+    assert one.map is not two.map
+
+
+@pytest.mark.parametrize('kind', ['same wall', 'corridor'])
+def test_outlines_and_their_evidence_are_bounded_however_long_one_looks(kind):
+    random, outline, evidence = np.random.default_rng(0), shapely.Polygon(), Evidence()
+    for n in range(400):
+        at = random.uniform(-3, 3, 2) if kind == 'same wall' else np.array([0.2 * n, 0.0])
+        corners = at + random.uniform(-1, 1, (12, 2))
+        part = shapely.MultiPoint(corners).convex_hull
+        outline = unite_outlines(outline, part, 0.05)
+        evidence.follow(outline)
+        assert shapely.get_num_coordinates(outline) <= 400
+        # Sides of cells are powers of two: up to four times as many, and those at borders.
+        assert len(evidence.centres) <= 400
+    assert outline.area > 10
