@@ -106,7 +106,8 @@ class PlaneFilters:
         """Take in observations, each plane at most one."""
         step = self._expected(index, seen, which)
         state = step.own + step.before @ (step.before + step.lasting).transpose(0, 2, 1)
-        gain = np.linalg.solve(step.spread, state.transpose(0, 2, 1)).transpose(0, 2, 1)
+        solved = np.linalg.solve(step.spread, state.transpose(0, 2, 1))
+        gain = np.asarray(solved.transpose(0, 2, 1), np.float64)
         rest = np.eye(3) - gain
         self.own[index] = _turned(rest, step.own) + _turned(gain, step.fresh)
         self.lasting[index] = rest @ step.before - gain @ step.lasting
