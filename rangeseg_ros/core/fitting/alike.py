@@ -70,29 +70,49 @@ def _divide(
 
     Of equal keys, as slopes of 0 are, the `second` ones rise, then the numbers.
     """
-    first = bounds[0]
-    for k in range(1, len(bounds) - 1):
-        low, high, place = first, bounds[-1] - 1, bounds[k]
-        # Quickselect (Hoare 1961): what would be at `place` if all were sorted comes there.
-        while low < high:
-            pivot = order[(low + high) // 2]
-            i, j = low, high
-            while i <= j:
-                while _precedes(order[i], pivot, key, second):
-                    i += 1
-                while _precedes(pivot, order[j], key, second):
-                    j -= 1
-                if i <= j:
-                    order[i], order[j] = order[j], order[i]
-                    i += 1
-                    j -= 1
-            if place <= j:
-                high = j
-            elif place >= i:
-                low = i
-            else:
-                break
-        first = place
+    shares = len(bounds) - 1
+    step = 1
+    while step < shares:
+        step *= 2
+    # Halves, then halves of these.
+    while step > 1:
+        step //= 2
+        for k in range(step, shares, 2 * step):
+            after = bounds[min(k + step, shares)]
+            _place(order, key, second, (bounds[k - step], after), bounds[k])
+
+
+@njit(cache=True)
+def _place(
+    order: NDArray[np.int32],
+    key: NDArray[np.float64],
+    second: NDArray[np.float64],
+    within: tuple[int, int],
+    place: int,
+) -> None:
+    """Permute a part of `order` so that what comes to `place` is what sorting would bring there.
+
+    What precedes it is before it, and what it precedes is behind it (quickselect; Hoare 1961).
+    """
+    low, high = within[0], within[1] - 1
+    while low < high:
+        pivot = order[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while _precedes(order[i], pivot, key, second):
+                i += 1
+            while _precedes(pivot, order[j], key, second):
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if place <= j:
+            high = j
+        elif place >= i:
+            low = i
+        else:
+            break
 
 
 @njit(cache=True)
@@ -115,11 +135,27 @@ def quantiles(values: NDArray[np.float64], sets: Sets, quantile: float) -> NDArr
 
 @njit(cache=True)
 def ranked(values: NDArray[np.float64], quantile: float) -> float:
-    """One of N values that so many lie below; permutes them.
+    """One of N values that so many lie below; permutes them."""
+    return _ranked(values, int(quantile * (len(values) - 1)))
 
-    What np.partition gives, which numba takes as long to compile as the rest of the noise.
+
+@njit(cache=True)
+def median(values: NDArray[np.float64]) -> float:
+    """Median of N values."""
+    values = values.copy()
+    count = len(values)
+    upper = _ranked(values, count // 2)
+    if count % 2 == 1:
+        return upper
+    return (values[: count // 2].max() + upper) / 2
+
+
+@njit(cache=True)
+def _ranked(values: NDArray[np.float64], rank: int) -> float:
+    """What sorting would bring to a rank; it comes there, and none before it is larger.
+
+    What np.partition does, which numba takes as long to compile as the rest of the noise.
     """
-    rank = int(quantile * (len(values) - 1))
     low, high = 0, len(values) - 1
     while low < high:
         # The median of three, as values that rise and fall would take the middle one N rounds.

@@ -21,10 +21,11 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from rangeseg_ros.core.fitting.alike import Sets, alike, quantiles
+from rangeseg_ros.core.fitting.alike import Sets, alike, median, quantiles
 from rangeseg_ros.core.fitting.quantisation import quantisation
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quad_sums, quads
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     FLOOR,
@@ -98,13 +99,19 @@ class _Scale(NamedTuple):
         squared, slope = blocks.squared.ravel()[place], blocks.slope.ravel()[place]
         return cls(place, squared, slope, alike(squared, slope))
 
+    def pixels(self, blocks: Blocks) -> NDArray[np.float64]:
+        """Measured pixels (N,) of each."""
+        pixels: NDArray[np.float64] = blocks.moments.reshape(-1, SIZE)[self.place, COUNT]
+        return pixels
+
     def variance_ratio(
         self, blocks: Blocks, level: NDArray[np.float64] | float
     ) -> NDArray[np.float64]:
         """Mean square residuals (N,) of what the quantile of those of a variance `level` is."""
-        freedom = np.maximum(blocks.moments[..., COUNT].ravel()[self.place] - 3, 1)
-        ratio = (blocks.residual / level).ravel()[self.place]
-        return ratio / (freedom * _share(float(np.median(freedom))))
+        freedom = np.maximum(self.pixels(blocks) - 3, 1)
+        ratio = blocks.residual.ravel()[self.place]
+        ratio /= level if isinstance(level, float) else level.ravel()[self.place]
+        return ratio / (freedom * _share(median(freedom)))
 
     def mean(self, ratio: NDArray[np.float64], quantile: float) -> float:
         """Mean over the sets of a quantile of what their blocks show of what was expected."""
@@ -153,10 +160,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     prior : SensorModel
         Taken as far as the image says too little.
     """
-    quantum, range_quantum = quantisation(image.inverse)
-    # Rounding errors spread evenly over a step.
-    rounding = max(quantum / np.sqrt(12), _EXACT)
-    range_rounding = range_quantum / np.sqrt(12)
+    quanta = submit(quantisation, image.inverse)
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
     coarse = Blocks.planes(quads(blocks.moments), image.rays, 2 * BLOCK)
@@ -165,15 +169,14 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if np.count_nonzero(used) < _PRIOR:
         return prior
     scale = _Scale.of(coarse, used)
+    quantum, range_quantum = quanta.result()
+    # Rounding errors spread evenly over a step.
+    rounding = max(quantum / np.sqrt(12), _EXACT)
+    range_rounding = range_quantum / np.sqrt(12)
     none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
     variance = scale.variance_ratio(coarse, 1.0)
     noise = scale.errors(variance, _QUANTILE, (0, 1), rounded, none)
-    level = noise.at(coarse.squared, coarse.slope).repeat(2, axis=0).repeat(2, axis=1)
-    # A copy, for the same reason as in `errors`.
-    level = level[: blocks.squared.shape[0], : blocks.squared.shape[1]].copy()
-    count = blocks.moments[..., COUNT]
-    # Six pixels leave three degrees of freedom.
-    flat = (count >= 6) & (blocks.residual < ROUGH * level * np.maximum(count - 3, 1))
+    level, flat = _flat_blocks(blocks, noise.at(coarse.squared, coarse.slope))
     if not flat.any():
         return prior
     scale = _Scale.of(blocks, flat)
@@ -198,7 +201,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         bending = scale.errors(excess.ravel()[scale.place], 0.5, kinds, none, shown)
         within.append(scale.mean(scale.variance_ratio(parts, level), _QUANTILE))
         # Measured in each of the four blocks: s^2 where there are no holes.
-        pixels = float(np.median(parts.moments[..., COUNT].ravel()[scale.place])) / 4
+        pixels = median(scale.pixels(parts)) / 4
         if side == BLOCK:
             between = scale.mean((excess / level).ravel()[scale.place], 0.5)
             filled = pixels / side**2
@@ -207,8 +210,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         expected = shown.at(parts.squared, parts.slope) + bending.at(parts.squared, parts.slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
-            float(np.median(errors.at(scale.squared, scale.slope)))
-            for errors in (distortion, smooth)
+            median(errors.at(scale.squared, scale.slope)) for errors in (distortion, smooth)
         ]
         if typical[1] > typical[0]:
             distortion = smooth
@@ -229,6 +231,23 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         quantum=quantum,
         range_quantum=range_quantum,
     )
+
+
+@njit(cache=True)
+def _flat_blocks(
+    blocks: Blocks, variance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Variances of blocks (rows, columns) from those of blocks of four, and which they explain."""
+    rows, columns = blocks.squared.shape
+    level, flat = np.empty((rows, columns)), np.empty((rows, columns), np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            level[i, j] = variance[i // 2, j // 2]
+            count = blocks.moments[i, j, COUNT]
+            # Six pixels leave three degrees of freedom.
+            limit = ROUGH * level[i, j] * max(count - 3, 1.0)
+            flat[i, j] = (count >= 6) & (blocks.residual[i, j] < limit)
+    return level, flat
 
 
 @cache

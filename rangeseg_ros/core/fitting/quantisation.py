@@ -21,7 +21,7 @@ _COARSEST = 0.05
 _SAME = 0.05
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
     """Steps of the inverse range, 1/m, and of the range, metres, that an image is rounded to.
 
