@@ -100,7 +100,8 @@ def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) 
     """Write `text` where the region is widest, if it is wide enough."""
     x, y, width, height = cv2.boundingRect(region.astype(np.uint8))
     part = region[y : y + height, x : x + width].astype(np.uint8)
-    inside = cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3)
+    around = cv2.copyMakeBorder(part, 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=0)
+    inside = cv2.distanceTransform(around, cv2.DIST_L2, 3)
     _, radius, _, (column, row) = cv2.minMaxLoc(inside)
     if radius < 8:
         return

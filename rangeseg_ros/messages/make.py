@@ -24,7 +24,8 @@ def make_rclpy(kind: str, **fields: Any) -> Any:
     for name, value in fields.items():
         # rclpy takes an array of bytes as it is, and a numpy array octet by octet.
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
-            fields[name] = array('B', value.tobytes())
+            fields[name] = array('B')
+            fields[name].frombytes(np.ascontiguousarray(value))
     return message_class(kind)(**fields)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -90,6 +91,7 @@ class _Markers:
         self._make = make
         self._header = header
         self._markers: list[Any] = []
+        self._blank = _blank(make, header)
         self.add('', 0, ARROW, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)).action = DELETEALL
 
     def message(self) -> Any:
@@ -102,7 +104,7 @@ class _Markers:
         """Add white letters of 12 cm that face whoever looks."""
         size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
         marker = self.add(namespace, number, TEXT_VIEW_FACING, size, white)
-        (marker.pose.position,) = _points(self._make, position[None])
+        marker.pose = _pose(self._make, position)
         marker.text = text
 
     def add(
@@ -113,41 +115,54 @@ class _Markers:
         scale: tuple[float, float, float],
         colour: tuple[float, ...],
     ) -> Any:
-        """Add a visualization_msgs/Marker with every field, as not all makers have defaults."""
+        """Add a visualization_msgs/Marker at the origin."""
         make = self._make
-        time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
-        untextured = make(
-            'sensor_msgs/msg/CompressedImage',
-            header=make('std_msgs/msg/Header', stamp=time, frame_id=''),
-            format='',
-            data=np.empty(0, np.uint8),
-        )
-        mesh = make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8))
-        marker = make(
-            'visualization_msgs/msg/Marker',
-            header=self._header,
-            ns=namespace,
-            id=number,
-            type=kind,
-            action=ADD,
-            pose=make(
-                'geometry_msgs/msg/Pose',
-                position=make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0),
-                orientation=make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0),
-            ),
-            scale=make('geometry_msgs/msg/Vector3', **dict(zip('xyz', scale, strict=True))),
-            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour, strict=True))),
-            lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
-            frame_locked=False,
-            points=[],
-            colors=[],
-            texture_resource='',
-            texture=untextured,
-            uv_coordinates=[],
-            text='',
-            mesh_resource='',
-            mesh_file=mesh,
-            mesh_use_embedded_materials=False,
-        )
+        marker = copy(self._blank)
+        marker.ns, marker.id, marker.type = namespace, number, kind
+        marker.scale = make('geometry_msgs/msg/Vector3', **dict(zip('xyz', scale, strict=True)))
+        marker.color = make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour, strict=True)))
         self._markers.append(marker)
         return marker
+
+
+def _blank(make: Make, header: Any) -> Any:
+    """visualization_msgs/Marker with every field, as not all makers have defaults.
+
+    To be copied: rclpy makes the parts of a marker anew even where they are given.
+    """
+    time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
+    untextured = make(
+        'sensor_msgs/msg/CompressedImage',
+        header=make('std_msgs/msg/Header', stamp=time, frame_id=''),
+        format='',
+        data=np.empty(0, np.uint8),
+    )
+    mesh = make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8))
+    return make(
+        'visualization_msgs/msg/Marker',
+        header=header,
+        ns='',
+        id=0,
+        type=ARROW,
+        action=ADD,
+        pose=_pose(make, np.zeros(3)),
+        scale=make('geometry_msgs/msg/Vector3', x=1.0, y=1.0, z=1.0),
+        color=make('std_msgs/msg/ColorRGBA', r=0.0, g=0.0, b=0.0, a=0.0),
+        lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
+        frame_locked=False,
+        points=[],
+        colors=[],
+        texture_resource='',
+        texture=untextured,
+        uv_coordinates=[],
+        text='',
+        mesh_resource='',
+        mesh_file=mesh,
+        mesh_use_embedded_materials=False,
+    )
+
+
+def _pose(make: Make, position: NDArray[np.floating]) -> Any:
+    (point,) = _points(make, position[None])
+    unturned = make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
+    return make('geometry_msgs/msg/Pose', position=point, orientation=unturned)

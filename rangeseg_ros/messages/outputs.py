@@ -98,8 +98,10 @@ def _crossings(
 
 
 def _points(image: RangeImage, where: NDArray[np.bool_]) -> NDArray[np.float32]:
-    # Of these pixels only, which is faster than RangeImage.points.
-    points: NDArray[np.float32] = image.rays[where] / image.inverse[where, None]
+    # Of these pixels only, which is faster than RangeImage.points, and by number than by mask.
+    pixels = np.flatnonzero(where)
+    rays = np.take(image.rays.reshape(-1, 3), pixels, axis=0)
+    points: NDArray[np.float32] = rays / np.take(image.inverse, pixels)[:, None]
     return points
 
 
