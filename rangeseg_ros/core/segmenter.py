@@ -305,7 +305,6 @@ def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
         correlation=2 * sensor.correlation,
         distortion_length=2 * sensor.distortion_length,
         pixel_noise=2 * sensor.pixel_noise,
-        pixel_distortion=2 * sensor.pixel_distortion,
     )
     survey = coarse.survey
     if isinstance(survey, Survey):

@@ -146,7 +146,6 @@ def weigh_blocks(
                 result[i, j, entry] = weight * blocks.moments[i, j, entry]
             result[i, j, COUNT] = count
             systematic = systematic_variance(sensor, squared)
-            systematic += sensor.pixel_distortion**2 * blocks.slope[i, j]
             result[i, j, RATIO] = count * weight * systematic
             result[i, j, SLOPE] = count * tilt
     return result

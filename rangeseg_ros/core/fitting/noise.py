@@ -54,6 +54,9 @@ _ROUNDS = 5
 _EXACT = 1e-4
 # Median of chi-squared of 9 degrees of freedom over its mean.
 _MEDIAN = 0.927
+# Half of the likelihood ratio that is no chance, for one block: quantile 0.999 of chi-squared with
+# one degree of freedom times the relative variance of a median of chi-squared with nine.
+_CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
@@ -131,21 +134,22 @@ class _Scale(NamedTuple):
         """
         squared, tilt = (quantiles(term, self.sets, 0.5) for term in (self.squared, self.slope))
         shown = quantiles(variance, self.sets, quantile)
-        # `known` adds no floor to that of `least`.
-        shown = np.maximum(shown - (known.at(squared, tilt) - FLOOR), least.at(squared, tilt))
+        shown = np.maximum(shown, least.at(squared, tilt))
+        there = known.at(squared, tilt) - FLOOR
+        blocks = len(self.place) / len(shown)
         # What faces the sensor first: noise makes slopes of its own, that would explain it.
         # Indices and no slice: kernels are compiled for layouts, and a slice's follows the size.
         facing = np.arange(0, len(shown), self.sets.slopes)
         terms = np.ones(len(squared)), squared**2
         # A sensor errs in disparity or in range: of both together a few blocks tell nothing.
-        nothing = np.zeros(len(shown))
         likeliest = [
-            (*_likeliest(terms[kind][facing], shown[facing], nothing[facing]), kind)
+            (*_likeliest(terms[kind][facing], shown[facing], there[facing], blocks), kind)
             for kind in kinds
         ]
         factor, _, kind = min(likeliest, key=lambda found: found[1])
         constant, quartic = (factor, 0.0) if kind == 0 else (0.0, factor)
-        straight, _ = _likeliest(tilt, shown, constant + quartic * terms[1])
+        there += constant + quartic * terms[1]
+        straight, _ = _likeliest(tilt, shown, there, blocks)
         return Errors(constant, quartic, straight)
 
 
@@ -205,8 +209,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         if side == BLOCK:
             between = scale.mean((excess / level).ravel()[scale.place], 0.5)
             filled = pixels / side**2
-        # M(s) = v + D^2 n / 8, with n pixels in a block.
-        smooth = bending.times(8 / pixels)
+        # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
+        smooth = bending.times(8 / pixels)._replace(tilt=0.0)
         expected = shown.at(parts.squared, parts.slope) + bending.at(parts.squared, parts.slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
@@ -227,7 +231,6 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),
         range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
-        pixel_distortion=float(np.sqrt(distortion.tilt)),
         quantum=quantum,
         range_quantum=range_quantum,
     )
@@ -261,12 +264,14 @@ def _likeliest(
     term: NDArray[np.float64],
     variances: NDArray[np.float64],
     known: NDArray[np.float64],
+    blocks: float,
 ) -> tuple[float, float]:
     """Factor >= 0 of a term (N,) that with what is `known` explains variances (N,).
 
     Variances are spread in proportion to themselves (chi-squared): the likeliest factor is that of
-    least squares weighted by what it explains, found in a few rounds. Also returns how unlikely
-    it is, the deviance but for a constant.
+    least squares weighted by what it explains, found in a few rounds. It is 0 where what is known
+    explains medians of so many blocks as well. Also returns how unlikely it is, the deviance but
+    for a constant.
     """
     explained = np.full(len(variances), np.mean(variances))
     factor = 0.0
@@ -275,7 +280,12 @@ def _likeliest(
         factor = max((weight * (variances - known)).sum(), 0.0)
         factor /= max((weight * term).sum(), 1e-300)
         explained = np.maximum(known + factor * term, 1e-3 * variances)
-    return factor, (np.log(explained) + variances / explained).sum()
+    unlikely = (np.log(explained) + variances / explained).sum()
+    if known.min() > 0:
+        without = (np.log(known) + variances / known).sum()
+        if without - unlikely < _CHANCE / blocks:
+            return 0.0, without
+    return factor, unlikely
 
 
 def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:

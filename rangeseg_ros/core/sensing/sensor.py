@@ -37,8 +37,6 @@ class SensorModel(NamedTuple):
     pixel_noise : float
         Random error of a pixel's direction, pixels: what surfaces seen at a grazing angle are
         noisier by.
-    pixel_distortion : float
-        Smooth systematic error of a pixel's direction, pixels.
     quantum : float
         Step that the inverse range is rounded to, 1/m; 0 for none.
     range_quantum : float
@@ -53,7 +51,6 @@ class SensorModel(NamedTuple):
     range_distortion: float
     distortion_length: float
     pixel_noise: float = 0.0
-    pixel_distortion: float = 0.0
     quantum: float = 0.0
     range_quantum: float = 0.0
 
