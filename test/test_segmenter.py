@@ -14,6 +14,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
@@ -217,3 +218,14 @@ def test_warm_start_begins_anew_with_the_first_frame_a_reset_and_another_camera(
 def test_warm_start_is_refused_where_nothing_could_begin_from_labels(options):
     with pytest.raises(ConfigError, match='warm_start'):
         Config(warm_start=True, **options)
+
+
+def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():
+    result = segment(corner())
+    sent = pickle.loads(pickle.dumps(result))
+    for found in (result, sent):
+        assert found.tilt.degrees == pytest.approx(np.degrees(np.arccos(0.8)), abs=1)
+    sequence = SequenceSegmenter(NORMALS)
+    image = RangeImage.from_depth(corner(), CAMERA)
+    assert sequence.segment(image, 0).tilt is not None
+    assert sequence.segment(image, 1, up=(0, -0.8, -0.6)).tilt is None

@@ -83,8 +83,8 @@ class Segmentation:
         Edges of the grid that cross a jump; None where none were looked for.
     survey : Survey or Terrain
         How the ground is found, or what was found.
-    tilt : Tilt or None
-        Where the planes say that up is, when that is not what was stated.
+    upright : tuple of 3 float
+        Tolerance, smallest area and slope of `tilt_of`.
     """
 
     labels: NDArray[np.uint16]
@@ -95,7 +95,14 @@ class Segmentation:
     labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
     jumps: GridEdges | None = field(default=None, repr=False)
     survey: Survey | Terrain | None = field(default=None, repr=False)
-    tilt: Tilt | None = None
+    upright: tuple[float, float, float] | None = None
+
+    @cached_property
+    def tilt(self) -> Tilt | None:
+        """Where the planes say that up is, when that is not what was stated; when read."""
+        if self.upright is None or not isinstance(self.survey, Survey):
+            return None
+        return tilt_of(self.planes, self.survey.up, *self.upright)
 
     @cached_property
     def normals(self) -> NDArray[np.float32]:
@@ -154,7 +161,8 @@ class Segmentation:
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
-        return {**self.__dict__, 'labelling': kept, 'survey': survey, 'stairs': stairs}
+        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt}
+        return {**self.__dict__, 'labelling': kept, **found}
 
 
 class Segmenter:
@@ -236,9 +244,10 @@ class Segmenter:
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)
         laps = watch.laps
-        limits = config.role_tolerance, config.role_area, config.ground_slope
-        tilt = tilt_of(planes, survey.up, *limits)
-        return Segmentation(labels, planes, laps, reason, sensor, labelling, jumps, survey, tilt)
+        upright = config.role_tolerance, config.role_area, config.ground_slope
+        return Segmentation(
+            labels, planes, laps, reason, sensor, labelling, jumps, survey, upright
+        )
 
     def _by_planes(
         self,

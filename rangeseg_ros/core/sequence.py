@@ -17,7 +17,6 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.memory import GroundMemory
 from rangeseg_ros.core.meaning.roles import roles, unit
 from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.meaning.tilt import tilt_of
 from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
@@ -114,17 +113,14 @@ class SequenceSegmenter:
         self.pose = pose
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
-        survey, tilt = result.survey, result.tilt
+        survey = result.survey
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=unit(up))
-            config = self.config
-            limits = config.role_tolerance, config.role_area, config.ground_slope
-            tilt = tilt_of(planes, survey.up, *limits)
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
         if isinstance(survey, Survey):
             survey = replace(survey, memory=self._ground, stamp=stamp)
-        return replace(result, planes=planes, survey=survey, tilt=tilt)
+        return replace(result, planes=planes, survey=survey)
 
     def _follow(
         self, labels: NDArray[np.uint16], planes: list[Plane], stamp: int, up: ArrayLike | None
