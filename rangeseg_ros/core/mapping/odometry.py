@@ -8,7 +8,8 @@ state has the errors of
 * the velocity in the camera's axes, turning and going, which persists for a while and has the
   spread of a hand's (Ornstein and Uhlenbeck): where planes hold the camera it is measured, and
   where they do not, it makes the covariance of the pose grow without bound;
-* each plane: x of `plane_errors`, and beta of `observations`.
+* each plane: x of `plane_errors`, and beta of `observations`, which is considered, not estimated,
+  as in `plane_filter`.
 
 A plane (n, p) is to be seen in the camera's frame with n' = R^T n and p' = R^T (p - t), so that an
 observation is, as error of that plane with the axes e1', e2',
@@ -105,7 +106,7 @@ class PlaneOdometry:
         self._pose: Transform | None = None
         self._velocity = np.zeros(6)
         self._id = np.zeros(0, np.int64)
-        self._normal = self._point = self._bias = np.zeros((0, 3))
+        self._normal = self._point = np.zeros((0, 3))
         self._axes = np.zeros((0, 2, 3))
         self._view = np.zeros((0, 0))
         spread = np.repeat([0.0, 0.0, TURN**2, SHIFT**2], 3)
@@ -219,7 +220,8 @@ class PlaneOdometry:
                 value = _chi_squared(rest.reshape(count, 3), fresh)
                 weight = np.minimum(1.0, np.sqrt(_GATE / np.maximum(value, 1e-12)))
             noise = _diagonal(fresh / weight[:, None, None])
-            gain = np.linalg.solve(spread + noise, expected).T
+            gain = np.linalg.solve(spread + noise, expected).T.copy()
+            gain[_betas(len(self._id))] = 0
             left = np.eye(size) - gain @ flat
             covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
             self._covariance = (covariance + covariance.T) / 2
@@ -238,7 +240,7 @@ class PlaneOdometry:
         lasting = local @ seen.lasting[which]
         fresh = local @ seen.fresh[which] @ local.transpose(0, 2, 1)
         fresh = fresh + new[:, None, None] * lasting @ lasting.transpose(0, 2, 1)
-        gap = local @ seen.plane[which][..., None] - lasting @ self._bias[..., None]
+        gap = local @ seen.plane[which][..., None]
         for k in range(len(which)):
             x = _CAMERA + _OWN * k
             design[k, :, x : x + 3] = np.eye(3)
@@ -264,19 +266,17 @@ class PlaneOdometry:
         twist = Rotation.from_rotvec(step[:3]).as_matrix()
         self._pose = Transform(turn @ twist, shift + step[3:6])
         self._velocity = self._velocity + step[6:12]
-        own = step[_CAMERA:].reshape(-1, 2, 3)
-        planes = shifted(self._normal, self._point, self._axes, own[:, 0])
+        own = step[_CAMERA:].reshape(-1, _OWN)[:, :3]
+        planes = shifted(self._normal, self._point, self._axes, own)
         self._normal, self._point, self._axes = planes
-        self._bias = self._bias + own[:, 1]
 
     def _fade(self, rho: NDArray[np.float64]) -> None:
         """Beta of other pixels is partly another one."""
         scale = np.ones(len(self._covariance))
-        beta = (_CAMERA + _OWN * np.arange(len(rho))[:, None] + [3, 4, 5]).ravel()
+        beta = _betas(len(rho))
         scale[beta] = np.repeat(rho, 3)
         self._covariance = self._covariance * scale[:, None] * scale
         self._covariance[beta, beta] += np.repeat(1 - rho**2, 3)
-        self._bias = rho[:, None] * self._bias
 
     def _append(self, seen: Observations, ids: NDArray[np.int64]) -> None:
         """Planes seen for the first time: x = -(what the pose errs by) - B beta - v."""
@@ -292,7 +292,6 @@ class PlaneOdometry:
         self._normal = np.concatenate([self._normal, normal])
         self._point = np.concatenate([self._point, point])
         self._axes = np.concatenate([self._axes, axes])
-        self._bias = np.concatenate([self._bias, np.zeros((count, 3))])
         self._view = np.concatenate([self._view.reshape(old, seen.view.shape[1]), seen.view])
         design, local = self._design()
         design, local = design[old:], local[old:]
@@ -318,8 +317,14 @@ class PlaneOdometry:
             return
         states = np.concatenate([np.ones(_CAMERA, bool), np.repeat(chosen, _OWN)])
         self._covariance = self._covariance[np.ix_(states, states)]
-        for name in ('_id', '_normal', '_point', '_axes', '_bias', '_view'):
+        for name in ('_id', '_normal', '_point', '_axes', '_view'):
             setattr(self, name, getattr(self, name)[chosen])
+
+
+def _betas(count: int) -> NDArray[np.intp]:
+    """Places of the beta of each of `count` planes in the state."""
+    places = _CAMERA + _OWN * np.arange(count)[:, None] + np.arange(3, _OWN)
+    return np.asarray(places.ravel(), np.intp)
 
 
 def _level(up: NDArray[np.float64]) -> NDArray[np.float64]:
