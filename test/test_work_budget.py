@@ -13,7 +13,7 @@ from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
-BUDGETS = (1.0, 0.9, 0.8, 0.5, 0.36, 0.0)
+BUDGETS = (1.0, 0.95, 0.9, 0.7, 0.48, 0.0)
 
 
 @pytest.fixture(scope='module')
@@ -41,9 +41,9 @@ def test_less_is_never_more():
 
 
 def test_fewer_cuts_leave_more_energy(results):
-    energies = [results[budget].energy for budget in (1.0, 0.9, 0.8)]
+    energies = [results[budget].energy for budget in (1.0, 0.95, 0.9)]
     assert energies[0] < energies[1] < energies[2]
-    energies = [results[budget].energy for budget in (0.5, 0.36, 0.0)]
+    energies = [results[budget].energy for budget in (0.7, 0.48, 0.0)]
     assert energies[0] < energies[1] < energies[2]
 
 
@@ -77,13 +77,13 @@ def test_planes_are_those_of_the_scene(image, room, results, budget):
 
 
 def test_the_sensor_is_said_in_pixels_of_the_image(results):
-    full, coarse = results[1.0].sensor, results[0.5].sensor
+    full, coarse = results[1.0].sensor, results[0.7].sensor
     assert coarse.noise == pytest.approx(full.noise, rel=0.5)
     assert coarse.distortion_length == full.distortion_length
 
 
 def test_no_jump_beside_what_was_not_measured(image, results):
-    across, down = results[0.5].jumps
+    across, down = results[0.7].jumps
     valid = image.valid
     assert across.any() and down.any()
     assert not (across & ~(valid[:, 1:] & valid[:, :-1])).any()
@@ -118,4 +118,4 @@ def test_tiny_images(shape):
 @pytest.mark.parametrize('other', [{'method': 'normals'}, {'exact': True}])
 def test_budgets_are_for_the_shortcuts_of_planes(other):
     with pytest.raises(ConfigError, match='work_budget'):
-        Config(work_budget=0.9, **other)
+        Config(work_budget=0.95, **other)

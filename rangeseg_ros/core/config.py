@@ -116,7 +116,7 @@ class Config:
     work_budget: float = option(
         1.0,
         'method planes: share of the full work that a frame may take; below 1 fewer boundaries '
-        'are refined, below 0.8 every second row and column is looked at',
+        'are refined, below 0.9 every second row and column is looked at',
         low=0.0,
         high=1.0,
     )

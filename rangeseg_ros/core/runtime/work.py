@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 # Share of the full work, on Kinect frames of 640 x 480, that remains without cuts: of all pixels,
 # and of every second row and column; and that of these with cuts.
-_UNCUT, _COARSE, _COARSE_UNCUT = 0.8, 0.4, 0.32
+_UNCUT, _COARSE, _COARSE_UNCUT = 0.9, 0.5, 0.46
 
 
 class Work(NamedTuple):
