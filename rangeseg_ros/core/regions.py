@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import map_halves
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 
 VGA = 640 * 480
@@ -79,21 +79,33 @@ def connected_components(
     """
     if valid is None:
         valid = np.ones(labels.shape, np.bool_)
-    return _components(labels, grid, valid)
-
-
-@njit(cache=True)
-def _components(
-    labels: NDArray[np.integer],
-    grid: Grid,
-    valid: NDArray[np.bool_],
-) -> NDArray[np.int32]:
-    """Two passes over the image with a table of equivalent labels (thesis 3.1.1)."""
     height, width = labels.shape
     found = np.empty((height, width), np.int32)
     parent = np.empty(height * width + 1, np.int32)
+    counts = map_halves(_find_components, height, labels, grid, valid, found, parent)
+    run_rows(_renumber, height, found, _unite_halves(labels, grid, found, parent, *counts))
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _find_components(
+    first: int,
+    after: int,
+    labels: NDArray[np.integer],
+    grid: Grid,
+    valid: NDArray[np.bool_],
+    found: NDArray[np.int32],
+    parent: NDArray[np.int32],
+) -> int:
+    """The first pass over some rows, with a table of equivalent labels (thesis 3.1.1).
+
+    Numbers in `found` begin after that of the rows' first pixel; a number's `parent` is an
+    equivalent, lower one, or itself. Returns how many there are.
+    """
+    width = labels.shape[1]
+    start = first * width
     count = 0
-    for i in range(height):
+    for i in range(first, after):
         # What was last found equivalent: most pixels tell what the one before has told.
         known = -1
         for j in range(width):
@@ -102,39 +114,70 @@ def _components(
                 continue
             here = labels[i, j]
             left = j > 0 and grid.right[i, j - 1] > 0 and labels[i, j - 1] == here
-            up = i > 0 and grid.below[i - 1, j] > 0 and labels[i - 1, j] == here
+            up = i > first and grid.below[i - 1, j] > 0 and labels[i - 1, j] == here
             left &= found[i, j - 1] > 0
-            up &= found[i - 1, j] > 0
+            up = up and found[i - 1, j] > 0
             if left:
                 found[i, j] = found[i, j - 1]
                 if up and found[i - 1, j] != known:
-                    a, b = found[i, j], found[i - 1, j]
-                    known = b
-                    while parent[a] != a:
-                        a = parent[a]
-                    while parent[b] != b:
-                        b = parent[b]
-                    parent[max(a, b)] = min(a, b)
+                    known = found[i - 1, j]
+                    _unite(int(found[i, j]), int(known), parent)
             elif up:
                 found[i, j] = known = found[i - 1, j]
             else:
                 known = -1
                 count += 1
-                parent[count] = count
-                found[i, j] = count
-    # A parent has a lower number than its children, so that one pass resolves and renumbers.
-    number = np.zeros(count + 1, np.int32)
-    last = 0
-    for k in range(1, count + 1):
-        if parent[k] == k:
-            last += 1
-            number[k] = last
-        else:
-            number[k] = number[parent[k]]
-    for i in range(height):
+                parent[start + count] = start + count
+                found[i, j] = start + count
+    return count
+
+
+@njit(cache=True)
+def _unite(a: int, b: int, parent: NDArray[np.int32]) -> None:
+    while parent[a] != a:
+        a = parent[a]
+    while parent[b] != b:
+        b = parent[b]
+    parent[max(a, b)] = min(a, b)
+
+
+@njit(cache=True)
+def _unite_halves(
+    labels: NDArray[np.integer],
+    grid: Grid,
+    found: NDArray[np.int32],
+    parent: NDArray[np.int32],
+    upper: int,
+    lower: int,
+) -> NDArray[np.int32]:
+    """New number of each number in `found`, of so many in the halves of the rows: without gaps."""
+    height, width = labels.shape
+    middle = height // 2
+    if middle > 0:
         for j in range(width):
+            a, b = int(found[middle - 1, j]), int(found[middle, j])
+            alike = a > 0 and b > 0 and labels[middle - 1, j] == labels[middle, j]
+            if alike and grid.below[middle - 1, j] > 0:
+                _unite(a, b, parent)
+    # A parent has a lower number than its children, so that one pass resolves and renumbers.
+    number = np.empty(len(parent), np.int32)
+    number[0] = last = 0
+    for start, count in ((0, upper), (middle * width, lower)):
+        for k in range(start + 1, start + count + 1):
+            if parent[k] == k:
+                last += 1
+                number[k] = last
+            else:
+                number[k] = number[parent[k]]
+    return number
+
+
+@njit(cache=True, nogil=True)
+def _renumber(first: int, after: int, found: NDArray[np.int32], number: NDArray[np.int32]) -> None:
+    """The second pass over some rows."""
+    for i in range(first, after):
+        for j in range(found.shape[1]):
             found[i, j] = number[found[i, j]]
-    return found
 
 
 def is_noise(regions: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -244,11 +287,22 @@ def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
     return table
 
 
-@njit(cache=True)
 def relabel(regions: NDArray[np.integer], table: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Regions (H, W) by another name: `table` (M + 1,) uint16 has the new number of each."""
     result = np.empty(regions.shape, np.uint16)
-    for i in range(regions.shape[0]):
+    run_rows(_relabel, len(regions), regions, table, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _relabel(
+    first: int,
+    after: int,
+    regions: NDArray[np.integer],
+    table: NDArray[np.uint16],
+    result: NDArray[np.uint16],
+) -> None:
+    """The same of some rows."""
+    for i in range(first, after):
         for j in range(regions.shape[1]):
             result[i, j] = table[regions[i, j]]
-    return result

@@ -86,7 +86,6 @@ def _find_whole(
             result[bi, bj] = whole and count >= _MEASURED * size * size
 
 
-@njit(cache=True)
 def block_links(grid: Grid, size: int) -> Links:
     """Whether a block touches its right, its lower neighbour: along half of their border at least.
 
@@ -102,24 +101,36 @@ def block_links(grid: Grid, size: int) -> Links:
     """
     height, width = len(grid.right), grid.below.shape[1]
     rows, columns = -(-height // size), -(-width // size)
-    right = np.zeros((rows, columns - 1), np.bool_)
-    below = np.zeros((rows - 1, columns), np.bool_)
-    for bi in range(rows):
-        for bj in range(columns - 1):
+    right, below = np.zeros((rows, columns - 1), np.bool_), np.zeros((rows - 1, columns), np.bool_)
+    run_rows(_link, rows, grid, size, right, below)
+    return right, below
+
+
+@njit(cache=True, nogil=True)
+def _link(
+    first: int,
+    after: int,
+    grid: Grid,
+    size: int,
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+) -> None:
+    """The same of some rows of blocks."""
+    height, width = len(grid.right), grid.below.shape[1]
+    for bi in range(first, after):
+        for bj in range(right.shape[1]):
             touching = 0
             for i in range(bi * size, min((bi + 1) * size, height)):
                 touching += grid.right[i, (bj + 1) * size - 1] > 0
             right[bi, bj] = 2 * touching >= size
-    for bi in range(rows - 1):
-        for bj in range(columns):
+    for bi in range(first, min(after, len(below))):
+        for bj in range(below.shape[1]):
             touching = 0
             for j in range(bj * size, min((bj + 1) * size, width)):
                 touching += grid.below[(bi + 1) * size - 1, j] > 0
             below[bi, bj] = 2 * touching >= size
-    return right, below
 
 
-@njit(cache=True)
 def weigh_blocks(
     blocks: Blocks, whole: NDArray[np.bool_], sensor: SensorModel
 ) -> NDArray[np.float64]:
@@ -134,7 +145,21 @@ def weigh_blocks(
     sensor : SensorModel
     """
     result = np.zeros_like(blocks.moments)
-    for i in range(result.shape[0]):
+    run_rows(_weigh, len(result), blocks, whole, sensor, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _weigh(
+    first: int,
+    after: int,
+    blocks: Blocks,
+    whole: NDArray[np.bool_],
+    sensor: SensorModel,
+    result: NDArray[np.float64],
+) -> None:
+    """The same of some rows of blocks."""
+    for i in range(first, after):
         for j in range(result.shape[1]):
             if not whole[i, j]:
                 continue
@@ -148,4 +173,3 @@ def weigh_blocks(
             systematic = systematic_variance(sensor, squared)
             result[i, j, RATIO] = count * weight * systematic
             result[i, j, SLOPE] = count * tilt
-    return result

@@ -11,7 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import RECORD, Cells, add_block, add_pixels, cell_of
-from rangeseg_ros.core.fitting.interior import rows_of_blocks
+from rangeseg_ros.core.fitting.interior import RIM, rows_of_blocks
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, squares_left
@@ -24,8 +24,6 @@ from rangeseg_ros.core.sensing.sensor import (
 
 # Standard deviations of random and systematic error beyond which a pixel is an outlier.
 _OUTLIER = 4.0
-# Pixels from another region up to which a pixel may be its neighbour's.
-_RIM = 2
 # Kinds of pixels.
 _SURE, _OUTLYING, _AT_RIM = 0, 1, 2
 
@@ -258,8 +256,8 @@ def _kind(
         return _OUTLYING
     if inside[j // BLOCK] > 0:
         return _SURE
-    above, below = max(i - _RIM, 0), min(i + _RIM, labels.shape[0] - 1)
-    left, right = max(j - _RIM, 0), min(j + _RIM, labels.shape[1] - 1)
+    above, below = max(i - RIM, 0), min(i + RIM, labels.shape[0] - 1)
+    left, right = max(j - RIM, 0), min(j + RIM, labels.shape[1] - 1)
     alike = labels[above, left] == label and labels[above, right] == label
     alike = alike and labels[below, left] == label and labels[below, right] == label
     return _SURE if alike else _AT_RIM

@@ -96,7 +96,7 @@ class Fits(NamedTuple):
         """
         blocks = blocks or Blocks.of(image)
         filled = fill(labels)
-        inner = interior(filled)
+        inner = interior(labels, filled)
         count = int(labels.max(initial=0)) + 1
         box, border, area = measure_regions(labels, inner, count)
         first = _theta(first_sums(labels, image, sensor, blocks, filled, area))

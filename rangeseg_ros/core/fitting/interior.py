@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 
+RIM = 2
+"""Pixels from another region up to which a pixel may be its neighbour's."""
+
 
 def fill(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
     """Region of each block of 4 x 4 pixels that has one label.
@@ -46,12 +49,13 @@ def _fill(first: int, after: int, labels: NDArray[np.uint16], filled: NDArray[np
                 filled[bi, bj] = label
 
 
-@njit(cache=True)
-def interior(filled: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Region of each block that it fills together with the eight blocks around it.
+def interior(labels: NDArray[np.uint16], filled: NDArray[np.uint16]) -> NDArray[np.uint16]:
+    """Region of each block that it fills together with two pixels on all sides.
 
     Parameters
     ----------
+    labels : (H, W) uint16
+        0...M.
     filled : (rows, columns) uint16
         See `fill`.
 
@@ -61,18 +65,37 @@ def interior(filled: NDArray[np.uint16]) -> NDArray[np.uint16]:
         0 for the others, and for all at the border of the image.
     """
     inner = np.zeros_like(filled)
-    for i in range(1, len(filled) - 1):
-        for j in range(1, filled.shape[1] - 1):
-            label = filled[i, j]
+    run_rows(_leave_borders, len(filled), labels, filled, inner)
+    return inner
+
+
+@njit(cache=True, nogil=True)
+def _leave_borders(
+    first: int,
+    after: int,
+    labels: NDArray[np.uint16],
+    filled: NDArray[np.uint16],
+    inner: NDArray[np.uint16],
+) -> None:
+    """The same of some rows of blocks."""
+    for bi in range(max(first, 1), min(after, len(filled) - 1)):
+        for bj in range(1, filled.shape[1] - 1):
+            label = filled[bi, bj]
             if label == 0:
                 continue
             alike = True
-            for k in range(i - 1, i + 2):
-                for m in range(j - 1, j + 2):
+            for k in range(bi - 1, bi + 2):
+                for m in range(bj - 1, bj + 2):
                     alike &= filled[k, m] == label
+            if not alike:
+                unlike = label ^ label
+                # Whole rows: the block itself is known to be alike.
+                for i in range(bi * BLOCK - RIM, min((bi + 1) * BLOCK + RIM, len(labels))):
+                    for j in range(bj * BLOCK - RIM, min((bj + 1) * BLOCK + RIM, labels.shape[1])):
+                        unlike |= labels[i, j] ^ label
+                alike = unlike == 0
             if alike:
-                inner[i, j] = label
-    return inner
+                inner[bi, bj] = label
 
 
 @njit(cache=True, inline='always')
