@@ -50,7 +50,8 @@ class Record:
     """What is kept of a plane beside its equation.
 
     `first` and `last` are stamps; `seen` and `united` are of the map's own time, which goes on
-    where stamps do not: when it was seen last, and when its outline last grew.
+    where stamps do not: when it was seen last, and when its outline was looked at last. `margin`
+    is the outline and what is so near that it is no detail of the map.
     """
 
     id: int
@@ -62,6 +63,7 @@ class Record:
     confidence: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
+    margin: shapely.Geometry | None = None
     seen: int = 0
     united: int | None = None
     frames: int = 0

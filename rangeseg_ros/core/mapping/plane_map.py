@@ -228,11 +228,16 @@ class PlaneMap:
 
     def _grow(self, k: int, part: shapely.Geometry) -> None:
         record, resolution = self._records[k], self.config.map_resolution
+        if record.margin is not None and shapely.covers(record.margin, part):
+            return
         if record.outline.is_empty:
             record.outline = simplify(part, resolution)
         else:
             record.outline = unite_outlines(record.outline, part, resolution)
         record.evidence.follow(record.outline)
+        # What reaches no farther is no detail of the map: most looks show nothing new.
+        record.margin = record.outline.buffer(resolution / 2, join_style='mitre')
+        shapely.prepare(record.margin)
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         assert self._filters is not None
@@ -263,6 +268,7 @@ class PlaneMap:
         for k in see(evidence, found).tolist():
             record = self._records[k]
             record.outline = record.evidence.remaining(record.outline)
+            record.margin = None
         kept = [
             not r.outline.is_empty and (r.confirmed or self._time - r.seen < _PROBATION)
             for r in self._records
