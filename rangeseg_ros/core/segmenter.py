@@ -137,7 +137,7 @@ class Segmentation:
         """Staircases in sight, up and down, worked out when read."""
         if not isinstance(self.survey, Survey) or self.ground is None:
             return []
-        return stairs_of(self.survey.image, self.ground)
+        return stairs_of(self.ground)
 
     @property
     def terrain(self) -> NDArray[np.uint8]:

@@ -16,8 +16,8 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
-# Rows and columns of an image whose cells are 1 x 8 pixels.
-_ROWS, _COLUMNS = 480, 480
+# Rows of an image whose cells are 1 x 4 pixels.
+_ROWS = 240
 
 
 class CellSize(NamedTuple):
@@ -28,9 +28,9 @@ class CellSize(NamedTuple):
 
     @classmethod
     def of(cls, shape: tuple[int, int]) -> CellSize:
-        """1 x 8 for 640 x 480, more for larger images, 1 x 4 for small ones."""
+        """2 x 8 for 640 x 480, more for larger images, 1 x 4 for small ones."""
         rows = max(shape[0] // _ROWS, 1)
-        return cls(rows, 8 * rows if shape[1] >= _COLUMNS else 4)
+        return cls(rows, 4 * rows)
 
 
 class Cells(NamedTuple):
@@ -95,7 +95,7 @@ def cells_of(
     return cells
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _means(
     first: int,
     after: int,
@@ -107,58 +107,49 @@ def _means(
     cells: Cells,
 ) -> None:
     half = size.columns // 2
-    # Of the left and the right half: sums of rays and inverse ranges, and their number.
-    sums = np.zeros((2, 5), np.float32)
+    # Of the left and the right half of a cell: sums of rays and inverse ranges, and their number.
+    sums = np.zeros((5, 2), np.float32)
+    mean = np.zeros(3, np.float32)
+    up, ahead, across = axes[0], axes[1], axes[2]
     for i in range(first, after):
         for c in range(cells.inverse.shape[1]):
             for side in range(2):
-                _sum(inverse, rays, i, c * size.columns + side * half, size.rows, half, sums[side])
-            count = sums[0, 4] + sums[1, 4]
+                start = c * size.columns + side * half
+                x = y = z = total = number = np.float32(0)
+                for v in range(i * size.rows, min((i + 1) * size.rows, inverse.shape[0])):
+                    for j in range(start, min(start + half, inverse.shape[1])):
+                        # No branch, so that the compiler makes them vector instructions.
+                        one = np.float32(1) if inverse[v, j] > 0 else np.float32(0)
+                        x += one * rays[v, j, 0]
+                        y += one * rays[v, j, 1]
+                        z += one * rays[v, j, 2]
+                        total += inverse[v, j]
+                        number += one
+                sums[0, side], sums[1, side], sums[2, side] = x, y, z
+                sums[3, side], sums[4, side] = total, number
+            count = sums[4, 0] + sums[4, 1]
             if 2 * count < size.rows * size.columns:
                 continue
-            value = (sums[0, 3] + sums[1, 3]) / count
+            value = (sums[3, 0] + sums[3, 1]) / count
             cells.inverse[i, c] = value
             for k in range(3):
-                cells.ray[i, c, k] = (sums[0, k] + sums[1, k]) / count
-            ray = cells.ray[i, c]
+                mean[k] = (sums[k, 0] + sums[k, 1]) / count
+                cells.ray[i, c, k] = mean[k]
             for k in range(3):
-                cells.place[i, c, k] = _dot(axes[k], ray) / value
+                cells.place[i, c, k] = (
+                    axes[k, 0] * mean[0] + axes[k, 1] * mean[1] + axes[k, 2] * mean[2]
+                ) / value
             deviation = np.sqrt(random_variance(sensor, value * value))
             cells.error[i, c] = abs(cells.place[i, c, 0]) / value * deviation
-            if min(sums[0, 4], sums[1, 4]) * 4 >= size.rows * size.columns:
-                left, right = sums[0, 3], sums[1, 3]
-                up, ahead, across = (
-                    _dot(axes[0], sums[0]) / left - _dot(axes[0], sums[1]) / right,
-                    _dot(axes[1], sums[0]) / left - _dot(axes[1], sums[1]) / right,
-                    _dot(axes[2], sums[0]) / left - _dot(axes[2], sums[1]) / right,
-                )
-                cells.kink[i, c, 0] = abs(up)
-                cells.kink[i, c, 1] = np.sqrt(ahead * ahead + across * across)
+            if min(sums[4, 0], sums[4, 1]) * 4 >= size.rows * size.columns:
+                x, y = _apart(ahead, sums), _apart(across, sums)
+                cells.kink[i, c, 0] = abs(_apart(up, sums))
+                cells.kink[i, c, 1] = np.sqrt(x * x + y * y)
 
 
 @njit(cache=True, inline='always')
-def _sum(
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    row: int,
-    start: int,
-    rows: int,
-    columns: int,
-    total: NDArray[np.float32],
-) -> None:
-    """Sum what is measured in `rows` x `columns` pixels of row `row` of cells."""
-    x = y = z = value = count = np.float32(0)
-    for v in range(row * rows, min((row + 1) * rows, inverse.shape[0])):
-        for j in range(start, min(start + columns, inverse.shape[1])):
-            if inverse[v, j] > 0:
-                x += rays[v, j, 0]
-                y += rays[v, j, 1]
-                z += rays[v, j, 2]
-                value += inverse[v, j]
-                count += np.float32(1)
-    total[0], total[1], total[2], total[3], total[4] = x, y, z, value, count
-
-
-@njit(cache=True, inline='always')
-def _dot(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+def _apart(axis: NDArray[np.float32], sums: NDArray[np.float32]) -> np.float32:
+    """Along an axis, how far the left half of a cell is from the right one."""
+    left = axis[0] * sums[0, 0] + axis[1] * sums[1, 0] + axis[2] * sums[2, 0]
+    right = axis[0] * sums[0, 1] + axis[1] * sums[1, 1] + axis[2] * sums[2, 1]
+    return left / sums[3, 0] - right / sums[3, 1]

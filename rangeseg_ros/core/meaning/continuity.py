@@ -20,12 +20,14 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
 BASELINES = (1, 2, 4, 8, 16)
 """Rows between cells that are compared; neighbours are as far apart as four rows or more."""
+BROAD = 3
+"""Baseline of the noise that cells of a patch share."""
 # Baselines of the noise between the halves of a cell, its neighbours, and the next but one.
-_HALF, _NEXT, _SECOND = 2, 2, 3
+_HALF, _NEXT, _SECOND = 1, 1, 2
 # Standard deviations of the noise that a step must exceed: one in 16 000 by chance.
 _SIGNIFICANT = 4.0
 # Cells without a measurement that a surface may reach across.
-_GAP = 3
+_GAP = 2
 
 
 class Steps(NamedTuple):
@@ -57,19 +59,33 @@ def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
     -------
     (B,) float64, one for each of `BASELINES`.
     """
-    value = cells.inverse[:, ::2].astype(np.float64)
-    found: list[float] = []
-    for step in BASELINES:
-        a, b, c = (value[k * step : len(value) - (2 - k) * step : 3] for k in range(3))
-        whole = (a > 0) & (b > 0) & (c > 0) if len(value) > 2 * step else np.zeros(0, np.bool_)
-        if not whole.any():
-            found.append(found[-1] if found else 1.0)
-            continue
-        bend = np.abs(a - 2 * b + c)[whole] / np.sqrt(random_variance(sensor, b[whole] ** 2))
-        rank = int(0.4 * bend.size)
-        # Of a normal distribution, 40 % lie within 0.524 standard deviations.
-        found.append(float(np.partition(bend, rank)[rank]) / 0.524 / np.sqrt(6))
-    return np.maximum.accumulate(np.maximum(found, 0.05))
+    result: NDArray[np.float64] = _noise_of(cells.inverse, sensor)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _noise_of(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float64]:
+    rows, columns = inverse.shape
+    found = np.ones(len(BASELINES))
+    bends = np.empty(rows * columns)
+    for b in range(len(BASELINES)):
+        k, count = BASELINES[b], 0
+        for i in range(k, rows - k, 2):
+            for c in range(0, columns, 2):
+                above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]
+                if above > 0 and middle > 0 and below > 0:
+                    bend = above - 2 * middle + below
+                    bends[count] = bend * bend / random_variance(sensor, middle * middle)
+                    count += 1
+        if count:
+            rank = int(0.4 * count)
+            # Of a normal distribution, 40 % lie within 0.524 standard deviations.
+            found[b] = np.sqrt(np.partition(bends[:count], rank)[rank] / 6) / 0.524
+        elif b:
+            found[b] = found[b - 1]
+        # Never less than at shorter ones, nor than rounding makes.
+        found[b] = max(found[b], found[b - 1] if b else 0.05)
+    return found
 
 
 def surfaces_of(
@@ -91,7 +107,7 @@ def surfaces_of(
     steep, broken = (np.zeros(cells.error.shape, np.bool_) for _ in range(2))
     run_rows(_mark, cells.error.shape[1], cells, steps, steep, broken)
     # Noise hides parts of a step.
-    closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 7), np.uint8))
+    closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     steep = closed.view(np.bool_)
     return *join_cells(cells, steps, steep, broken), steep, broken
 
@@ -169,7 +185,7 @@ def join_cells(
     place, error = cells.place, cells.error
     rows, columns = error.shape
     factors = _SIGNIFICANT * np.sqrt(2.0) * steps.noise
-    parent = np.arange(rows * columns)
+    parent = np.arange(rows * columns, dtype=np.int32)
     for i in range(rows):
         for c in range(columns):
             if steep[i, c] or np.isnan(place[i, c, 0]):
@@ -178,7 +194,7 @@ def join_cells(
                 if broken[i, c] or i + k >= rows or steep[i + k, c]:
                     break
                 if not np.isnan(place[i + k, c, 0]):
-                    if not _step(place, error, factors[1], steps, i, c, i + k, c, True):
+                    if not _step(place, error, factors[0], steps, i, c, i + k, c, True):
                         _join(parent, i * columns + c, (i + k) * columns + c)
                     break
             # The one to the right, where the next but one agrees on either side.
@@ -206,7 +222,7 @@ def join_cells(
 
 
 @njit(cache=True, nogil=True)
-def _find(parent: NDArray[np.int64], i: int) -> int:
+def _find(parent: NDArray[np.int32], i: int) -> int:
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -214,7 +230,7 @@ def _find(parent: NDArray[np.int64], i: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _join(parent: NDArray[np.int64], i: int, k: int) -> None:
+def _join(parent: NDArray[np.int32], i: int, k: int) -> None:
     a, b = _find(parent, i), _find(parent, k)
     # The smaller root, so that the result does not depend on the order.
     parent[max(a, b)] = min(a, b)

@@ -18,7 +18,7 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import cofactors
 
 # Cells of a block, which is about square.
-_ROWS, _COLUMNS = 16, 2
+_ROWS, _COLUMNS = 8, 2
 # The prior counts as so much of a window full of ground: each of the about five levels leaves a
 # fifth of what the one before has left.
 _PRIOR = 0.25
@@ -45,7 +45,7 @@ def ground_field(
     levels = [_moments(cells.ray, cells.inverse, on_ground)]
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_halved(levels[-1]))
-    theta = np.asarray(base, np.float64)[None, None]
+    theta = np.array(base, np.float64).reshape(1, 1, 3)
     for sums in reversed(levels):
         theta = _fitted(sums, theta)
     return theta
@@ -57,39 +57,39 @@ def _moments(
 ) -> NDArray[np.float64]:
     """Sums over blocks: ray ray^T (6), ray * inverse (3) of the ground; ray ray^T of all (6)."""
     rows, columns = on_ground.shape
-    sums = np.zeros((-(-rows // _ROWS), -(-columns // _COLUMNS), 15))
-    for i in range(rows):
-        for c in range(columns):
-            value = inverse[i, c]
-            if value == 0:
-                continue
-            total = sums[i // _ROWS, c // _COLUMNS]
-            x, y, z = ray[i, c, 0], ray[i, c, 1], ray[i, c, 2]
-            xx, xy, xz, yy, yz, zz = x * x, x * y, x * z, y * y, y * z, z * z
-            total[9] += xx
-            total[10] += xy
-            total[11] += xz
-            total[12] += yy
-            total[13] += yz
-            total[14] += zz
-            if on_ground[i, c]:
-                total[0] += xx
-                total[1] += xy
-                total[2] += xz
-                total[3] += yy
-                total[4] += yz
-                total[5] += zz
-                total[6] += x * value
-                total[7] += y * value
-                total[8] += z * value
+    high, wide = -(-rows // _ROWS), -(-columns // _COLUMNS)
+    sums = np.zeros((high, wide, 15))
+    for m in range(high):
+        for n in range(wide):
+            total = sums[m, n]
+            for i in range(m * _ROWS, min((m + 1) * _ROWS, rows)):
+                for c in range(n * _COLUMNS, min((n + 1) * _COLUMNS, columns)):
+                    value = inverse[i, c]
+                    if value == 0:
+                        continue
+                    x, y, z = ray[i, c, 0], ray[i, c, 1], ray[i, c, 2]
+                    squares = (x * x, x * y, x * z, y * y, y * z, z * z)
+                    for k in range(6):
+                        total[9 + k] += squares[k]
+                    if on_ground[i, c]:
+                        for k in range(6):
+                            total[k] += squares[k]
+                        total[6] += x * value
+                        total[7] += y * value
+                        total[8] += z * value
     return sums
 
 
+@njit(cache=True, nogil=True)
 def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums of 2 x 2 neighbours."""
     rows, columns = sums.shape[:2]
-    padded = np.pad(sums, ((0, rows % 2), (0, columns % 2), (0, 0)))
-    return padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]
+    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, 15))
+    for i in range(rows):
+        for j in range(columns):
+            for k in range(15):
+                result[i // 2, j // 2, k] += sums[i, j, k]
+    return result
 
 
 @njit(cache=True, nogil=True)
@@ -160,59 +160,62 @@ class GroundField(NamedTuple):
 
 def cell_heights(cells: Cells, field: GroundField, size: CellSize) -> NDArray[np.float32]:
     """Heights of cells above the ground, metres along up; NaN where nothing is measured."""
-    result = np.full(cells.inverse.shape, np.nan, np.float32)
-    run_rows(_cell_heights, len(result), cells, field, size, result)
+    result = np.empty(cells.inverse.shape, np.float32)
+    # In units of cells, as if they were pixels.
+    small = field._replace(rows=field.rows // size.rows, columns=field.columns // size.columns)
+    run_rows(_cell_heights, len(result), cells, small, result)
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _cell_heights(
-    first: int,
-    after: int,
-    cells: Cells,
-    field: GroundField,
-    size: CellSize,
-    result: NDArray[np.float32],
+    first: int, after: int, cells: Cells, field: GroundField, result: NDArray[np.float32]
 ) -> None:
-    line = np.empty((field.theta.shape[1], 4))
+    planes = np.empty((4, result.shape[1]), np.float32)
+    spread = spread_planes(field, result.shape[1])
+    ray = cells.ray
     for i in range(first, after):
-        planes_of_row(field, (i + 0.5) * size.rows - 0.5, line)
+        planes_of_row(spread, (i + 0.5) / field.rows - 0.5, planes)
         for c in range(result.shape[1]):
             value = cells.inverse[i, c]
-            if value > 0:
-                x = (c + 0.5) * size.columns / field.columns - 0.5
-                result[i, c] = height_in_row(line, x, value, cells.ray[i, c])
+            along = (
+                planes[0, c] * ray[i, c, 0]
+                + planes[1, c] * ray[i, c, 1]
+                + planes[2, c] * ray[i, c, 2]
+            )
+            height = (along - value) / (value * planes[3, c])
+            result[i, c] = height if value > 0 else np.float32(np.nan)
 
 
-@njit(cache=True, inline='always')
-def planes_of_row(field: GroundField, row: float, line: NDArray[np.float64]) -> None:
-    """Planes theta of the ground at a row of the image, and theta . up, one for each block."""
+@njit(cache=True, nogil=True)
+def spread_planes(field: GroundField, width: int) -> NDArray[np.float32]:
+    """Planes of the ground at the columns of an image, (M, 4, width): theta, and theta . up."""
     theta, up = field.theta, field.up
-    y = min(max((row + 0.5) / field.rows - 0.5, 0.0), theta.shape[0] - 1.0)
-    i = int(y)
-    k, v = min(i + 1, theta.shape[0] - 1), y - i
-    for j in range(theta.shape[1]):
-        for n in range(3):
-            line[j, n] = (1 - v) * theta[i, j, n] + v * theta[k, j, n]
-        line[j, 3] = line[j, 0] * up[0] + line[j, 1] * up[1] + line[j, 2] * up[2]
+    last = theta.shape[1] - 1
+    result = np.empty((theta.shape[0], 4, width), np.float32)
+    for j in range(width):
+        x = min(max((j + 0.5) / field.columns - 0.5, 0.0), float(last))
+        k = int(x)
+        m, u = min(k + 1, last), x - k
+        for i in range(theta.shape[0]):
+            rise = 0.0
+            for n in range(3):
+                value = theta[i, k, n] + u * (theta[i, m, n] - theta[i, k, n])
+                result[i, n, j] = value
+                rise += value * up[n]
+            result[i, 3, j] = rise
+    return result
 
 
 @njit(cache=True, inline='always')
-def height_in_row(
-    line: NDArray[np.float64], x: float, inverse: float, ray: NDArray[np.float32]
-) -> float:
-    """Height of a point above the plane theta . p = 1 at x, in blocks, along up."""
-    x = min(max(x, 0.0), line.shape[0] - 1.0)
-    j = int(x)
-    k, u = min(j + 1, line.shape[0] - 1), x - j
-    theta = (
-        line[j, 0] + u * (line[k, 0] - line[j, 0]),
-        line[j, 1] + u * (line[k, 1] - line[j, 1]),
-        line[j, 2] + u * (line[k, 2] - line[j, 2]),
-    )
-    along = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]
-    rise = line[j, 3] + u * (line[k, 3] - line[j, 3])
-    return (along - inverse) / (inverse * rise)
+def planes_of_row(spread: NDArray[np.float32], y: float, planes: NDArray[np.float32]) -> None:
+    """Planes of the ground (4, width) at y, in rows of blocks, from those of `spread_planes`."""
+    y = min(max(y, 0.0), spread.shape[0] - 1.0)
+    i = int(y)
+    k, v = min(i + 1, spread.shape[0] - 1), np.float32(y - i)
+    for n in range(4):
+        for j in range(planes.shape[1]):
+            planes[n, j] = spread[i, n, j] + v * (spread[k, n, j] - spread[i, n, j])
 
 
 @njit(cache=True, inline='always')

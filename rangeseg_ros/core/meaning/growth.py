@@ -12,9 +12,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.meaning.continuity import Steps
+from rangeseg_ros.core.meaning.continuity import BROAD, Steps
 
-ROWS, COLUMNS = 4, 2
+ROWS, COLUMNS = 2, 2
 """Cells of a tile, along columns and rows."""
 # Tiles on either side of a tile whose mean must agree: about 20 x 48 pixels together, which is
 # wider than the correlation of a stereo camera's noise.
@@ -22,7 +22,7 @@ _BESIDE = (2, 1)
 # Tiles of a block: the window of a prediction is three blocks high and wide.
 _HIGH = 4
 # Cells that make a prediction: as many as two tiles have.
-_ENOUGH = 16
+_ENOUGH = 8
 # Spread of the ground's slope that a prediction starts from: that of undulation.
 _SLOPE = 0.05
 
@@ -69,6 +69,7 @@ def grown(
                 reach = np.sqrt(x * x + y * y)
                 distance[tile] = min(distance[tile], reach)
     order = np.argsort(distance, kind='mergesort')
+    total = np.empty(10)
     for turn in range(2):  # outwards, and back behind what stands in the way
         for k in range(len(order)):
             tile = order[k] if turn == 0 else order[len(order) - 1 - k]
@@ -82,6 +83,7 @@ def grown(
                     steps,
                     sums,
                     ground,
+                    total,
                 )
     return ground
 
@@ -96,19 +98,23 @@ def _grow_tile(
     steps: Steps,
     sums: NDArray[np.float64],
     ground: NDArray[np.bool_],
+    total: NDArray[np.float64],
 ) -> None:
     """Accept the cells of tile (m, n) that agree with the ground around it, if their mean does."""
-    total = np.zeros(10)
+    if not _open(m, n, candidate, ground):
+        return
     b = m // _HIGH
+    total[:] = 0
     for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
         for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
-            total += sums[i, j]
+            for k in range(10):
+                total[k] += sums[i, j, k]
     if total[9] < _ENOUGH:
         return
     w = total[0]
     x, y, h = total[1] / w, total[2] / w, total[6] / w
     # The weights are those of the sensor model, which the image shows to err by a factor.
-    prior = (steps.noise[-1] / _SLOPE) ** 2
+    prior = (steps.noise[BROAD] / _SLOPE) ** 2
     xx, xy, yy = (
         total[3] - w * x * x + prior,
         total[4] - w * x * y,
@@ -138,6 +144,16 @@ def _grow_tile(
                 expected = h + p * (place[i, c, 1] - x) + q * (place[i, c, 2] - y)
                 if abs(height[i, c] - expected) <= steps.least:
                     _add(sums, ground, height, cells, i, c)
+
+
+@njit(cache=True, inline='always')
+def _open(m: int, n: int, candidate: NDArray[np.bool_], ground: NDArray[np.bool_]) -> bool:
+    """Whether tile (m, n) has cells that may become ground."""
+    for i in range(m * ROWS, min((m + 1) * ROWS, ground.shape[0])):
+        for c in range(n * COLUMNS, min((n + 1) * COLUMNS, ground.shape[1])):
+            if candidate[i, c] and not ground[i, c]:
+                return True
+    return False
 
 
 @njit(cache=True, inline='always')

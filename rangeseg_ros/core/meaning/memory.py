@@ -13,8 +13,9 @@ from rangeseg_ros.core.meaning.ground import Terrain
 
 # How well the height is remembered, metres: a robot nods, and a floor undulates.
 _DOUBT = 0.05
-# From this confidence on a height is worth remembering.
-_SURE = 0.8
+# From this confidence on a height is worth remembering: most of the half that remains of it for a
+# surface which fills the view.
+_SURE = 0.4
 # Share of the newest image in what is remembered.
 _NEWEST = 0.2
 

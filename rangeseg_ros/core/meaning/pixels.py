@@ -9,8 +9,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import CellSize
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.ground_field import GroundField, height_in_row, planes_of_row
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.meaning.ground_field import GroundField, planes_of_row, spread_planes
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -25,7 +25,8 @@ class Said(NamedTuple):
     doubt : (...) float32
         Heights beyond it contradict that a pixel is ground, metres.
     unsure : (...) float32
-        The noise of a height: no deeper, nothing is claimed to be a drop, metres.
+        The noise of a pixel's height: where it is not higher, nothing is claimed to be an
+        obstacle, where it is not deeper, nothing to be a drop. Metres.
     """
 
     kind: NDArray[np.int8]
@@ -60,14 +61,14 @@ def pixels_of(
     heights : (H, W) float32
         Along up above the ground, metres; NaN where not measured.
     """
-    classes = np.zeros(image.shape, np.uint8)
-    heights = np.full(image.shape, np.nan, np.float32)
+    classes = np.empty(image.shape, np.uint8)
+    heights = np.empty(image.shape, np.float32)
     run_rows(_classify, len(said.kind), image.inverse, image.rays, field, size, said, bounds,
            classes, heights)  # fmt: skip
     return classes, heights
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _classify(
     first: int,
     after: int,
@@ -80,31 +81,55 @@ def _classify(
     classes: NDArray[np.uint8],
     heights: NDArray[np.float32],
 ) -> None:
-    """Of cells first...after along the columns.
+    """Of rows first...after of cells.
 
-    Ten parameters, as a kernel cannot return what several threads write.
+    Ten parameters, as a kernel cannot return what several threads write. The inner loops do the
+    same for every pixel, so that the compiler makes them vector instructions.
     """
-    line = np.empty((field.theta.shape[1], 4))
-    # Divisions would take as long as all the rest.
-    blocks, cells = 1 / field.columns, 1 / size.columns
-    for i in range(first * size.rows, min(after * size.rows, len(inverse))):
-        row = i // size.rows
-        planes_of_row(field, i, line)
-        for j in range(inverse.shape[1]):
-            value = inverse[i, j]
-            if value == 0:
-                continue
-            height = height_in_row(line, (j + 0.5) * blocks - 0.5, value, rays[i, j])
-            heights[i, j] = height
-            c = int((j + 0.5) * cells)
-            kind = said.kind[row, c]
-            if kind > GROUND:
-                classes[i, j] = kind
-            elif kind == GROUND and abs(height) < said.doubt[row, c]:
-                classes[i, j] = GROUND
-            elif height > bounds[0]:
-                classes[i, j] = OBSTACLE
-            elif height < -bounds[1]:
-                classes[i, j] = DROP if height < -said.unsure[row, c] else UNKNOWN
-            else:
-                classes[i, j] = GROUND
+    width = inverse.shape[1]
+    spread = spread_planes(field, width)
+    # Heights between which a pixel is ground, and beyond which it is a drop or an obstacle.
+    limits = np.empty((4, width), np.float32)
+    planes = np.empty((4, width), np.float32)
+    along = np.empty(width, np.float32)
+    for i in range(first, after):
+        planes_of_row(spread, ((i + 0.5) * size.rows) / field.rows - 0.5, planes)
+        _bound(said, i, size.columns, bounds, limits)
+        for v in range(i * size.rows, min((i + 1) * size.rows, len(inverse))):
+            for j in range(width):
+                along[j] = (
+                    planes[0, j] * rays[v, j, 0]
+                    + planes[1, j] * rays[v, j, 1]
+                    + planes[2, j] * rays[v, j, 2]
+                )
+            for j in range(width):
+                value = inverse[v, j]
+                height = (along[j] - value) / (value * planes[3, j])
+                heights[v, j] = height if value > 0 else np.float32(np.nan)
+            for j in range(width):
+                height = heights[v, j]
+                # All of them are false where nothing was measured.
+                classes[v, j] = (
+                    np.uint8((height >= limits[1, j]) & (height <= limits[2, j])) * GROUND
+                    + np.uint8(height > limits[3, j]) * OBSTACLE
+                    + np.uint8(height < limits[0, j]) * DROP
+                )
+
+
+@njit(cache=True, inline='always')
+def _bound(
+    said: Said, i: int, columns: int, bounds: tuple[float, float], limits: NDArray[np.float32]
+) -> None:
+    """Limits of the pixels of row i of cells."""
+    for c in range(said.kind.shape[1]):
+        kind, doubt, unsure = said.kind[i, c], said.doubt[i, c], said.unsure[i, c]
+        low, high = np.float32(-bounds[1]), np.float32(bounds[0])
+        if kind == GROUND:
+            low, high = min(low, -doubt), max(high, doubt)
+        drop, obstacle = min(low, -unsure), max(high, unsure)
+        if kind > GROUND:
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+            drop = high if kind == OBSTACLE else low
+            obstacle = drop
+        for j in range(c * columns, min((c + 1) * columns, limits.shape[1])):
+            limits[0, j], limits[1, j], limits[2, j], limits[3, j] = drop, low, high, obstacle

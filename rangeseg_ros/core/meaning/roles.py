@@ -10,13 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.stairs import RISE
+from rangeseg_ros.core.meaning.under_robot import TILT
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
-STEP = 0.25
-"""Height of the highest step that people climb, metres."""
-LEVEL = 3.0
-"""Slope that is a ramp and no error of a plane, degrees."""
 
 
 class RolesError(ValueError):
@@ -77,11 +75,11 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     if floor:
         offset = _offsets(planes, floor)
         found[upward & (offset > config.role_height)] = 'step'
-        found[upward & (offset > STEP)] = 'table'
+        found[upward & (offset > RISE[1])] = 'table'
         found[upward & (offset < -config.role_height)] = 'lower'
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
-        ramp = (slope > LEVEL) & (slope <= config.ground_slope)
+        ramp = (slope > np.degrees(2 * TILT)) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
             foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
             if foot <= config.role_height:

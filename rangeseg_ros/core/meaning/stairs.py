@@ -1,42 +1,39 @@
 """Stairs up and down: level surfaces that follow each other at the same rise and run.
 
-The treads in sight are heights above the ground that many level points have. The gradient of the
-height over them is the direction of the stairs, and their noses, the edges that the robot sees,
-lie one run apart along it.
+The rise is the period of the heights of level cells. Going outwards along a column of cells, the
+noses of the treads, their edges that the robot sees, are where one tread ends and the next one is:
+the number of a tread is a linear function of where its nose is, whose gradient is the direction of
+the stairs and one over the run.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import axes_of
 from rangeseg_ros.core.meaning.classes import GROUND
-from rangeseg_ros.core.meaning.ground import Terrain
-from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.meaning.ground import CellTerrain, Terrain
+from rangeseg_ros.core.meaning.under_robot import FEWEST
 
-# Rise and run of stairs, metres: what people climb, with a margin (ISO 21542 asks for 0.15 to 0.18
-# and 0.26 to 0.30).
-_RISE, _RUN = (0.08, 0.25), (0.2, 0.42)
+RISE, _RUN = (0.08, 0.25), (0.2, 0.42)
+"""Rise and run of stairs, metres: what people climb, with a margin.
+
+ISO 21542 asks for 0.15 to 0.18 and 0.26 to 0.30.
+"""
+# Tangents of the flattest and the steepest stairs: what is flatter is level.
+_FLATTEST, _STEEPEST = RISE[0] / _RUN[1], RISE[1] / _RUN[0]
 # Narrowest staircase, metres.
 _NARROWEST = 0.4
-# Largest relative difference between the rises, and the runs, of one staircase.
-_UNEVEN = 0.3
-# Parts of one tread differ in height by less, metres: half of the least rise.
-_LEVEL = 0.04
-# Quantile of the points of a tread at its nose, which noise blurs.
-_NOSE = 0.03
-# Points of a tread: of every other pixel along columns and rows.
-_FEWEST, _STRIDE = 20, 2
-# How many of these points apart heights are compared, and the tangent up to which that is level.
-_BESIDE, _STEEPEST = (1, 2), 0.25
-# How many times more points a tread has at its height than half a rise below.
-_CLEAR = 2.0
+# Treads and noses are within so much of a rise and a run of where they should be.
+_UNEVEN = 0.25
 # The histogram of heights: width of a bin, and its end, metres.
-_BIN, _HIGHEST = 0.01, 2.5
+_BIN, _HIGHEST = 0.005, 2.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +43,8 @@ class Stairs:
     Attributes
     ----------
     edge : (2, 3) float64
-        Ends of the first edge, as far as it is in sight, on the ground: the foot of the first
-        riser, or the edge that the stairs go down from. Metres, in the frame of the image.
+        Ends of the first edge, as wide as the stairs are in sight, on the ground: the foot of the
+        first riser, or the edge that the stairs go down from. Metres, in the frame of the image.
     width : float
         Length of the edge, metres.
     count : int
@@ -69,193 +66,227 @@ class Stairs:
         return f'{self.direction} {self.count} x {self.rise:.2f} / {self.run:.2f} m'
 
 
-class _Level(NamedTuple):
-    """Points of level surfaces: heights above the ground, and places on two horizontal axes."""
+class _Noses(NamedTuple):
+    """Noses of treads in the columns of cells.
 
-    height: NDArray[np.float64]
+    Attributes
+    ----------
+    number : (N,) int64
+        Of the tread; 0 for the edge of the ground.
+    place : (N, 2) float64
+        On two horizontal axes, metres.
+    """
+
+    number: NDArray[np.int64]
     place: NDArray[np.float64]
 
 
-def stairs_of(image: RangeImage, terrain: Terrain) -> list[Stairs]:
+def stairs_of(terrain: Terrain) -> list[Stairs]:
     """Staircases in sight: none or one up, none or one down.
 
     Parameters
     ----------
-    image : RangeImage
-        (H, W).
     terrain : Terrain
         The ground of the image.
     """
-    if not terrain.stand.surface:
+    cells = terrain.cells
+    if cells is None:
         return []
-    points = _level_points(image, terrain)
     found = []
     for sign in (1, -1):
-        levels = _levels(sign * points.height)
-        if sign > 0:  # nobody sees a tread from below
-            levels = levels[levels < terrain.stand.height(terrain.field.up)]
-        if len(levels) > 1 and (stairs := _staircase(points, sign * levels, terrain)):
+        # Nobody sees a tread from below.
+        highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST
+        level = _find_level(cells, sign, min(highest, _HIGHEST))
+        sums = np.bincount((level[level > 0] / _BIN).astype(np.int64), minlength=1)
+        rise, count = _find_rise(sums)
+        if count > 1 and (stairs := _staircase(cells, level, sign, rise, count, terrain)):
             found.append(stairs)
     return found
 
 
-def _level_points(image: RangeImage, terrain: Terrain) -> _Level:
-    """Every other pixel, along columns and rows, whose neighbours along up are as high."""
-    up = terrain.field.up
-    height = terrain.height[::_STRIDE, ::_STRIDE].astype(np.float64)
-    inverse = image.inverse[::_STRIDE, ::_STRIDE].astype(np.float64)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        place = image.rays[::_STRIDE, ::_STRIDE] @ axes_of(up)[1:].T / inverse[..., None]
-    off_ground = terrain.classes[::_STRIDE, ::_STRIDE] > GROUND
-    if abs(up[0]) > abs(up[1]):  # a camera on its side
-        height, place, off_ground = height.T, place.transpose(1, 0, 2), off_ground.T
-    level = np.zeros(height.shape, np.bool_)
-    for k in _BESIDE:
-        with np.errstate(invalid='ignore'):
-            way = np.linalg.norm(place[: -2 * k] - place[2 * k :], axis=-1)
-        # Also false where one of the two is not measured.
-        level[k:-k] |= np.abs(height[: -2 * k] - height[2 * k :]) < _STEEPEST * way
-    level &= off_ground & np.isfinite(height)
-    return _Level(height[level], place[level])
+@njit(cache=True, nogil=True)
+def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.float32]:
+    """Heights of level cells off the ground, times `sign`; 0 for all others.
 
-
-def _levels(height: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Heights of treads one rise apart, of the rise with the most of them; empty below two.
-
-    A tread has many points at its height, and few half a rise below.
+    Only those that can be of stairs which begin where the ground ends in their column: not nearer
+    than the steepest stairs are so high, not farther than the flattest.
     """
-    count = int(_HIGHEST / _BIN)
-    bins = np.floor(height / _BIN).astype(int)
-    sums = np.bincount(bins[(bins >= 0) & (bins < count)], minlength=count)
-    # Within half of _LEVEL of the middle of each bin.
-    near = np.convolve(sums, np.ones(int(_LEVEL / _BIN) + 1), 'same')
-    best, most = np.zeros(0), 0.0
-    for rise in np.arange(_RISE[0], _RISE[1], _BIN / 4):
-        at = np.arange(rise, _HIGHEST - _BIN, rise)
-        on, off = near[(at / _BIN).astype(int)], near[((at - rise / 2) / _BIN).astype(int)]
-        seen = (on >= _FEWEST) & (on >= _CLEAR * off)
-        treads = len(seen) if seen.all() else int(np.argmin(seen))
-        # Among rises with as many treads, the one that most points are of.
-        score = treads + on[:treads].sum() / (1 + on.sum())
-        if treads > 1 and score > most:
-            best, most = at[:treads], score
-    # As wide as the bins that were counted.
-    wide = _LEVEL / 2 + _BIN
-    return np.array([np.median(height[np.abs(height - level) < wide]) for level in best])
+    height, place, kind, unsure = cells.height, cells.place, cells.kind, cells.unsure
+    rows, columns = height.shape
+    level = np.zeros((rows, columns), np.float32)
+    for c in range(columns):
+        x = y = np.float32(np.nan)
+        for m in range(rows):
+            i = m if cells.turned else rows - 1 - m
+            h = sign * height[i, c]
+            if kind[i, c] == GROUND and abs(h) < RISE[0] / 2:
+                x, y = place[i, c, 1], place[i, c, 2]
+            # Also false where nothing is measured.
+            if not RISE[0] / 2 < h < highest or unsure[i, c] > _UNEVEN * RISE[1]:
+                continue
+            a, b = place[i, c, 1] - x, place[i, c, 2] - y
+            way = np.sqrt(a * a + b * b)
+            # Half as steep where the columns are at 60 degrees to the stairs. Also false where no
+            # ground was.
+            if not _FLATTEST / 2 * way - RISE[1] < h < _STEEPEST * way + RISE[1]:
+                continue
+            # A tread that is too thin to be measured is still seen between two risers.
+            for step in (-1, 1):
+                k = i + step
+                while 0 < k < rows - 1 and np.isnan(height[k, c]):
+                    k += step
+                if 0 <= k < rows:
+                    p, q = place[i, c, 1] - place[k, c, 1], place[i, c, 2] - place[k, c, 2]
+                    if abs(height[i, c] - height[k, c]) < _FLATTEST * np.sqrt(p * p + q * q):
+                        level[i, c] = h
+    return level
 
 
-def _staircase(points: _Level, levels: NDArray[np.float64], terrain: Terrain) -> Stairs | None:
-    """The staircase with treads at `levels`, negative below; None where the noses do not fit."""
-    down = levels[0] < 0
-    parts = [points.place[np.abs(points.height - level) < _LEVEL / 2] for level in levels]
-    places = np.concatenate(parts)
-    heights = np.repeat(levels, [len(part) for part in parts])
-    # The plane through all treads rises along the stairs; each tread counts alike.
-    weight = np.repeat([1 / len(part) for part in parts], [len(part) for part in parts])
-    ahead = _gradient(places, heights, weight) * (-1 if down else 1)
-    for _ in range(3):
-        ahead = _turned(ahead, parts, down)
+@njit(cache=True, nogil=True)
+def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
+    """The period of a histogram of heights, and how many periods there are from its start.
+
+    A tread has at least `FEWEST` cells, twice as many in the half of a period around its height
+    as in the other half, and is the better the nearer they are to it.
+    """
+    rise, count, most = 0.0, 0, 0.0
+    for k in range(int((RISE[1] - RISE[0]) / _BIN * 2) + 1):
+        period = RISE[0] / _BIN + k / 2  # in bins
+        score, treads = 0.0, 0
+        while (treads + 1.5) * period < len(sums) + period:
+            middle = (treads + 1) * period
+            on = off = 0
+            apart = 0.0
+            for b in range(int(middle - period / 2), min(int(middle + period / 2), len(sums))):
+                far = abs(b + 0.5 - middle)
+                if far <= _UNEVEN * period:
+                    on += sums[b]
+                    apart += far * sums[b]
+                else:
+                    off += sums[b]
+            if on < FEWEST or on < 2 * off:
+                break
+            treads += 1
+            score += 1 - apart / on / (_UNEVEN * period)
+        if score > most:
+            rise, count, most = period * _BIN, treads, score
+    return rise, count
+
+
+@njit(cache=True, nogil=True)
+def _find_noses(
+    cells: CellTerrain, level: NDArray[np.float32], up: bool, rise: float, count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
+    """Noses of treads, their places, and the number of each cell's tread; 0 elsewhere."""
+    place, kind, height = cells.place, cells.kind, cells.height
+    rows, columns = level.shape
+    number, found = np.zeros((rows, columns), np.int64), 0
+    numbers, places = np.empty(rows * columns, np.int64), np.empty((rows * columns, 2))
+    for c in range(columns):
+        # The cell measured before, and the farthest one of the tread or the ground that was last.
+        before, last, tread = -1, -1, 0
+        for m in range(rows):
+            i = m if cells.turned else rows - 1 - m
+            if np.isnan(place[i, c, 0]):
+                continue
+            k = int(level[i, c] / rise + 0.5)
+            if k > count or abs(level[i, c] - k * rise) > _UNEVEN * rise:
+                k = 0
+            number[i, c] = k
+            # Near its edge, the ground is not told as such.
+            if abs(height[i, c]) < _UNEVEN * rise and (kind[i, c] == GROUND or tread == 0):
+                last, tread = i, 0
+            elif k and last >= 0:
+                if k == tread + 1 and up:
+                    # The riser below is where the nose is, the tread begins behind it.
+                    numbers[found] = k
+                    places[found] = place[before, c, 1:]
+                    found += 1
+                elif k == tread + 1:
+                    numbers[found] = tread
+                    # Half a cell goes on behind its middle.
+                    inner = last + 1 if not cells.turned else last - 1
+                    for n in range(2):
+                        places[found, n] = place[last, c, 1 + n]
+                        if 0 <= inner < rows and not np.isnan(place[inner, c, 0]):
+                            step = place[last, c, 1 + n] - place[inner, c, 1 + n]
+                            places[found, n] += step / 2
+                    found += 1
+                if k >= tread:
+                    last, tread = i, k
+            before = i
+    return numbers[:found].copy(), places[:found].copy(), number
+
+
+def _staircase(
+    cells: CellTerrain,
+    level: NDArray[np.float32],
+    sign: int,
+    rise: float,
+    count: int,
+    terrain: Terrain,
+) -> Stairs | None:
+    """The staircase with so many treads of that rise; None where the noses do not fit."""
+    number, place, tread = _find_noses(cells, level, sign > 0, rise, count)
+    seen = _Noses(number, place)
+    first = int(sign > 0)
+    # Treads that follow each other, each with a nose but the landing at the foot of stairs down.
+    enough = np.bincount(number, minlength=count + 1) >= FEWEST
+    last = first
+    while last <= count and enough[last]:
+        last += 1
+    seen = _Noses(number[number < last], place[number < last])
+    if last - first < 2:
+        return None
+    fitted = _fit_noses(seen)
+    if fitted is None:
+        return None
+    start, ahead, run, fits = fitted
+    if not _RUN[0] <= run <= _RUN[1]:
+        return None
     across = np.array([-ahead[1], ahead[0]])
-    sides = np.quantile(parts[0] @ across, (0.02, 0.98))
-    noses, count = _noses([part @ ahead for part in parts], down)
-    if count < 2 or sides[1] - sides[0] < _NARROWEST:
-        return None
-    # Boxes of several heights stand side by side, treads one behind the other.
-    for part in parts[1:count]:
-        left, right = np.quantile(part @ across, (0.02, 0.98))
-        common = min(right, sides[1]) - max(left, sides[0])
-        if common < min(right - left, sides[1] - sides[0]) / 2:
+    sides = []
+    for k in range(first, last):
+        here = fits & (seen.number == k)
+        if here.sum() < FEWEST:
             return None
-    run = float(np.median(np.diff(noses)))
-    start = float(np.median(noses - run * np.arange(len(noses))))
-    number = np.arange(1, count + 1)
-    rise = float(np.abs(levels[:count]) @ number / (number @ number))
-    if not _RISE[0] <= rise <= _RISE[1]:
+        sides.append(np.quantile(seen.place[here] @ across, (0.02, 0.98)))
+    # Boxes of several heights stand side by side, treads one behind the other.
+    for (left, right), (low, high) in pairwise(sides):
+        if min(right, high) - max(left, low) < min(right - left, high - low) / 2:
+            return None
+    ends = sides[0]
+    if sign < 0:  # columns of cells that leave the stairs at their side see no nose there
+        ends = np.quantile(cells.place[tread == 1][:, 1:] @ across, (0.02, 0.98))
+    width = float(ends[1] - ends[0])
+    if width < _NARROWEST:
         return None
-    edge = start - run if down else start
-    ends = edge * ahead + np.outer(sides, across)
+    treads = last - first  # going down, there is one beyond each nose
+    levels = np.array([np.median(level[tread == k]) for k in range(1, treads + 1)])
+    steps = np.arange(1, treads + 1)
+    edge = (start + first * run) * ahead + np.outer(ends, across)
     return Stairs(
-        _on_ground(ends, terrain), float(np.diff(sides)[0]), count, rise, run,
-        'down' if down else 'up',
+        _on_ground(edge, terrain), width, treads, float(levels @ steps / (steps @ steps)), run,
+        'up' if sign > 0 else 'down',
     )  # fmt: skip
 
 
-def _gradient(
-    places: NDArray[np.float64], heights: NDArray[np.float64], weight: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Unit direction in which a plane through the points rises."""
-    design = np.column_stack([np.ones(len(places)), places]) * np.sqrt(weight)[:, None]
-    slope = np.linalg.lstsq(design, heights * np.sqrt(weight), rcond=None)[0][1:]
-    return slope / max(float(np.linalg.norm(slope)), 1e-9)
-
-
-def _noses(along: list[NDArray[np.float64]], down: bool) -> tuple[NDArray[np.float64], int]:
-    """Where the noses of treads are that follow each other at one run, and how many treads.
-
-    Going down, a tread's nose is its far end; the landing, whose end is elsewhere, counts as the
-    last tread.
-    """
-    first = _nose(along[0], down)
-    second = along[1]
-    if down:  # noise of what lies far beyond is at the same height
-        second = second[(second > first) & (second < first + 1.2 * _RUN[1])]
-    if len(second) < _FEWEST:
-        return np.array([first]), 0
-    noses = [first, _nose(second, down)]
-    run = noses[1] - noses[0]
-    if down and len(along) == 2:  # the second one may be the landing
-        run = noses[0] - _nose(along[0], False)
-        noses = noses[:1] if noses[1] - noses[0] > (1 + _UNEVEN) * run else noses
-    if not _RUN[0] <= run <= _RUN[1]:
-        return np.array(noses), 0
-    count = 2
-    for part in along[2:]:
-        ahead = part - noses[-1]
-        near = ahead < 1.5 * run if down else ahead > (1 - _UNEVEN) * run
-        here = part[near & (ahead > 0)]
-        if len(here) < _FEWEST:
-            break
-        nose = _nose(here, down)
-        regular = abs(nose - noses[-1] - run) <= _UNEVEN * run
-        if not regular and not down:
-            break
-        count += 1
-        if not regular:
-            break
-        noses.append(nose)
-    return np.array(noses), count
-
-
-def _nose(along: NDArray[np.float64], down: bool) -> float:
-    """Where a tread begins; going down, where it ends."""
-    return float(np.quantile(along, 1 - _NOSE if down else _NOSE))
-
-
-def _turned(
-    ahead: NDArray[np.float64], parts: list[NDArray[np.float64]], down: bool
-) -> NDArray[np.float64]:
-    """`ahead`, turned to be at a right angle to the noses."""
-    across = np.array([-ahead[1], ahead[0]])
-    slopes, weights = [], []
-    for part in parts[:-1] if down and len(parts) > 2 else parts:
-        side, along = part @ across, part @ ahead
-        bins = np.floor(side / 0.05).astype(int)
-        edge = [
-            (float(side[here].mean()), _nose(along[here], down))
-            for k in np.unique(bins)
-            if (here := bins == k).sum() >= 8
-        ]
-        if len(edge) < 5:
-            continue
-        x, y = np.array(edge).T
-        # The lines between all pairs: their median slope heeds no corners (Theil and Sen).
-        i, j = np.triu_indices(len(x), len(x) // 2)
-        slopes.append(float(np.median((y[j] - y[i]) / (x[j] - x[i]))))
-        weights.append(len(x))
-    if not slopes:
-        return ahead
-    turned = ahead - np.average(slopes, weights=weights) * across
-    return turned / float(np.linalg.norm(turned))
+def _fit_noses(
+    noses: _Noses,
+) -> tuple[float, NDArray[np.float64], float, NDArray[np.bool_]] | None:
+    """Where tread 0 has its nose, direction, run, and which noses fit; None if most do not."""
+    design = np.column_stack([np.ones(len(noses.place)), noses.place])
+    fits = np.ones(len(design), np.bool_)
+    for _ in range(4):
+        solved = np.linalg.lstsq(design[fits], noses.number[fits].astype(float), rcond=None)[0]
+        off = np.abs(design @ solved - noses.number)
+        fits = off <= max(_UNEVEN, float(np.median(off)))
+    fits = off <= _UNEVEN
+    slope = float(np.linalg.norm(solved[1:]))
+    if 2 * fits.sum() < len(fits) or slope == 0:
+        return None
+    ahead = solved[1:] / slope
+    return -float(solved[0]) / slope, ahead, 1 / slope, fits
 
 
 def _on_ground(ends: NDArray[np.float64], terrain: Terrain) -> NDArray[np.float64]:

@@ -18,8 +18,6 @@ from rangeseg_ros.core.description.planes import Plane
 _LARGEST = 40.0
 # How many times more pixels must speak for the planes' direction alone than for the stated one.
 _CLEARLY = 1.5
-# Share of the pixels of all planes that must agree with the planes' direction.
-_MOST = 0.5
 
 
 class Tilt(NamedTuple):
@@ -77,7 +75,7 @@ def tilt_of(
         seen = _agree(normals, normals[k], tolerance)
         # Walls that the camera would turn about agree with both.
         alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()
-        whole = pixels[seen].sum() >= _MOST * pixels.sum()
+        whole = 2 * pixels[seen].sum() >= pixels.sum()  # most of what is seen
         # The area last: it is worked out when asked for.
         if whole and alone[0] > _CLEARLY * alone[1] and planes[k].area >= area:
             found.append((float(alone[0]), k))

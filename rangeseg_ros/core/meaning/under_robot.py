@@ -14,11 +14,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells, axes_of
+from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 HEIGHT, TILT = 0.015, float(np.radians(1.5))
 """How well a robot knows its camera: standard deviations of height, metres, and tilt, radians."""
-FEWEST = 24
+FEWEST = 12
 """Cells that can be a ground: less is the foot of something."""
 # Metres of a surface, from where it begins, that tell its plane under the robot; fewer when the
 # ground begins with a ramp.
@@ -29,8 +30,6 @@ _FARTHER = 0.25
 _RAMP = 0.02
 # The squared deviation, in variances, from which what is known and what is seen contradict.
 _MISFIT = 25.0
-# Logarithm of a share of the probability that nobody would notice.
-_HOPELESS = 30.0
 # Largest surfaces that are looked at.
 _MOST = 32
 
@@ -45,7 +44,8 @@ class Stand(NamedTuple):
     theta : (3,) float64
         Plane of the ground under the robot.
     confidence : float
-        0...1: that it is this surface and no other one.
+        0...1: that it is this surface and no other one; and without a height that it is no
+        table: where more of its edge falls off than ends at what stands on it, less than 0.5.
     """
 
     surface: int
@@ -95,34 +95,18 @@ def stand(
     rank = np.full(len(sizes), -1)
     rank[order] = np.arange(len(order))
     sums = _sums(cells, surface, rank, reach, sensor, height)
-    horizontal = axes_of(up)[1:]
-    ramp = -np.log(_RAMP)
-    scores: list[float] = []
-    planes: list[NDArray[np.float64]] = []
-    for k, total in zip(order, sums, strict=True):
-        base = np.log(sizes[k]) - (reach[k] - reach[order].min()) / _FARTHER
-        if height == 0:
-            # A metre farther from below the sensor, for each metre of its height.
-            base -= steepest[k] / _FARTHER
-        best = -np.inf, np.zeros(3)
-        if scores and base < max(scores) - _HOPELESS:
-            scores.append(-np.inf)
-            planes.append(best[1])
-            continue
-        for way, tilt, rarity in ((0, TILT, 0.0), (0, slope, ramp), (1, TILT, ramp)):
-            spread = np.array([doubt or 1e3, tilt, tilt])
-            solved, misfit = _solved(total[way], spread)
-            below = height - solved[0]
-            if misfit < _MISFIT and below > 0.02:
-                theta = -(up - solved[1:] @ horizontal) / below
-                best = max(best, (base - misfit / 2 - rarity, theta), key=lambda found: found[0])
-        scores.append(best[0])
-        planes.append(best[1])
+    base = np.log(sizes[order]) - (reach[order] - reach[order].min()) / _FARTHER
+    if height == 0:
+        # A metre farther from below the sensor, for each metre of its height.
+        base -= steepest[order] / _FARTHER
+    scores, planes = _scores(sums, base, height, doubt or 1e3, slope)
     winner = int(np.argmax(scores))
     if scores[winner] == -np.inf:
         return Stand(0, np.zeros(3), 0.0)
-    share = np.exp(np.array(scores) - scores[winner])
-    return Stand(int(order[winner]), planes[winner], float(1 / share.sum()))
+    below, *tilt = planes[winner]
+    theta = -(up - np.array(tilt) @ axes_of(up)[1:]) / (height - below)
+    share = np.exp(scores - scores[winner])
+    return Stand(int(order[winner]), theta, float(1 / share.sum()))
 
 
 @njit(cache=True, nogil=True)
@@ -158,7 +142,7 @@ def _sums(
     measurement.
     """
     # Cells under the square of a Gaussian of the distortion's width; a cell has about 8 pixels.
-    patch = max(4 * np.pi * sensor.distortion_length**2 / 8, 1.0)
+    patch = max(4 * np.pi * sensor.distortion_length**2 / 16, 1.0)
     sums = np.zeros((rank.max() + 1, 2, 10))
     for i in range(surface.shape[0]):
         for c in range(surface.shape[1]):
@@ -185,16 +169,89 @@ def _sums(
     return sums
 
 
+@njit(cache=True, nogil=True)
+def _scores(
+    sums: NDArray[np.float64],
+    base: NDArray[np.float64],
+    height: float,
+    doubt: float,
+    slope: float,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Logarithms of the probabilities of surfaces, and what each errs by if it is the ground.
+
+    Parameters
+    ----------
+    sums : (K, 2, 10) float64
+        See `_sums`.
+    base : (K,) float64
+        Logarithms of the probabilities but for what is known.
+    height, doubt : float
+        Of the sensor, and its standard deviation, metres.
+    slope : float
+        Steepest ground, radians.
+
+    Returns
+    -------
+    scores : (K,) float64
+        -inf where what is known contradicts.
+    planes : (K, 3) float64
+        a, b, c.
+    """
+    scores = np.full(len(base), -np.inf)
+    planes = np.zeros((len(base), 3))
+    for k in range(len(base)):
+        # Level ground, a ramp, and a ramp that is left soon.
+        for way, tilt, rarity in ((0, TILT, 1.0), (0, slope, _RAMP), (1, TILT, _RAMP)):
+            a, b, c, misfit = _solved(sums[k, way], doubt, tilt)
+            score = base[k] - misfit / 2 + np.log(rarity)
+            # Nothing less than 2 cm below is a ground.
+            if misfit < _MISFIT and height - a > 0.02 and score > scores[k]:
+                scores[k] = score
+                planes[k, 0], planes[k, 1], planes[k, 2] = a, b, c
+    return scores, planes
+
+
+@njit(cache=True, nogil=True)
 def _solved(
-    total: NDArray[np.float64], spread: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], float]:
+    total: NDArray[np.float64], doubt: float, tilt: float
+) -> tuple[float, float, float, float]:
     """a, b, c with zero means and these standard deviations; what that costs beyond a free fit."""
-    one, x, y, xx, xy, yy = total[:6]
-    matrix = np.array([[one, x, y], [x, xx, xy], [y, xy, yy]])
-    vector = total[6:9]
-    solved = np.linalg.solve(matrix + np.diag(spread**-2.0), vector)
-    free = np.linalg.lstsq(matrix, vector, rcond=1e-12)[0]
+    a, b, c = solve_plane(total, doubt**-2.0, tilt**-2.0)
+    # Where the cells lie on a line, any plane through it.
+    least = 1e-12 * (total[0] + total[3] + total[5])
+    p, q, r = solve_plane(total, least, least)
     # Both residual sums, without what they have in common.
-    bound = solved @ matrix @ solved - 2 * solved @ vector + ((solved / spread) ** 2).sum()
-    misfit = bound - (free @ matrix @ free - 2 * free @ vector)
-    return solved, max(float(misfit), 0.0)
+    bound = _residual(total, a, b, c) + (a / doubt) ** 2 + (b * b + c * c) / tilt**2
+    return a, b, c, max(bound - _residual(total, p, q, r), 0.0)
+
+
+@njit(cache=True, nogil=True)
+def solve_plane(
+    total: NDArray[np.float64], first: float, others: float
+) -> tuple[float, float, float]:
+    """Coefficients a, b, c of the least-squares plane h = a + b x + c y, by Cramer's rule.
+
+    Parameters
+    ----------
+    total : (9,) float64 or more
+        Weighted sums of 1, x, y, x^2, xy, y^2, h, xh, yh.
+    first, others : float
+        Added to the diagonal: for a, for b and c.
+    """
+    a, b, c = total[0] + first, total[1], total[2]
+    d, e, f = total[3] + others, total[4], total[5] + others
+    x, y, z = total[6], total[7], total[8]
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+    return (
+        (aa * x + bb * y + cc * z) / determinant,
+        (bb * x + dd * y + ee * z) / determinant,
+        (cc * x + ee * y + ff * z) / determinant,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _residual(total: NDArray[np.float64], a: float, b: float, c: float) -> float:
+    """Sum of the weighted squares that a plane leaves, less that of the heights."""
+    square = total[0] * a * a + total[3] * b * b + total[5] * c * c
+    mixed = total[1] * a * b + total[2] * a * c + total[4] * b * c
+    return square + 2 * mixed - 2 * (total[6] * a + total[7] * b + total[8] * c)
