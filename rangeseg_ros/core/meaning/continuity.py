@@ -7,6 +7,7 @@ hangs together or not.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import cv2
@@ -38,14 +39,27 @@ class Steps(NamedTuple):
     slope : float
         Tangent of the steepest ground.
     least : float
-        Height that no neighbour on the ground differs by, metres.
+        What the ground may differ by from where it is expected, metres.
+    beside : float
+        Height that the ground does not fall by between neighbours, metres.
     noise : (B,) float64
         See `noise_of`.
     """
 
     slope: float
     least: float
+    beside: float
     noise: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, slope: float, step: float, noise: NDArray[np.float64], blur: float) -> Steps:
+        """What tells a step of the least height, metres, from ground.
+
+        Half of it is not the same ground. Where the sensor smooths a step as a Gaussian kernel of
+        a width of `blur` cells does, neighbours show a part of it.
+        """
+        shown = math.erf(_GAP / (2 * math.sqrt(2) * blur)) if blur > 0 else 1.0
+        return cls(slope, step / 2, shown * step / 2, noise)
 
 
 def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
@@ -173,7 +187,11 @@ def _step(
     chance = factor * max(error[i, c], error[k, m])
     allowed = steps.slope * way + chance
     if neighbours:
-        allowed = min(allowed, max(steps.least, chance))
+        # A step down, or along the view, is fatal where it is taken for a ramp; one up only hides.
+        farther = place[i, c, 1] ** 2 + place[i, c, 2] ** 2
+        farther -= place[k, m, 1] ** 2 + place[k, m, 2] ** 2
+        up = i != k and (place[i, c, 0] - place[k, m, 0]) * farther > 0
+        allowed = min(allowed, max(steps.least if up else steps.beside, chance))
     return rise > allowed
 
 

@@ -163,8 +163,8 @@ def _terrain(
     cells = cells_of(image, size, up, sensor)
     noise = noise_of(cells, sensor)
     least = min(limits.obstacle, limits.drop)
-    # Half of the least step: what differs more is not the same ground.
-    steps = Steps(float(np.tan(limits.slope + TILT)), least / 2, noise)
+    slope = float(np.tan(limits.slope + TILT))
+    steps = Steps.of(slope, least, noise, sensor.correlation / size.rows)
     surface, _, steep, broken = surfaces_of(cells, steps)
     under = stand(cells, surface, up, sensor, known, limits.slope)
     if under.surface == 0:
