@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.description.planes import fit_planes
+from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -173,3 +174,14 @@ def test_no_variance_is_negative():
     (plane,) = fit_planes(labels, image, SensorModel(0, 0, 0.33, 2, 0.0014, 0, 7))
     values = np.linalg.eigvalsh(plane.covariance)
     assert values[0] > -1e-9 * values[-1]
+
+
+def test_uniting_nothing_changes_no_covariance():
+    """Of 23 pixels across a hundredth of a degree A^-1 magnifies any rounding."""
+    camera = Camera(49, 12, 1e5, 1e5, 24, 5.5, 0.0, 'plumb_bob', (-0.2, 0.05, 0.001, 0, 0))
+    labels = np.zeros(camera.shape, np.uint16)
+    labels[5, :23] = 1
+    image = RangeImage.from_depth(np.full(camera.shape, 47.625), camera)
+    fits = Fits.of(labels, image, SensorModel(0.1, 0, 0.33, 2, 0.00145, 0, 35))
+    united = fits.united(np.arange(2), central=True)
+    assert np.array_equal(united.covariance, fits.covariance)

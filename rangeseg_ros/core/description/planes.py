@@ -12,7 +12,7 @@ from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits, symmetric
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwich
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
@@ -147,8 +147,7 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     normal = -theta * distance[:, None]
     surface = common_surfaces(fits)
     jacobian = plane_jacobians(normal, distance)
-    covariance = jacobian @ fits.covariance @ jacobian.transpose(0, 2, 1)
-    covariance = (covariance + covariance.transpose(0, 2, 1)) / 2  # rounding
+    covariance = sandwich(jacobian, fits.covariance)
 
     inliers = np.maximum(sums[:, COUNT], 1)
     centroid = sums[:, POINT:SCATTER] / inliers[:, None]

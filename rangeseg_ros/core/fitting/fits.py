@@ -14,6 +14,7 @@ from rangeseg_ros.core.fitting.interior import fill, interior
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
+    sandwich,
     systematic_field,
     theta_covariances,
 )
@@ -46,6 +47,8 @@ class Fits(NamedTuple):
         Of the sums of w r r^T.
     covariance : (M + 1, 3, 3) float64
         Of theta.
+    middle : (M + 1, 3, 3) float64
+        What stands in it between inverse and inverse.
     sensor : SensorModel
     systematic : Field
         Its systematic errors.
@@ -62,6 +65,7 @@ class Fits(NamedTuple):
     theta: NDArray[np.float64]
     inverse: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    middle: NDArray[np.float64]
     sensor: SensorModel
     systematic: Field
     inner: NDArray[np.uint16]
@@ -105,11 +109,11 @@ class Fits(NamedTuple):
         )
         sums = cells.regions()
         theta, inverse = _solved(sums, image.camera is not None)
-        covariance = theta_covariances(cells, theta, inverse, sensor)
+        covariance, middle = theta_covariances(cells, theta, inverse, sensor)
         systematic = systematic_field(sensor)
         parts, start = np.arange(len(theta)), np.arange(len(theta) + 1)
         counts = pixels, outliers, explained
-        planes = theta, inverse, covariance
+        planes = theta, inverse, covariance, middle
         return cls(cells, parts, start, *counts, *planes, sensor, systematic, inner)
 
     def united(self, group: NDArray[np.integer], central: bool) -> Fits:
@@ -125,8 +129,7 @@ class Fits(NamedTuple):
         count = int(group.max(initial=0)) + 1
         sums = _total(self.cells.regions(), group, count)
         theta, inverse = _solved(sums, central)
-        normal = symmetric(self.cells.regions()[:, :6])
-        middle = _total(normal @ self.covariance @ normal, group, count)
+        middle = _total(self.middle, group, count)
         for k in np.flatnonzero(np.bincount(group)[1:] > 1) + 1:
             for a, b in combinations(np.flatnonzero(group == k).tolist(), 2):
                 # The errors of two regions agree where they are smooth.
@@ -140,7 +143,8 @@ class Fits(NamedTuple):
             explained=_total(self.explained, group, count),
             theta=theta,
             inverse=inverse,
-            covariance=inverse @ middle @ inverse,
+            covariance=sandwich(inverse, middle),
+            middle=middle,
             inner=group.astype(np.uint16)[self.inner],
         )
 

@@ -55,8 +55,8 @@ def theta_covariances(
     theta: NDArray[np.float64],
     inverse: NDArray[np.float64],
     sensor: SensorModel,
-) -> NDArray[np.float64]:
-    """Covariance of each plane in the form theta . ray = inverse range.
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Covariance of each plane in the form theta . ray = inverse range, and the sum within it.
 
     Parameters
     ----------
@@ -71,17 +71,27 @@ def theta_covariances(
     Returns
     -------
     (M + 1, 3, 3) float64
-        Zeros where there is no plane.
+        The covariances; zeros where there is no plane.
+    (M + 1, 3, 3) float64
+        The sums over pairs of pixels between A^-1 and A^-1.
     """
     random = Field(
         sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
     )
     middle = _middles(cells, theta, sensor, random, systematic_field(sensor))
-    # By a root of it, so that no rounding that A^-1 magnifies makes a variance negative.
+    return sandwich(inverse, middle), middle
+
+
+def sandwich(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """outer middle outer^T, (N, m, m), of covariances `middle` (N, n, n).
+
+    By a root of them, so that no rounding that `outer` magnifies makes a variance negative.
+    """
     values, vectors = np.linalg.eigh(middle)
-    root = inverse @ (vectors * np.sqrt(np.maximum(values, 0))[:, None, :])
-    covariances: NDArray[np.float64] = root @ root.transpose(0, 2, 1)
-    return covariances
+    root = outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None, :])
+    product = root @ root.transpose(0, 2, 1)
+    result: NDArray[np.float64] = (product + product.transpose(0, 2, 1)) / 2
+    return result
 
 
 def plane_jacobians(
