@@ -26,7 +26,16 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     shifted_cost,
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
-from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, beyond, expand, fronts
+from rangeseg_ros.core.graphcut.expansion import (
+    CHUNK,
+    GridLabelling,
+    Sites,
+    are_alike,
+    band,
+    beyond,
+    expand,
+    fronts,
+)
 from rangeseg_ros.core.runtime.threads import run_rows, submit
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -193,34 +202,37 @@ def _take_nearest(
     side = 2 * _REACH + 1
     candidates, scale = np.empty(side * side, np.int32), np.empty(side * side)
     for bi in range(first, after):
+        top, bottom = bi * block, min((bi + 1) * block, height)
         for bj in range(columns):
-            count = 0
-            around = 0 if settled[bi, bj] else _REACH
-            for i in range(max(bi - around, 0), min(bi + around + 1, rows)):
-                for j in range(max(bj - around, 0), min(bj + around + 1, columns)):
+            left, right = bj * block, min((bj + 1) * block, width)
+            if settled[bi, bj]:
+                for i in range(top, bottom):
+                    for p in range(i * width + left, i * width + right):
+                        labels[p] = surfaces[bi, bj] if problem.weight[p] > 0 else 0
+                continue
+            count, last = 0, np.int32(0)
+            for i in range(max(bi - _REACH, 0), min(bi + _REACH + 1, rows)):
+                for j in range(max(bj - _REACH, 0), min(bj + _REACH + 1, columns)):
                     label = surfaces[i, j]
-                    known = label == 0
+                    if label in (np.int32(0), last):
+                        continue
+                    last, known = label, False
                     for k in range(count):
                         known |= candidates[k] == label
                     if not known:
                         candidates[count] = label
                         scale[count] = 1 + shift_at(models.shifts, label, bi, bj)
                         count += 1
-            for i in range(bi * block, min((bi + 1) * block, height)):
-                row = i * width
-                for p in range(row + bj * block, row + min((bj + 1) * block, width)):
+            for i in range(top, bottom):
+                for p in range(i * width + left, i * width + right):
                     if problem.weight[p] == 0:
                         continue
-                    if settled[bi, bj]:
-                        labels[p] = candidates[0]
-                        continue
-                    best, least = 0, np.float32(NO_PLANE)
+                    best, least = np.int32(0), np.float32(NO_PLANE)
                     for k in range(count):
-                        value = np.float32(
-                            shifted_cost(candidates[k], p, scale[k], problem, models)
-                        )
+                        label = candidates[k]
+                        value = np.float32(shifted_cost(label, p, scale[k], problem, models))
                         if value < least:
-                            best, least = candidates[k], value
+                            best, least = label, value
                     labels[p], cost[p] = best, least
 
 
@@ -247,15 +259,19 @@ def _descend(
     queue = np.empty(max(end - begin, 1), np.int32)
     queued = np.zeros(end - begin, np.bool_)
     waiting = 0
-    for p in range(max(begin - problem.width, 0), end):
-        for k in range(2):
-            q = p + offsets[k]
-            if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
-                for site in (p, q):
-                    if begin <= site < end and not queued[site - begin]:
-                        queue[waiting] = site
-                        queued[site - begin] = True
-                        waiting += 1
+    for chunk in range(max(begin - problem.width, 0), end, CHUNK):
+        stop = min(chunk + CHUNK, end)
+        if are_alike(labels, chunk, stop, problem.width):
+            continue
+        for p in range(chunk, stop):
+            for k in range(2):
+                q = p + offsets[k]
+                if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
+                    for site in (p, q):
+                        if begin <= site < end and not queued[site - begin]:
+                            queue[waiting] = site
+                            queued[site - begin] = True
+                            waiting += 1
     first, last = 0, waiting % len(queue)
     while waiting > 0:
         p = queue[first]

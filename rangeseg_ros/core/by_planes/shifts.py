@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -45,7 +46,6 @@ class Shifts(NamedTuple):
         )
 
 
-@njit(cache=True)
 def shifts(
     surfaces: NDArray[np.int32],
     blocks: NDArray[np.float64],
@@ -74,13 +74,10 @@ def shifts(
     """
     box = _boxes(surfaces, len(theta), reach)
     area = box[:, 2] * box[:, 3]
-    start = np.cumsum(area) - area
     values = np.zeros(area.sum(), np.float32)
-    inner = _inner(surfaces)
-    for k in range(1, len(theta)):
-        own = values[start[k] : start[k] + area[k]].reshape(box[k, 2], box[k, 3])
-        _shift(k, inner, blocks, theta[k], box[k], agreement, own)
-    return Shifts(box, start, values)
+    local = Shifts(box, np.cumsum(area) - area, values)
+    _find_shifts(local, _inner(surfaces), blocks, theta, agreement)
+    return local
 
 
 @njit(cache=True, inline='always')
@@ -102,6 +99,8 @@ def _boxes(surfaces: NDArray[np.int32], count: int, reach: int) -> NDArray[np.in
     for i in range(rows):
         for j in range(columns):
             k = surfaces[i, j]
+            if 0 < j < columns - 1 and surfaces[i, j - 1] == k == surfaces[i, j + 1]:
+                continue  # what is between two of the same row is in the box
             first[k, 0], first[k, 1] = min(first[k, 0], i), min(first[k, 1], j)
             after[k, 0], after[k, 1] = max(after[k, 0], i + 1), max(after[k, 1], j + 1)
     box = np.zeros((count, 4), np.intp)
@@ -113,21 +112,28 @@ def _boxes(surfaces: NDArray[np.int32], count: int, reach: int) -> NDArray[np.in
     return box
 
 
-@njit(cache=True)
 def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
     """Surfaces without the blocks beside others, which may hold pixels of these."""
-    rows, columns = surfaces.shape
-    inner = np.zeros_like(surfaces)
-    for i in range(rows):
-        for j in range(columns):
-            k = surfaces[i, j]
-            alone = k > 0
-            for u in range(max(i - 1, 0), min(i + 2, rows)):
-                for v in range(max(j - 1, 0), min(j + 2, columns)):
-                    alone &= surfaces[u, v] == k or surfaces[u, v] == 0
-            if alone:
-                inner[i, j] = k
-    return inner
+    exact = surfaces.astype(np.float32)
+    window = np.ones((3, 3), np.uint8)
+    least = cv2.erode(np.where(exact > 0, exact, np.float32(np.inf)), window)
+    return np.where(least == cv2.dilate(exact, window), surfaces, np.int32(0))
+
+
+@njit(cache=True, nogil=True)
+def _find_shifts(
+    local: Shifts,
+    inner: NDArray[np.int32],
+    blocks: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    agreement: float,
+) -> None:
+    """Shifts of all planes in their boxes."""
+    for k in range(1, len(theta)):
+        rows, columns = local.box[k, 2], local.box[k, 3]
+        own = local.values[local.start[k] : local.start[k] + rows * columns]
+        own = own.reshape(rows, columns)
+        _shift(k, inner, blocks, theta[k], local.box[k], agreement, own)
 
 
 @njit(cache=True)

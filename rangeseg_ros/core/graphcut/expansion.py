@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
 
-# Sites that are compared at a time.
-_CHUNK = 64
+CHUNK = 16
+"""Sites that are compared at a time."""
 
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
@@ -81,16 +81,9 @@ def fronts(
     room = 4 * (after - first)
     beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
     found = 0
-    begin, end = max(first - width, 0), min(after, len(labels) - width)
-    for chunk in range(begin, after, _CHUNK):
-        stop = min(chunk + _CHUNK, after)
-        # Most are alike: without branches, the compiler compares many at a time.
-        unlike = labels[chunk] ^ labels[chunk]
-        for p in range(chunk, min(stop, len(labels) - 1)):
-            unlike |= labels[p] ^ labels[p + 1]
-        for p in range(chunk, min(stop, end)):
-            unlike |= labels[p] ^ labels[p + width]
-        if unlike == 0:
+    for chunk in range(max(first - width, 0), after, CHUNK):
+        stop = min(chunk + CHUNK, after)
+        if are_alike(labels, chunk, stop, width):
             continue
         for p in range(chunk, stop):
             here = labels[p]
@@ -104,6 +97,21 @@ def fronts(
                         beside[found], sites[found] = labels[q], p
                         found += 1
     return group_sites(beside[:found], sites[:found], count)
+
+
+@njit(cache=True, nogil=True)
+def are_alike(labels: NDArray[np.int32], first: int, after: int, width: int) -> bool:
+    """Whether sites from `first` to before `after` have the labels of those right of and below
+    them, where there are any; `width` sites are in a row."""
+    # As views of their own, whose places are known not to be negative, many are compared at once.
+    here = labels[first:after]
+    right, below = labels[first + 1 : after + 1], labels[first + width : after + width]
+    unlike = here[0] ^ here[0]
+    for p in range(len(right)):
+        unlike |= here[p] ^ right[p]
+    for p in range(len(below)):
+        unlike |= here[p] ^ below[p]
+    return bool(unlike == 0)
 
 
 @njit(cache=True, nogil=True)
