@@ -200,7 +200,9 @@ def _sort(
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             # No pixel is farther off than all together.
             left = squares_left(blocks.moments[bi, bj], theta[label])
-            explained[bi, bj] = left <= _OUTLIER**2 * variance
+            explained[bi, bj] = left <= _OUTLIER**2 * variance or not _has_outliers(
+                bi * BLOCK, bj * BLOCK, inverse, rays, sensor, theta[label]
+            )
             if explained[bi, bj] and bi >= first_block and squared > 0:
                 count[0, label] += int(blocks.moments[bi, bj, COUNT])
                 record = sums[_SURE, cell_of(cells, label, bi * BLOCK, bj * BLOCK)]
@@ -232,6 +234,29 @@ def _sort(
             record = sums[kind, cell_of(cells, label, i, first)]
             add_pixels(record, i, first, j, inverse, rays, sensor, central)
     return count, sums
+
+
+@njit(cache=True)
+def _has_outliers(
+    top: int,
+    left: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    sensor: SensorModel,
+    theta: NDArray[np.float64],
+) -> bool:
+    """Whether any measured pixel of a whole block is beyond what its plane explains."""
+    found = False
+    # Without branches, so that the compiler takes many at a time.
+    for i in range(top, top + BLOCK):
+        for j in range(left, left + BLOCK):
+            y = float(inverse[i, j])
+            residual = y - theta[0] * rays[i, j, 0] - theta[1] * rays[i, j, 1]
+            residual -= theta[2] * rays[i, j, 2]
+            squared = y * y
+            variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+            found |= (y > 0) & (residual * residual > _OUTLIER**2 * variance)
+    return found
 
 
 @njit(cache=True, inline='always')
