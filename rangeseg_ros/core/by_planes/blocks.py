@@ -67,23 +67,30 @@ def _find_whole(
     size: int,
     result: NDArray[np.bool_],
 ) -> None:
-    """The same of some rows of blocks."""
+    """The same of some rows of blocks, from what the columns of a row of blocks hold."""
     height, width = inverse.shape
+    measured, across = np.empty(width, np.uint8), np.empty(width, np.bool_)
+    down = np.empty(width, np.bool_)
     for bi in range(first, after):
         bottom = min((bi + 1) * size, height)
+        measured[:], across[:], down[:] = 0, False, False
+        for i in range(bi * size, bottom):
+            for j in range(width):
+                measured[j] += inverse[i, j] > 0
+            for j in range(width - 1):
+                both = (inverse[i, j] > 0) & (inverse[i, j + 1] > 0)
+                across[j] |= both & (grid.right[i, j] == 0)
+            if i + 1 < bottom:
+                for j in range(width):
+                    both = (inverse[i, j] > 0) & (inverse[i + 1, j] > 0)
+                    down[j] |= both & (grid.below[i, j] == 0)
         for bj in range(result.shape[1]):
             right = min((bj + 1) * size, width)
-            whole, count = True, 0
-            for i in range(bi * size, bottom):
-                for j in range(bj * size, right):
-                    if inverse[i, j] == 0:
-                        continue
-                    count += 1
-                    if j + 1 < right and inverse[i, j + 1] > 0:
-                        whole &= grid.right[i, j] > 0
-                    if i + 1 < bottom and inverse[i + 1, j] > 0:
-                        whole &= grid.below[i, j] > 0
-            result[bi, bj] = whole and count >= _MEASURED * size * size
+            crossed, count = False, 0
+            for j in range(bj * size, right):
+                count += measured[j]
+                crossed |= down[j] | (across[j] & (j + 1 < right))
+            result[bi, bj] = not crossed and count >= _MEASURED * size * size
 
 
 def block_links(grid: Grid, size: int) -> Links:

@@ -54,34 +54,41 @@ def _find_steps(
     steps: NDArray[np.float32],
     slopes: NDArray[np.float32],
 ) -> None:
+    """The same of some rows of blocks, in loops without branches but where a block is not flat."""
     rows, columns = steps.shape
-    # Slopes of the flat blocks of three rows of blocks in turn.
-    slope = np.full((3, columns + 2), np.inf)
+    # Slopes of the flat blocks of three rows of blocks in turn, and those taken for one row.
+    flat, slope = np.full((3, columns + 2), np.inf), np.empty(columns)
     for i in range(first - 1, after + 1):
-        for j in range(columns):
-            is_flat = 0 <= i < rows and _is_flat(i, j, blocks, sensor)
-            slope[i % 3, j + 1] = blocks.slope[i, j] if is_flat else np.inf
+        flat[i % 3] = np.inf
+        if 0 <= i < rows:
+            _find_flat(i, blocks, sensor, flat[i % 3])
         if i <= first:
             continue
         for j in range(columns):
-            squared, own = blocks.squared[i - 1, j], slope[(i - 1) % 3, j + 1]
-            # The slope of a block that a jump crosses is the jump's: its neighbours' then.
-            if own == np.inf:
+            slope[j] = flat[(i - 1) % 3, j + 1]
+            if slope[j] == np.inf:
+                # That of a block that a jump crosses is the jump's: its neighbours' then.
                 for k in range(3):
                     for m in range(j, j + 3):
-                        own = min(own, slope[k, m])
-            if own == np.inf:
-                own = 0.0
-            variance = random_variance(sensor, squared) + sensor.pixel_noise**2 * own
+                        slope[j] = min(slope[j], flat[k, m])
+                if slope[j] == np.inf:
+                    slope[j] = 0.0
+        for j in range(columns):
+            squared = blocks.squared[i - 1, j]
+            variance = random_variance(sensor, squared) + sensor.pixel_noise**2 * slope[j]
             rounding = max(sensor.quantum, sensor.range_quantum * squared)
             steps[i - 1, j] = max(np.sqrt(factor * variance), 2.2 * rounding)
-            slopes[i - 1, j] = np.sqrt(own)
+            slopes[i - 1, j] = np.sqrt(slope[j])
 
 
-@njit(cache=True)
-def _is_flat(i: int, j: int, blocks: Blocks, sensor: SensorModel) -> bool:
-    """Whether noise explains what the plane of a block leaves."""
-    count = blocks.moments[i, j, COUNT]
-    variance = random_variance(sensor, blocks.squared[i, j])
-    variance += sensor.pixel_noise**2 * blocks.slope[i, j]
-    return count > 3 and blocks.residual[i, j] < ROUGH * variance * (count - 3)
+@njit(cache=True, nogil=True)
+def _find_flat(i: int, blocks: Blocks, sensor: SensorModel, flat: NDArray[np.float64]) -> None:
+    """Slopes of the blocks of a row of which noise explains what their planes leave.
+
+    `flat` has a margin of one; it keeps what it holds there and for the other blocks.
+    """
+    for j in range(blocks.squared.shape[1]):
+        count, slope = blocks.moments[i, j, COUNT], blocks.slope[i, j]
+        variance = random_variance(sensor, blocks.squared[i, j]) + sensor.pixel_noise**2 * slope
+        is_flat = (count > 3) & (blocks.residual[i, j] < ROUGH * variance * (count - 3))
+        flat[j + 1] = slope if is_flat else flat[j + 1]

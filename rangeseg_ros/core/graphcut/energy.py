@@ -55,7 +55,8 @@ def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
         the first pixel, where this counts from the end, there is a border as well.
     """
     height, width = len(grid.right), grid.below.shape[1]
-    result = np.zeros((2, height, width), np.float32)
+    result = np.empty((2, height, width), np.float32)
+    result[0, :, -1] = result[1, -1] = 0
     np.multiply(grid.right, np.float32(smoothness), out=result[0, :, :-1], casting='same_kind')
     np.multiply(grid.below, np.float32(smoothness), out=result[1, :-1], casting='same_kind')
     return result.reshape(2, -1)

@@ -214,7 +214,7 @@ _NEAREST, _FARTHEST = 1e-6, 1e6
 def _reciprocal(distance: NDArray, scale: float) -> NDArray[np.float32]:
     """1 / (scale * distance) in 1/m, 0 where that is no distance from 1 um to 1000 km."""
     if distance.dtype == np.uint16:
-        return _reciprocals(scale)[distance]
+        return _reciprocals(scale).take(distance)
     with np.errstate(divide='ignore', invalid='ignore', over='ignore'):
         metres = distance.astype(np.float64) * scale
         inverse = (1.0 / metres).astype(np.float32)
