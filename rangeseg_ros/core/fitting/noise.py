@@ -42,9 +42,9 @@ ROUGH = 2.7
 of a plane."""
 # The same with 9 degrees of freedom, of what one plane through four blocks leaves.
 _BENT = 3.1
-# Blocks of a scale that are looked at, about: a quantile of two hundred in each of `alike`'s sets
-# is off by 3 % of a standard deviation, and the mean of these by less than 1 %.
-_MOST = 4800
+# Blocks of a scale that are looked at, about: a quantile of fifty in each of `alike`'s sets is off
+# by 6 % of a standard deviation, and the mean of these by little more than 1 %.
+_MOST = 1200
 # Share of the pixels of the fullest block that a block needs to count.
 _SHARE = 0.5
 # Rounds of least squares that settle the weights.
