@@ -6,7 +6,7 @@ import shapely
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.evidence import Evidence
-from rangeseg_ros.core.mapping.map_outlines import unite_outlines
+from rangeseg_ros.core.mapping.map_outlines import unite_outlines, widened
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -98,9 +98,25 @@ def test_outlines_and_their_evidence_are_bounded_however_long_one_looks(kind):
         at = random.uniform(-3, 3, 2) if kind == 'same wall' else np.array([0.2 * n, 0.0])
         corners = at + random.uniform(-1, 1, (12, 2))
         part = shapely.MultiPoint(corners).convex_hull
-        outline = unite_outlines(outline, part, 0.05)
+        outline = unite_outlines(widened(outline, 0.025), part, 0.05)
         evidence.follow(outline)
         assert shapely.get_num_coordinates(outline) <= 400
         # Sides of cells are powers of two: up to four times as many, and those at borders.
         assert len(evidence.centres) <= 400
     assert outline.area > 10
+
+
+def test_what_is_widened_can_be_united():
+    # Of this outline with a narrow notch, the corners of the border that GEOS 3.14 draws cross.
+    notch = [
+        (1.45, 0.49),
+        (1.3893393874173412, 0.054875106286694),
+        (1.3901640133969233, 0.042876451067813),
+        (0.96, 0.0659501798),
+        (1.3911041020756671, 0.0291977649595514),
+        (1.3950271222734791, -0.0278838307404879),
+        (-0.84, -0.74),
+    ]
+    wide = widened(shapely.Polygon(notch), 0.015)
+    assert wide.is_valid
+    assert wide.union(shapely.box(1.3, -0.1, 1.5, 0.1)).area > wide.area

@@ -41,25 +41,27 @@ class Evidence:
         side = 2.0 ** math.ceil(math.log2(math.sqrt(max(outline.area, 1e-4) / _CELLS)))
         if side != self._side:
             self._side, self._keys, self.odds = side, np.zeros(0, np.int64), np.zeros(0)
+        left, low, right, high = outline.bounds if not outline.is_empty else (0, 0, -1, -1)
+        column = np.arange(math.floor(left / side), math.floor(right / side) + 2)
+        row = np.arange(math.floor(low / side), math.floor(high / side) + 2)
+        corner = shapely.contains_xy(outline, *np.meshgrid(column * side, row * side))
         # Borders are not as certain as what is within.
-        within = outline.buffer(-side / 2, join_style='mitre')
-        if within.is_empty:
-            within = outline
-        left, low, right, high = within.bounds if not within.is_empty else (0, 0, -1, -1)
-        column = np.arange(math.floor(left / side), math.floor(right / side) + 1)
-        row = np.arange(math.floor(low / side), math.floor(high / side) + 1)
-        cells = np.stack(np.meshgrid(column, row, indexing='ij'), axis=-1).reshape(-1, 2)
-        cells = cells[shapely.contains_xy(within, *((cells + 0.5) * side).T)]
+        whole = corner[:-1, :-1] & corner[1:, :-1] & corner[:-1, 1:] & corner[1:, 1:]
+        at = np.argwhere(whole)[:, ::-1]
+        cells = np.stack([column[at[:, 0]], row[at[:, 1]]], axis=1)
         if not len(cells) and not outline.is_empty:
-            # A sliver between the middles of cells.
+            # A sliver between the corners of cells.
             point = outline.representative_point()
             cells = np.floor([[point.x / side, point.y / side]]).astype(np.int64)
         keys = cells[:, 0] * 2**32 + cells[:, 1]
-        odds = np.full(len(keys), _HIT)
-        known = np.isin(keys, self._keys)
-        odds[known] = self.odds[np.searchsorted(self._keys, keys[known])]
         order = np.argsort(keys)
-        self._keys, self.odds = keys[order], odds[order]
+        keys = keys[order]
+        odds = np.full(len(keys), _HIT)
+        if len(self._keys):
+            place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
+            known = self._keys[place] == keys
+            odds[known] = self.odds[place[known]]
+        self._keys, self.odds = keys, odds
         self.centres = (cells[order] + 0.5) * side
 
     def remaining(self, outline: Polygon | MultiPolygon) -> Polygon | MultiPolygon:
@@ -74,9 +76,7 @@ class Evidence:
             around.append(
                 shapely.union_all(shapely.box(x - reach, y - reach, x + reach, y + reach))
             )
-        kept = areas(outline.intersection(around[0]).difference(around[1]))
-        self.follow(kept)
-        return kept
+        return areas(outline.intersection(around[0]).difference(around[1]))
 
 
 def see(evidence: Sequence[Evidence], found: NDArray[np.int8]) -> NDArray[np.intp]:

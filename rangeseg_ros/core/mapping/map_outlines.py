@@ -45,7 +45,12 @@ def polygon_of(
     """Polygon of rings (N, 2); empty when they enclose nothing."""
     if len(hull) < 3:
         return Polygon()
-    return areas(shapely.make_valid(Polygon(hull, [hole for hole in holes if len(hole) > 2])))
+    return valid(Polygon(hull, [hole for hole in holes if len(hole) > 2]))
+
+
+def valid(shape: shapely.Geometry) -> Polygon | MultiPolygon:
+    """A geometry whose borders do not cross themselves, the only kind that unions take."""
+    return shape if shape.is_valid else areas(shapely.make_valid(shape))
 
 
 def areas(shape: shapely.Geometry) -> Polygon | MultiPolygon:
@@ -56,32 +61,50 @@ def areas(shape: shapely.Geometry) -> Polygon | MultiPolygon:
     return MultiPolygon(parts)
 
 
+def widened(outline: shapely.Geometry, by: float) -> Polygon | MultiPolygon:
+    """An outline and what is as near (metres); without its border where that is negative."""
+    # Corners of narrow notches may cross (GEOS 3.14).
+    return valid(outline.buffer(by, join_style='mitre'))
+
+
 def unite_outlines(
-    outline: Polygon | MultiPolygon, seen: Polygon | MultiPolygon, resolution: float
+    around: shapely.Geometry, seen: Polygon | MultiPolygon, resolution: float
 ) -> Polygon | MultiPolygon:
     """Union of outlines without details smaller than `resolution` (metres).
 
     Gaps narrower than that are closed and smaller holes and parts left out, and the
     border is followed within a quarter of it; where it has many corners still, less closely.
+
+    Parameters
+    ----------
+    around : shapely geometry
+        The outline so far, `widened` by half of the resolution.
+    seen : shapely geometry
+        What is added.
+    resolution : float
     """
-    grown = outline.union(seen).buffer(resolution / 2, join_style='mitre')
-    return simplify(grown.buffer(-resolution / 2, join_style='mitre'), resolution)
+    grown = around.union(widened(seen, resolution / 2))
+    return simplify(widened(grown, -resolution / 2), resolution)
 
 
 def simplify(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPolygon:
     """An outline without details smaller than `resolution`, of a bounded number of corners."""
     least = resolution**2
     while True:
-        simple = areas(outline.simplify(resolution / 4))
-        parts = [
-            Polygon(part.exterior, [r for r in part.interiors if Polygon(r).area >= least])
-            for part in shapely.get_parts(simple)
-            if part.area >= least
-        ]
-        result = parts[0] if len(parts) == 1 else MultiPolygon(parts)
+        parts = shapely.get_parts(outline.simplify(resolution / 4))
+        parts = parts[shapely.area(parts) >= least]
+        parts = [_filled(part, least) for part in parts.tolist()]
+        result = parts[0] if len(parts) == 1 else shapely.multipolygons(parts)
         if shapely.get_num_coordinates(result) <= _CORNERS:
             return result
         resolution, least = 2 * resolution, 4 * least
+
+
+def _filled(part: Polygon, least: float) -> Polygon:
+    """A polygon without its holes smaller than `least` (square metres)."""
+    if not shapely.get_num_interior_rings(part):
+        return part
+    return Polygon(part.exterior, [r for r in part.interiors if Polygon(r).area >= least])
 
 
 def rings(outline: Polygon | MultiPolygon) -> list[list[NDArray[np.float64]]]:

@@ -63,9 +63,9 @@ class Record:
     confidence: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
-    margin: shapely.Geometry | None = None
+    margin: shapely.Geometry = field(default_factory=shapely.Polygon)
     seen: int = 0
-    united: int | None = None
+    united: int = 0
     frames: int = 0
     looks: int = 0
     evidence: Evidence = field(default_factory=Evidence)
@@ -74,10 +74,6 @@ class Record:
     def confirmed(self) -> bool:
         """Whether it was seen often enough to be part of the map."""
         return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
-
-    def waited(self, now: int) -> float:
-        """Nanoseconds since something was added to the outline."""
-        return np.inf if self.united is None else now - self.united
 
     def add(self, plane: Plane, stamp: int, now: int) -> None:
         """Take in a plane of a frame."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
-from rangeseg_ros.core.mapping.plane_errors import cross_matrices, tangents
+from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
@@ -29,7 +29,7 @@ ANOTHER = 0.7
 # residue of bands, grazing views and ragged borders: that of `fitting.coplanar`.
 RESIDUE = 2.5
 # Samples along a side of a cell of the image, see `views`.
-_SAMPLES = 16
+_SAMPLES = 8
 
 
 class PoseNoise(NamedTuple):
@@ -115,13 +115,15 @@ def _unexplained(
     one, and may shift and tilt it by their share of the residual.
     """
     share = np.array([(1 - p.confidence) * p.rms**2 for p in planes])
-    radius = np.sqrt(np.maximum([p.area for p in planes], 1e-4) / np.pi)
-    turned = np.zeros((len(planes), 4, 3))
-    axes = tangents(normal)
-    turned[:, :3, :2] = axes.transpose(0, 2, 1) / radius[:, None, None]
-    turned[:, 3, :2] = -(axes @ centroid[..., None])[..., 0] / radius[:, None]
-    turned[:, 3, 2] = 1
-    result: NDArray[np.float64] = share[:, None, None] * turned @ turned.transpose(0, 2, 1)
+    area = np.maximum([p.area for p in planes], 1e-4) / np.pi
+    # A tilt about any axis in the plane turns the normal and moves the origin along.
+    across = (np.eye(3) - normal[:, :, None] * normal[:, None]) / area[:, None, None]
+    moved = -(across @ centroid[..., None])[..., 0]
+    result = np.empty((len(planes), 4, 4))
+    result[:, :3, :3] = across
+    result[:, :3, 3] = result[:, 3, :3] = moved
+    result[:, 3, 3] = 1 - (moved * centroid).sum(axis=1)
+    result *= share[:, None, None]
     return result
 
 

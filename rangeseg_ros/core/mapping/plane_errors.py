@@ -12,11 +12,18 @@ from numpy.typing import NDArray
 
 
 def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3)."""
-    across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = _cross(across, normal)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, _cross(normal, first)], axis=1)
+    """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3).
+
+    Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
+    """
+    x, y, z = normal.T
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    axes = np.empty((len(normal), 2, 3))
+    axes[:, 0, 0], axes[:, 0, 1], axes[:, 0, 2] = 1 + sign * x * x * a, sign * b, -sign * x
+    axes[:, 1, 0], axes[:, 1, 1], axes[:, 1, 2] = b, sign + y * y * a, -y
+    return axes
 
 
 def to_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,7 +12,13 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.evidence import see
-from rangeseg_ros.core.mapping.map_outlines import areas, polygon_of, simplify, unite_outlines
+from rangeseg_ros.core.mapping.map_outlines import (
+    polygon_of,
+    simplify,
+    unite_outlines,
+    valid,
+    widened,
+)
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, described
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -33,9 +40,9 @@ _PROBATION = 3 * 10**9
 # Largest offset, as share of the range, of what may be one plane: beyond is no error of the sensor
 # but another plane, however uncertain both are; so it is beyond `SURE_TURN`.
 _FARTHEST = 0.1
-# Nanoseconds between unions of an outline, and unions in a frame: twice a second follows what a
-# hand or a robot shows, and the work does not grow with the number of planes in sight.
-_UNION_INTERVAL, _UNIONS = 500_000_000, 2
+# Share of the planes in sight whose outlines a frame adds to: at 30 Hz each has its turn four
+# times a second, and the work in a frame is bounded.
+_LOOKED_AT = 1 / 8
 
 
 class PlaneMap:
@@ -170,10 +177,8 @@ class PlaneMap:
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp, self._time)
         # The new ones first, then those that wait the longest.
-        waited = {k: self._records[k].waited(self._time) for k in np.unique(match).tolist()}
-        due = [k for k, time in waited.items() if time >= _UNION_INTERVAL]
-        due.sort(key=lambda k: -waited[k])
-        for k in due[: max(_UNIONS, len(new))]:
+        due = sorted(set(match.tolist()), key=lambda k: (self._records[k].united, k))
+        for k in due[: max(math.ceil(_LOOKED_AT * len(due)), len(new))]:
             self._records[k].united = self._time
             for part in np.flatnonzero(match == k).tolist():
                 self._unite(k, planes[part], pose)
@@ -189,7 +194,7 @@ class PlaneMap:
 
         part = polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes])
         # Corners of pixels are finer than the map, and cost time in every step that follows.
-        self._grow(k, areas(part.simplify(self.config.map_resolution / 4)))
+        self._grow(k, part.simplify(self.config.map_resolution / 4))
 
     def _merge(self, camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with those that have just grown."""
@@ -224,19 +229,26 @@ class PlaneMap:
         point, axes = filters.point, filters.axes
         turn = axes[target] @ axes[source].T
         shift = axes[target] @ (point[source] - point[target])
-        return shapely.transform(self._records[source].outline, lambda xy: xy @ turn.T + shift)
+        across = shapely.transform(self._records[source].outline, lambda xy: xy @ turn.T + shift)
+        # Corners that touched may cross by what rounding turns them by.
+        return valid(across)
 
     def _grow(self, k: int, part: shapely.Geometry) -> None:
         record, resolution = self._records[k], self.config.map_resolution
-        if record.margin is not None and shapely.covers(record.margin, part):
-            return
+        # What reaches no farther is no detail of the map: most looks show nothing new.
+        inner = widened(part, -resolution / 2)
         if record.outline.is_empty:
             record.outline = simplify(part, resolution)
+        elif inner.is_empty or shapely.covers(record.margin, inner):
+            return
         else:
-            record.outline = unite_outlines(record.outline, part, resolution)
+            record.outline = unite_outlines(record.margin, part, resolution)
+        self._follow(record)
+
+    def _follow(self, record: Record) -> None:
+        """Have what goes with an outline follow it."""
         record.evidence.follow(record.outline)
-        # What reaches no farther is no detail of the map: most looks show nothing new.
-        record.margin = record.outline.buffer(resolution / 2, join_style='mitre')
+        record.margin = widened(record.outline, self.config.map_resolution / 2)
         shapely.prepare(record.margin)
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
@@ -268,7 +280,7 @@ class PlaneMap:
         for k in see(evidence, found).tolist():
             record = self._records[k]
             record.outline = record.evidence.remaining(record.outline)
-            record.margin = None
+            self._follow(record)
         kept = [
             not r.outline.is_empty and (r.confirmed or self._time - r.seen < _PROBATION)
             for r in self._records
