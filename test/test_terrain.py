@@ -81,13 +81,13 @@ def test_below_a_drop_is_no_ground(depth, height):
 def test_a_step_down_that_the_sensor_smooths_is_one(falls, blur, levels):
     """Over the same way a ramp that is allowed falls as much; one up is given that chance."""
     rows, columns = 40, 6
-    place = np.zeros((rows, columns, 3), np.float32)
+    place = np.zeros((3, rows, columns), np.float32)
     far = np.arange(rows)[::-1, None]  # the first row is farthest
-    place[..., 0] = -falls * 0.05 * ndtr((far - rows / 2) / 2)
-    place[..., 1] = 2 + 0.05 * far
-    place[..., 2] = 0.02 * np.arange(columns)
+    place[0] = -falls * 0.05 * ndtr((far - rows / 2) / 2)
+    place[1] = 2 + 0.05 * far
+    place[2] = 0.02 * np.arange(columns)
     flat = np.zeros((rows, columns), np.float32)
-    cells = Cells(place, flat + 1, place, flat + 1e-6, np.zeros((rows, columns, 2), np.float32))
+    cells = Cells(place, flat + 1, place, flat + 1e-6, np.zeros((2, rows, columns), np.float32))
     slope = float(np.tan(np.radians(13.5)))
     _, count, _, _ = surfaces_of(cells, Steps.of(slope, 0.05, np.ones(len(BASELINES)), blur))
     assert count == levels

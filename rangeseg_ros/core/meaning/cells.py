@@ -38,16 +38,16 @@ class Cells(NamedTuple):
 
     Attributes
     ----------
-    ray : (..., 3) float32
+    ray : (3, ...) float32
         Mean ray of the measured pixels.
     inverse : (...) float32
         Their mean inverse range, 1/m; 0 where less than half of them are measured.
-    place : (..., 3) float32
+    place : (3, ...) float32
         Height above the sensor along up, and position along two horizontal directions, metres;
         NaN where not measured.
     error : (...) float32
         Standard deviation of the height, metres, by the sensor model for one pixel.
-    kink : (..., 2) float32
+    kink : (2, ...) float32
         Difference of height between the left and the right half, and the way between them,
         metres.
     """
@@ -63,8 +63,10 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3, 3) up and two horizontal directions, the first along the optical axis if it can be."""
     axis = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.9 else np.array([0.0, -1.0, 0.0])
     flat = axis - (axis @ up) * up
-    ahead = flat / np.linalg.norm(flat)
-    return np.stack([up, ahead, np.cross(up, ahead)])
+    x, y, z = up
+    a, b, c = ahead = flat / np.linalg.norm(flat)
+    # The cross product, which numpy takes longer for than for all cells.
+    return np.array([up, ahead, (y * c - z * b, z * a - x * c, x * b - y * a)])
 
 
 def cells_of(
@@ -83,13 +85,8 @@ def cells_of(
     """
     height, width = image.shape
     shape = -(-height // size.rows), -(-width // size.columns)
-    cells = Cells(
-        np.zeros((*shape, 3), np.float32),
-        np.zeros(shape, np.float32),
-        np.full((*shape, 3), np.nan, np.float32),
-        np.zeros(shape, np.float32),
-        np.zeros((*shape, 2), np.float32),
-    )
+    single, several = (np.empty((n, *shape), np.float32) for n in (2, 8))
+    cells = Cells(several[:3], single[0], several[3:6], single[1], several[6:])
     axes = axes_of(up).astype(np.float32)
     run_rows(_means, shape[0], image.inverse, image.rays, size, axes, sensor, cells)
     return cells
@@ -106,50 +103,104 @@ def _means(
     sensor: SensorModel,
     cells: Cells,
 ) -> None:
-    half = size.columns // 2
-    # Of the left and the right half of a cell: sums of rays and inverse ranges, and their number.
-    sums = np.zeros((5, 2), np.float32)
-    mean = np.zeros(3, np.float32)
-    up, ahead, across = axes[0], axes[1], axes[2]
+    width = inverse.shape[1]
+    # Of the pixels of a column: the sum of their inverse ranges, and how many are measured.
+    total, number = np.empty((2, cells.inverse.shape[1] * size.columns), np.float32)
+    # Of the left and the right halves: sums of rays and inverse ranges, and their number.
+    sums = np.empty((5, 2, cells.inverse.shape[1]), np.float32)
     for i in range(first, after):
-        for c in range(cells.inverse.shape[1]):
-            for side in range(2):
-                start = c * size.columns + side * half
-                x = y = z = total = number = np.float32(0)
-                for v in range(i * size.rows, min((i + 1) * size.rows, inverse.shape[0])):
-                    for j in range(start, min(start + half, inverse.shape[1])):
-                        # No branch, so that the compiler makes them vector instructions.
-                        one = np.float32(1) if inverse[v, j] > 0 else np.float32(0)
-                        x += one * rays[v, j, 0]
-                        y += one * rays[v, j, 1]
-                        z += one * rays[v, j, 2]
-                        total += inverse[v, j]
-                        number += one
-                sums[0, side], sums[1, side], sums[2, side] = x, y, z
-                sums[3, side], sums[4, side] = total, number
-            count = sums[4, 0] + sums[4, 1]
-            if 2 * count < size.rows * size.columns:
-                continue
-            value = (sums[3, 0] + sums[3, 1]) / count
-            cells.inverse[i, c] = value
-            for k in range(3):
-                mean[k] = (sums[k, 0] + sums[k, 1]) / count
-                cells.ray[i, c, k] = mean[k]
-            for k in range(3):
-                cells.place[i, c, k] = (
-                    axes[k, 0] * mean[0] + axes[k, 1] * mean[1] + axes[k, 2] * mean[2]
-                ) / value
-            deviation = np.sqrt(random_variance(sensor, value * value))
-            cells.error[i, c] = abs(cells.place[i, c, 0]) / value * deviation
-            if min(sums[4, 0], sums[4, 1]) * 4 >= size.rows * size.columns:
-                x, y = _apart(ahead, sums), _apart(across, sums)
-                cells.kink[i, c, 0] = abs(_apart(up, sums))
-                cells.kink[i, c, 1] = np.sqrt(x * x + y * y)
+        top, bottom = i * size.rows, min((i + 1) * size.rows, inverse.shape[0])
+        total[:], number[:], sums[:] = 0, 0, 0
+        for v in range(top, bottom):
+            for j in range(width):
+                total[j] += inverse[v, j]
+                number[j] += np.float32(1) if inverse[v, j] > 0 else np.float32(0)
+        _add_halves(top, bottom, inverse, rays, size, total, number, sums)
+        _divide(i, sums, size, axes, sensor, cells)
 
 
 @njit(cache=True, inline='always')
-def _apart(axis: NDArray[np.float32], sums: NDArray[np.float32]) -> np.float32:
-    """Along an axis, how far the left half of a cell is from the right one."""
-    left = axis[0] * sums[0, 0] + axis[1] * sums[1, 0] + axis[2] * sums[2, 0]
-    right = axis[0] * sums[0, 1] + axis[1] * sums[1, 1] + axis[2] * sums[2, 1]
-    return left / sums[3, 0] - right / sums[3, 1]
+def _add_halves(
+    top: int,
+    bottom: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    size: CellSize,
+    total: NDArray[np.float32],
+    number: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Sums of half cells between rows of the image, from those of its columns."""
+    half = size.columns // 2
+    whole = np.float32(size.rows * half)
+    for side in range(2):
+        for u in range(half):
+            for c in range(sums.shape[2]):
+                sums[3, side, c] += total[c * size.columns + side * half + u]
+            for c in range(sums.shape[2]):
+                sums[4, side, c] += number[c * size.columns + side * half + u]
+    for c in range(sums.shape[2]):
+        for side in range(2):
+            left = c * size.columns + side * half
+            right = min(left + half, inverse.shape[1])
+            if sums[4, side, c] == whole:
+                # Over so few pixels rays change evenly.
+                for k in range(3):
+                    corners = rays[top, left, k] + rays[bottom - 1, right - 1, k]
+                    sums[k, side, c] = corners * np.float32(0.5) * whole
+                continue
+            for v in range(top, bottom):
+                for j in range(left, right):
+                    if inverse[v, j] > 0:
+                        for k in range(3):
+                            sums[k, side, c] += rays[v, j, k]
+
+
+@njit(cache=True, inline='always')
+def _divide(
+    i: int,
+    sums: NDArray[np.float32],
+    size: CellSize,
+    axes: NDArray[np.float32],
+    sensor: SensorModel,
+    cells: Cells,
+) -> None:
+    """Row i of cells from the sums of their halves.
+
+    Short loops without a branch, which the compiler makes vector instructions.
+    """
+    columns = sums.shape[2]
+    fewest = np.float32(size.rows * size.columns / 2)
+    none, nothing = np.float32(0), np.float32(np.nan)
+    count, value = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    apart = np.empty((3, columns), np.float32)
+    for c in range(columns):
+        count[c] = sums[4, 0, c] + sums[4, 1, c]
+        enough = count[c] >= fewest
+        value[c] = (sums[3, 0, c] + sums[3, 1, c]) / count[c] if enough else nothing
+    for c in range(columns):
+        cells.inverse[i, c] = value[c] if value[c] > none else none
+    for k in range(3):
+        for c in range(columns):
+            cells.ray[k, i, c] = (sums[k, 0, c] + sums[k, 1, c]) / count[c]
+    for k in range(3):
+        x, y, z = axes[k]
+        for c in range(columns):
+            along = x * cells.ray[0, i, c] + y * cells.ray[1, i, c] + z * cells.ray[2, i, c]
+            cells.place[k, i, c] = along / value[c]
+    for c in range(columns):
+        deviation = np.sqrt(np.float32(random_variance(sensor, value[c] * value[c])))
+        error = abs(cells.place[0, i, c]) / value[c] * deviation
+        cells.error[i, c] = error if value[c] > none else none
+    # How far the left half is from the right one.
+    for k in range(3):
+        x, y, z = axes[k]
+        for c in range(columns):
+            left = x * sums[0, 0, c] + y * sums[1, 0, c] + z * sums[2, 0, c]
+            right = x * sums[0, 1, c] + y * sums[1, 1, c] + z * sums[2, 1, c]
+            apart[k, c] = left / sums[3, 0, c] - right / sums[3, 1, c]
+    for c in range(columns):
+        both = min(sums[4, 0, c], sums[4, 1, c]) * np.float32(2) >= fewest
+        way = np.sqrt(apart[1, c] * apart[1, c] + apart[2, c] * apart[2, c])
+        cells.kink[0, i, c] = abs(apart[0, c]) if both else none
+        cells.kink[1, i, c] = way if both else none

@@ -16,7 +16,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
 BASELINES = (1, 2, 4, 8, 16)
@@ -25,8 +24,9 @@ BROAD = 3
 """Baseline of the noise that cells of a patch share."""
 # Baselines of the noise between the halves of a cell, its neighbours, and the next but one.
 _HALF, _NEXT, _SECOND = 1, 1, 2
-# Standard deviations of the noise that a step must exceed: one in 16 000 by chance.
-_SIGNIFICANT = 4.0
+# What a step between two cells must exceed, in standard deviations of the noise of one: 4 of the
+# difference, one in 16 000 by chance.
+_DIFFERENCE = 4 * math.sqrt(2.0)
 # Cells without a measurement that a surface may reach across.
 _GAP = 2
 
@@ -85,7 +85,7 @@ def _noise_of(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.f
     for b in range(len(BASELINES)):
         k, count = BASELINES[b], 0
         for i in range(k, rows - k, 2):
-            for c in range(0, columns, 2):
+            for c in range(0, columns, 4):
                 above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]
                 if above > 0 and middle > 0 and below > 0:
                     bend = above - 2 * middle + below
@@ -119,7 +119,7 @@ def surfaces_of(
         Where a step is between a cell and the next measured one below.
     """
     steep, broken = (np.zeros(cells.error.shape, np.bool_) for _ in range(2))
-    run_rows(_mark, cells.error.shape[1], cells, steps, steep, broken)
+    _mark(cells, steps, steep, broken)
     # Noise hides parts of a step.
     closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     steep = closed.view(np.bool_)
@@ -127,72 +127,79 @@ def surfaces_of(
 
 
 @njit(cache=True, nogil=True)
-def _mark(
-    first: int,
-    after: int,
-    cells: Cells,
-    steps: Steps,
-    steep: NDArray[np.bool_],
-    broken: NDArray[np.bool_],
-) -> None:
-    """Mark steps in the columns first...after of cells."""
+def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[np.bool_]) -> None:
+    """Mark steps along the columns of cells."""
     place, error = cells.place, cells.error
-    rows = len(error)
+    rows, columns = error.shape
+    slope, factor = np.float32(steps.slope), np.float32(_DIFFERENCE * steps.noise[_HALF])
     for i in range(rows):
-        for c in range(first, after):
-            chance = _SIGNIFICANT * np.sqrt(2.0) * steps.noise[_HALF] * error[i, c]
-            steep[i, c] = cells.kink[i, c, 0] > steps.slope * cells.kink[i, c, 1] + chance
+        for c in range(columns):
+            bound = slope * cells.kink[1, i, c] + factor * error[i, c]
+            steep[i, c] = cells.kink[0, i, c] > bound
+    # Rows before which the cells of a column lie in a step.
+    within = np.empty(columns, np.int64)
+    step = np.empty(columns, np.bool_)
     for b in range(len(BASELINES)):
         k = BASELINES[b]
-        factor = _SIGNIFICANT * np.sqrt(2.0) * steps.noise[b]
-        for i in range(rows - k):
-            for c in range(first, after):
-                rise = abs(place[i, c, 0] - place[i + k, c, 0])
-                # Also false where one of the two is not measured.
-                if not rise > factor * max(error[i, c], error[i + k, c]):
-                    continue
-                if not _step(place, error, factor, steps, i, c, i + k, c, k <= _GAP):
+        factor = np.float32(_DIFFERENCE * steps.noise[b])
+        # A step down, or along the view, is fatal where it is taken for a ramp; one up only hides.
+        up, down = np.float32(steps.least), np.float32(steps.beside)
+        if k > _GAP:
+            up = down = np.float32(np.inf)
+        within[:] = 0
+        last = 0
+        for i in range(rows):
+            if i < last:
+                for c in range(columns):
+                    if i < within[c]:
+                        steep[i, c] = broken[i, c] = True
+            if i + k >= rows:
+                continue
+            # No branch, so that the compiler makes them vector instructions.
+            for c in range(columns):
+                step[c] = _is_step(place, error, factor, slope, up, down, i, c, i + k, c)
+            for c in range(columns):
+                if not step[c]:
                     continue
                 broken[i, c] = True
                 # Between the two, and as far as the measurement goes where it ends there.
-                start, end = i + 1, i + k
-                if k > 1 and (i == 0 or np.isnan(place[i - 1, c, 0])):
-                    start = i
-                if k > 1 and (i + k + 1 == rows or np.isnan(place[i + k + 1, c, 0])):
-                    end = i + k + 1
-                for m in range(start, end):
-                    steep[m, c] = True
-                    broken[m, c] = True
+                end = i + k
+                if k > 1 and (i == 0 or np.isnan(place[0, i - 1, c])):
+                    steep[i, c] = True
+                if k > 1 and (end + 1 == rows or np.isnan(place[0, end + 1, c])):
+                    end += 1
+                within[c] = max(within[c], end)
+                last = max(last, end)
 
 
-@njit(cache=True, nogil=True)
-def _step(
+@njit(cache=True, inline='always')
+def _is_step(
     place: NDArray[np.float32],
     error: NDArray[np.float32],
-    factor: float,
-    steps: Steps,
+    factor: np.float32,
+    slope: np.float32,
+    up: np.float32,
+    down: np.float32,
     i: int,
     c: int,
     k: int,
     m: int,
-    neighbours: bool,
 ) -> bool:
     """Whether cells (i, c) and (k, m) differ by more than the ground may; false if unknown.
 
-    Cells of nine parameters: two places, which kernels do not take as one.
+    Ten parameters: two places, which kernels do not take as one, and the four numbers that tell
+    a step: standard deviations of the noise, the steepest ground, and what it may rise or fall by
+    beyond the noise.
     """
-    rise = abs(place[i, c, 0] - place[k, m, 0])
-    x, y = place[i, c, 1] - place[k, m, 1], place[i, c, 2] - place[k, m, 2]
-    way = np.sqrt(x * x + y * y)  # several times faster than hypot
+    x, y = place[1, i, c], place[2, i, c]
+    p, q = place[1, k, m], place[2, k, m]
+    rise = place[0, i, c] - place[0, k, m]
+    way = np.sqrt((x - p) * (x - p) + (y - q) * (y - q))  # several times faster than hypot
     chance = factor * max(error[i, c], error[k, m])
-    allowed = steps.slope * way + chance
-    if neighbours:
-        # A step down, or along the view, is fatal where it is taken for a ramp; one up only hides.
-        farther = place[i, c, 1] ** 2 + place[i, c, 2] ** 2
-        farther -= place[k, m, 1] ** 2 + place[k, m, 2] ** 2
-        up = i != k and (place[i, c, 0] - place[k, m, 0]) * farther > 0
-        allowed = min(allowed, max(steps.least if up else steps.beside, chance))
-    return rise > allowed
+    # Neighbours in a row are along the view.
+    farther = x * x + y * y - p * p - q * q
+    least = up if (i != k) & (rise * farther > 0) else down
+    return abs(rise) > min(slope * way + chance, max(least, chance))
 
 
 @njit(cache=True, nogil=True)
@@ -202,41 +209,49 @@ def join_cells(
     """Surfaces of the cells that are not steep, along links that are not broken; their number."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
-    factors = _SIGNIFICANT * np.sqrt(2.0) * steps.noise
+    slope, up, down = np.float32(steps.slope), np.float32(steps.least), np.float32(steps.beside)
+    factors = (_DIFFERENCE * steps.noise).astype(np.float32)
+    # Whether a step is between a cell and the one below, the next, and the next but one.
+    below, beside, across = np.zeros((3, columns), np.bool_)
     parent = np.arange(rows * columns, dtype=np.int32)
     for i in range(rows):
+        # As vector instructions.
+        if i + 1 < rows:
+            for c in range(columns):
+                below[c] = _is_step(place, error, factors[0], slope, up, down, i, c, i + 1, c)
+        for c in range(columns - 1):
+            beside[c] = _is_step(place, error, factors[_NEXT], slope, up, down, i, c, i, c + 1)
+        for c in range(columns - 2):
+            across[c] = _is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
         for c in range(columns):
-            if steep[i, c] or np.isnan(place[i, c, 0]):
+            if steep[i, c] or np.isnan(place[0, i, c]):
                 continue
-            for k in range(1, _GAP + 1):  # the next measured cell below
-                if broken[i, c] or i + k >= rows or steep[i + k, c]:
-                    break
-                if not np.isnan(place[i + k, c, 0]):
-                    if not _step(place, error, factors[0], steps, i, c, i + k, c, True):
-                        _join(parent, i * columns + c, (i + k) * columns + c)
-                    break
+            # The next measured cell below.
+            k = i + 1 if i + 1 < rows and not np.isnan(place[0, i + 1, c]) else i + 2
+            if k < rows and not (broken[i, c] or steep[i + 1, c] or steep[k, c]):
+                apart = below[c]
+                if k > i + 1:
+                    apart = _is_step(place, error, factors[0], slope, up, down, i, c, k, c)
+                if not (apart or np.isnan(place[0, k, c])):
+                    _join(parent, i * columns + c, k * columns + c)
             # The one to the right, where the next but one agrees on either side.
-            if c + 1 < columns and not steep[i, c + 1] and not np.isnan(place[i, c + 1, 0]):
-                apart = _step(place, error, factors[_NEXT], steps, i, c, i, c + 1, True)
-                if c + 2 < columns:
-                    apart |= _step(place, error, factors[_SECOND], steps, i, c, i, c + 2, True)
-                if c > 0:
-                    apart |= _step(place, error, factors[_SECOND], steps, i, c - 1, i, c + 1, True)
+            if c + 1 < columns and not steep[i, c + 1] and not np.isnan(place[0, i, c + 1]):
+                apart = beside[c] or (c + 2 < columns and across[c]) or (c > 0 and across[c - 1])
                 if not apart:
                     _join(parent, i * columns + c, i * columns + c + 1)
-    label = np.zeros((rows, columns), np.int32)
+    label = np.zeros(rows * columns, np.int32)
     count = 0
     for i in range(rows):
         for c in range(columns):
-            if steep[i, c] or np.isnan(place[i, c, 0]):
+            if steep[i, c] or np.isnan(place[0, i, c]):
                 continue
+            # The root is the first of its surface.
             root = _find(parent, i * columns + c)
-            a, b = root // columns, root % columns
-            if label[a, b] == 0:
+            if label[root] == 0:
                 count += 1
-                label[a, b] = count
-            label[i, c] = label[a, b]
-    return label, count
+                label[root] = count
+            label[i * columns + c] = label[root]
+    return label.reshape((rows, columns)), count
 
 
 @njit(cache=True, nogil=True)

@@ -30,7 +30,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 # Metres of the ground, from where it comes into view, that it is grown from.
 _START = 0.25
 # Cells that tell its plane.
-_PLENTY = 1000
+_PLENTY = 300
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
 # Share of the least obstacle or drop that no noise excuses.
@@ -60,7 +60,7 @@ class CellTerrain(NamedTuple):
 
     Attributes
     ----------
-    place : (..., 3) float32
+    place : (3, ...) float32
         See `Cells`.
     height : (...) float32
         Above the ground, metres; NaN where not measured.
@@ -165,8 +165,8 @@ def _terrain(
     least = min(limits.obstacle, limits.drop)
     slope = float(np.tan(limits.slope + TILT))
     steps = Steps.of(slope, least, noise, sensor.correlation / size.rows)
-    surface, _, steep, broken = surfaces_of(cells, steps)
-    under = stand(cells, surface, up, sensor, known, limits.slope)
+    surface, count, steep, broken = surfaces_of(cells, steps)
+    under = stand(cells, surface, count, up, sensor, known, limits.slope)
     if under.surface == 0:
         return _without_ground(image, cells, size, steep, up, known, limits)
     flat = GroundField.of(under.theta[None, None], size, up)
@@ -225,13 +225,13 @@ def _nearest_part(
     for i in range(rows):
         for c in range(columns):
             if surface[i, c] == chosen:
-                nearest = min(nearest, place[i, c, 1] ** 2 + place[i, c, 2] ** 2)
+                nearest = min(nearest, place[1, i, c] ** 2 + place[2, i, c] ** 2)
     reach = (np.sqrt(nearest) + _START) ** 2
     near = np.zeros((rows, columns), np.bool_)
     count = 0
     for i in range(rows):
         for c in range(columns):
-            square = place[i, c, 1] ** 2 + place[i, c, 2] ** 2
+            square = place[1, i, c] ** 2 + place[2, i, c] ** 2
             near[i, c] = surface[i, c] == chosen and square <= reach
             count += near[i, c]
     # Some of them tell the plane as well as all.
@@ -243,7 +243,7 @@ def _nearest_part(
             if near[i, c]:
                 if count % step == 0:
                     k = count // step
-                    points[0, k], points[1, k] = place[i, c, 1], place[i, c, 2]
+                    points[0, k], points[1, k] = place[1, i, c], place[2, i, c]
                     points[2, k] = height[i, c]
                 count += 1
     x, y, h = points[0], points[1], points[2]
@@ -264,7 +264,7 @@ def _nearest_part(
     for i in range(rows):
         for c in range(columns):
             if near[i, c]:
-                off_plane = height[i, c] - p - q * place[i, c, 1] - r * place[i, c, 2]
+                off_plane = height[i, c] - p - q * place[1, i, c] - r * place[2, i, c]
                 near[i, c] = abs(off_plane) <= tolerance
     return near
 
@@ -376,9 +376,9 @@ def _without_ground(
     obstacle = steep.copy()
     height, doubt = known
     if height > 0:
-        reach = np.hypot(cells.place[..., 1], cells.place[..., 2])
+        reach = np.hypot(cells.place[1], cells.place[2])
         bound = limits.obstacle + _CERTAIN * (doubt + TILT * reach)
-        obstacle |= cells.place[..., 0] + height > bound
+        obstacle |= cells.place[0] + height > bound
     wide = obstacle.repeat(size.rows, axis=0).repeat(size.columns, axis=1)
     wide = wide[: image.shape[0], : image.shape[1]]
     classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)

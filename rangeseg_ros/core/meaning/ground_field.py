@@ -14,7 +14,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells, CellSize
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import cofactors
 
 # Cells of a block, which is about square.
@@ -67,7 +66,7 @@ def _moments(
                     value = inverse[i, c]
                     if value == 0:
                         continue
-                    x, y, z = ray[i, c, 0], ray[i, c, 1], ray[i, c, 2]
+                    x, y, z = ray[0, i, c], ray[1, i, c], ray[2, i, c]
                     squares = (x * x, x * y, x * z, y * y, y * z, z * z)
                     for k in range(6):
                         total[9 + k] += squares[k]
@@ -163,25 +162,23 @@ def cell_heights(cells: Cells, field: GroundField, size: CellSize) -> NDArray[np
     result = np.empty(cells.inverse.shape, np.float32)
     # In units of cells, as if they were pixels.
     small = field._replace(rows=field.rows // size.rows, columns=field.columns // size.columns)
-    run_rows(_cell_heights, len(result), cells, small, result)
+    _cell_heights(cells, small, result)
     return result
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _cell_heights(
-    first: int, after: int, cells: Cells, field: GroundField, result: NDArray[np.float32]
-) -> None:
+def _cell_heights(cells: Cells, field: GroundField, result: NDArray[np.float32]) -> None:
     planes = np.empty((4, result.shape[1]), np.float32)
     spread = spread_planes(field, result.shape[1])
     ray = cells.ray
-    for i in range(first, after):
+    for i in range(len(result)):
         planes_of_row(spread, (i + 0.5) / field.rows - 0.5, planes)
         for c in range(result.shape[1]):
             value = cells.inverse[i, c]
             along = (
-                planes[0, c] * ray[i, c, 0]
-                + planes[1, c] * ray[i, c, 1]
-                + planes[2, c] * ray[i, c, 2]
+                planes[0, c] * ray[0, i, c]
+                + planes[1, c] * ray[1, i, c]
+                + planes[2, c] * ray[2, i, c]
             )
             height = (along - value) / (value * planes[3, c])
             result[i, c] = height if value > 0 else np.float32(np.nan)

@@ -56,35 +56,30 @@ def grown(
     rows, columns = height.shape
     place = cells.place
     high, wide = -(-rows // ROWS), -(-columns // COLUMNS)
+    # Of the ground in a block: sums of the regression. Of the candidates in a tile that are not
+    # ground: their number, and sums of height and place.
     sums = np.zeros((-(-high // _HIGH), wide, 10))
+    rest = np.zeros((high, wide, 4))
     ground = np.zeros((rows, columns), np.bool_)
-    distance = np.full(high * wide, np.inf)
+    distance = np.full(high * wide, np.float32(np.inf))
     for i in range(rows):
         for c in range(columns):
+            m, n = i // ROWS, c // COLUMNS
             if seed[i, c]:
                 _add(sums, ground, height, cells, i, c)
+            elif candidate[i, c]:
+                _count(rest[m, n], height, place, i, c, 1.0)
             if candidate[i, c]:
-                tile = (i // ROWS) * wide + c // COLUMNS
-                x, y = place[i, c, 1], place[i, c, 2]
-                reach = np.sqrt(x * x + y * y)
-                distance[tile] = min(distance[tile], reach)
+                x, y = place[1, i, c], place[2, i, c]
+                distance[m * wide + n] = min(distance[m * wide + n], x * x + y * y)
     order = np.argsort(distance, kind='mergesort')
     total = np.empty(10)
     for turn in range(2):  # outwards, and back behind what stands in the way
         for k in range(len(order)):
             tile = order[k] if turn == 0 else order[len(order) - 1 - k]
-            if distance[tile] < np.inf:
-                _grow_tile(
-                    tile // wide,
-                    tile % wide,
-                    height,
-                    cells,
-                    candidate,
-                    steps,
-                    sums,
-                    ground,
-                    total,
-                )
+            m, n = tile // wide, tile % wide
+            if rest[m, n, 0] > 0:
+                _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground, total)
     return ground
 
 
@@ -97,12 +92,14 @@ def _grow_tile(
     candidate: NDArray[np.bool_],
     steps: Steps,
     sums: NDArray[np.float64],
+    rest: NDArray[np.float64],
     ground: NDArray[np.bool_],
     total: NDArray[np.float64],
 ) -> None:
-    """Accept the cells of tile (m, n) that agree with the ground around it, if their mean does."""
-    if not _open(m, n, candidate, ground):
-        return
+    """Accept the cells of tile (m, n) that agree with the ground around it, if their mean does.
+
+    Ten parameters: a kernel that changes three arrays, and one it need not make each time.
+    """
     b = m // _HIGH
     total[:] = 0
     for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
@@ -123,37 +120,43 @@ def _grow_tile(
     xh, yh = total[7] - w * x * h, total[8] - w * y * h
     determinant = xx * yy - xy * xy
     p, q = (yy * xh - xy * yh) / determinant, (xx * yh - xy * xh) / determinant
-    steepness = np.hypot(p, q)
+    steepness = np.sqrt(p * p + q * q)
     if steepness > steps.slope:
         p, q = p * steps.slope / steepness, q * steps.slope / steepness
-    place = cells.place
     # Noise lets single cells of a step through, not the mean of what is not yet ground around.
-    off, count = 0.0, 0
-    first, after = max(m - _BESIDE[0], 0) * ROWS, (m + _BESIDE[0] + 1) * ROWS
-    left, right = max(n - _BESIDE[1], 0) * COLUMNS, (n + _BESIDE[1] + 1) * COLUMNS
-    for i in range(first, min(after, height.shape[0])):
-        for c in range(left, min(right, height.shape[1])):
-            if candidate[i, c] and not ground[i, c]:
-                off += height[i, c] - h - p * (place[i, c, 1] - x) - q * (place[i, c, 2] - y)
-                count += 1
+    off, count = 0.0, 0.0
+    for i in range(max(m - _BESIDE[0], 0), min(m + _BESIDE[0] + 1, rest.shape[0])):
+        for j in range(max(n - _BESIDE[1], 0), min(n + _BESIDE[1] + 1, rest.shape[1])):
+            number = rest[i, j, 0]
+            count += number
+            off += rest[i, j, 1] - number * h
+            off -= p * (rest[i, j, 2] - number * x) + q * (rest[i, j, 3] - number * y)
     if abs(off) > count * steps.least:
         return
+    place = cells.place
     for i in range(m * ROWS, min((m + 1) * ROWS, height.shape[0])):
         for c in range(n * COLUMNS, min((n + 1) * COLUMNS, height.shape[1])):
             if candidate[i, c] and not ground[i, c]:
-                expected = h + p * (place[i, c, 1] - x) + q * (place[i, c, 2] - y)
+                expected = h + p * (place[1, i, c] - x) + q * (place[2, i, c] - y)
                 if abs(height[i, c] - expected) <= steps.least:
                     _add(sums, ground, height, cells, i, c)
+                    _count(rest[m, n], height, place, i, c, -1.0)
 
 
 @njit(cache=True, inline='always')
-def _open(m: int, n: int, candidate: NDArray[np.bool_], ground: NDArray[np.bool_]) -> bool:
-    """Whether tile (m, n) has cells that may become ground."""
-    for i in range(m * ROWS, min((m + 1) * ROWS, ground.shape[0])):
-        for c in range(n * COLUMNS, min((n + 1) * COLUMNS, ground.shape[1])):
-            if candidate[i, c] and not ground[i, c]:
-                return True
-    return False
+def _count(
+    total: NDArray[np.float64],
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    i: int,
+    c: int,
+    sign: float,
+) -> None:
+    """Add a cell to the sums of a tile, or take it away."""
+    total[0] += sign
+    total[1] += sign * height[i, c]
+    total[2] += sign * place[1, i, c]
+    total[3] += sign * place[2, i, c]
 
 
 @njit(cache=True, inline='always')
@@ -169,7 +172,7 @@ def _add(
     total = sums[i // (ROWS * _HIGH), c // COLUMNS]
     w = 1 / max(cells.error[i, c] ** 2, np.float32(1e-10))
     place = cells.place
-    x, y, h = place[i, c, 1], place[i, c, 2], height[i, c]
+    x, y, h = place[1, i, c], place[2, i, c], height[i, c]
     total[0] += w
     total[1] += w * x
     total[2] += w * y

@@ -120,11 +120,11 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
             i = m if cells.turned else rows - 1 - m
             h = sign * height[i, c]
             if kind[i, c] == GROUND and abs(h) < RISE[0] / 2:
-                x, y = place[i, c, 1], place[i, c, 2]
+                x, y = place[1, i, c], place[2, i, c]
             # Also false where nothing is measured.
             if not RISE[0] / 2 < h < highest or unsure[i, c] > _UNEVEN * RISE[1]:
                 continue
-            a, b = place[i, c, 1] - x, place[i, c, 2] - y
+            a, b = place[1, i, c] - x, place[2, i, c] - y
             way = np.sqrt(a * a + b * b)
             # Half as steep where the columns are at 60 degrees to the stairs. Also false where no
             # ground was.
@@ -136,7 +136,7 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
                 while 0 < k < rows - 1 and np.isnan(height[k, c]):
                     k += step
                 if 0 <= k < rows:
-                    p, q = place[i, c, 1] - place[k, c, 1], place[i, c, 2] - place[k, c, 2]
+                    p, q = place[1, i, c] - place[1, k, c], place[2, i, c] - place[2, k, c]
                     if abs(height[i, c] - height[k, c]) < _FLATTEST * np.sqrt(p * p + q * q):
                         level[i, c] = h
     return level
@@ -187,7 +187,7 @@ def _find_noses(
         before, last, tread = -1, -1, 0
         for m in range(rows):
             i = m if cells.turned else rows - 1 - m
-            if np.isnan(place[i, c, 0]):
+            if np.isnan(place[0, i, c]):
                 continue
             k = int(level[i, c] / rise + 0.5)
             if k > count or abs(level[i, c] - k * rise) > _UNEVEN * rise:
@@ -200,16 +200,16 @@ def _find_noses(
                 if k == tread + 1 and up:
                     # The riser below is where the nose is, the tread begins behind it.
                     numbers[found] = k
-                    places[found] = place[before, c, 1:]
+                    places[found] = place[1:, before, c]
                     found += 1
                 elif k == tread + 1:
                     numbers[found] = tread
                     # Half a cell goes on behind its middle.
                     inner = last + 1 if not cells.turned else last - 1
                     for n in range(2):
-                        places[found, n] = place[last, c, 1 + n]
-                        if 0 <= inner < rows and not np.isnan(place[inner, c, 0]):
-                            step = place[last, c, 1 + n] - place[inner, c, 1 + n]
+                        places[found, n] = place[1 + n, last, c]
+                        if 0 <= inner < rows and not np.isnan(place[0, inner, c]):
+                            step = place[1 + n, last, c] - place[1 + n, inner, c]
                             places[found, n] += step / 2
                     found += 1
                 if k >= tread:
@@ -257,7 +257,7 @@ def _staircase(
             return None
     ends = sides[0]
     if sign < 0:  # columns of cells that leave the stairs at their side see no nose there
-        ends = np.quantile(cells.place[tread == 1][:, 1:] @ across, (0.02, 0.98))
+        ends = np.quantile(across @ cells.place[1:, tread == 1], (0.02, 0.98))
     width = float(ends[1] - ends[0])
     if width < _NARROWEST:
         return None

@@ -60,6 +60,7 @@ class Stand(NamedTuple):
 def stand(
     cells: Cells,
     surface: NDArray[np.int32],
+    count: int,
     up: NDArray[np.float64],
     sensor: SensorModel,
     known: tuple[float, float],
@@ -76,6 +77,8 @@ def stand(
     cells : Cells
     surface : (rows, columns) int32
         1...N, 0 for none.
+    count : int
+        N.
     up : (3,) float64
     sensor : SensorModel
     known : (float, float)
@@ -85,13 +88,11 @@ def stand(
         Steepest ground, radians.
     """
     height, doubt = known
-    sizes = np.bincount(surface.ravel())
-    sizes[0] = 0
+    sizes, reach, steepest = _reaches(cells, surface, count + 1)
     order = np.argsort(-sizes, kind='stable')[:_MOST]
     order = order[sizes[order] >= FEWEST]
     if not len(order):
         return Stand(0, np.zeros(3), 0.0)
-    reach, steepest = _reaches(cells, surface, len(sizes))
     rank = np.full(len(sizes), -1)
     rank[order] = np.arange(len(order))
     sums = _sums(cells, surface, rank, reach, sensor, height)
@@ -112,19 +113,21 @@ def stand(
 @njit(cache=True, nogil=True)
 def _reaches(
     cells: Cells, surface: NDArray[np.int32], count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least horizontal distance of surfaces, metres, and the least ratio of it to the depth."""
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cells of surfaces, least horizontal distance, metres, least ratio of it to the depth."""
+    sizes = np.zeros(count, np.int64)
     reach = np.full(count, np.inf)
     ratio = np.full(count, np.inf)
     for i in range(surface.shape[0]):
         for c in range(surface.shape[1]):
             k = surface[i, c]
             if k:
-                z, x, y = cells.place[i, c]
+                z, x, y = cells.place[:, i, c]
                 way = np.sqrt(x * x + y * y)
+                sizes[k] += 1
                 reach[k] = min(reach[k], way)
                 ratio[k] = min(ratio[k], way / max(-z, np.float32(1e-3)))
-    return reach, ratio
+    return sizes, reach, ratio
 
 
 @njit(cache=True, nogil=True)
@@ -149,7 +152,7 @@ def _sums(
             k = surface[i, c]
             if k == 0 or rank[k] < 0:
                 continue
-            z, x, y = cells.place[i, c]
+            z, x, y = cells.place[:, i, c]
             way = np.sqrt(x * x + y * y) - reach[k]
             if way > _WAYS[0]:
                 continue
