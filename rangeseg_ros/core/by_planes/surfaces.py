@@ -11,8 +11,6 @@ within the distortion.
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -137,38 +135,57 @@ def _join(
     residual = np.zeros(count)
     for a in range(count):
         residual[a] = fit(moments[a], theta)
-    strain = np.zeros((count, count))
-    heap = [(0.0, 0, 0)]
-    heap.pop()
+    # Between surfaces a < b that touch: the strain along their border, and its mean where they
+    # may join. Of each a: the b of least mean strain, and this.
+    strain, mean = np.zeros((count, count)), np.full((count, count), np.inf)
+    partner, least = np.arange(count), np.full(count, np.inf)
     for a in range(count):
         for b in range(a + 1, count):
             if border[a, b] > 0:
                 extra = common_residual(moments, a, b) - residual[a] - residual[b]
-                apart = misfit(extra, moments, a, b, granted)
-                strain[a, b] = strain[b, a] = apart * border[a, b]
-                heappush(heap, (strain[a, b] / border[a, b], a, b))
+                strain[a, b] = misfit(extra, moments, a, b, granted) * border[a, b]
+                strain[b, a] = strain[a, b]
+                mean[a, b] = strain[a, b] / border[a, b]
+        partner[a], least[a] = _smallest(mean[a], a)
     parent = np.arange(count)
-    while len(heap) > 0:
-        mean, a, b = heappop(heap)
-        if mean >= 1:
+    while True:
+        a, strained = _smallest(least, 0)
+        if not strained < 1:
             break
-        if parent[a] != a or parent[b] != b or strain[a, b] / border[a, b] != mean:
-            continue
+        b = partner[a]
         chi2 = common_residual(moments, a, b)
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
         within = _WITHIN_SURFACE * pixels / (pixels + enlarged * DISTORTION_PIXELS)
+        mean[a, b] = np.inf
         if misfit(extra, moments, a, b, within) >= 1:
+            partner[a], least[a] = _smallest(mean[a], a)
             continue
         parent[b] = a
         moments[a] += moments[b]
         residual[a] = chi2
+        border[a, b] = border[b, a] = 0
+        least[b] = np.inf
         for c in range(count):
-            if border[b, c] > 0 and c != a:
+            if border[b, c] > 0:
                 border[a, c] += border[b, c]
                 strain[a, c] += strain[b, c]
                 border[c, a], strain[c, a] = border[a, c], strain[a, c]
-            border[b, c] = border[c, b] = 0
+                border[b, c] = border[c, b] = 0
+                mean[min(b, c), max(b, c)] = np.inf
             if border[a, c] > 0:
-                heappush(heap, (strain[a, c] / border[a, c], min(a, c), max(a, c)))
+                mean[min(a, c), max(a, c)] = strain[a, c] / border[a, c]
+                if c < a or partner[c] == b:
+                    partner[c], least[c] = _smallest(mean[c], c)
+        partner[a], least[a] = _smallest(mean[a], a)
     return find_roots(parent)
+
+
+@njit(cache=True)
+def _smallest(values: NDArray[np.float64], first: int) -> tuple[int, float]:
+    """The smallest of some values from `first` on: its index, the first of equals, and itself."""
+    index, smallest = first, values[first]
+    for k in range(first + 1, len(values)):
+        if values[k] < smallest:
+            index, smallest = k, values[k]
+    return index, smallest

@@ -15,6 +15,10 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 # Pixels from one side of a hole to the other, at most: gaps of three, as random holes in a third
 # of the pixels make them, and less than the shadow of any step that is not small itself.
 _SPAN = 4
+# Rows of the image that one row is told by, and more: a power of two.
+_ROWS = 2 * _SPAN
+# Rows and columns from one pixel to the next.
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def bridge_holes(
@@ -61,25 +65,35 @@ def _bridge(
 ) -> None:
     """Bridge the holes of some rows."""
     height, width = measured.shape
-    # Whether something was measured in a column near the row, and near the pixel: most holes are
-    # far from all that was.
-    column = np.empty(width + 2 * _SPAN, np.bool_)
-    near = np.empty(width, np.bool_)
-    for i in range(first, after):
-        column[:] = False
-        for k in range(max(i - _SPAN + 1, 0), min(i + _SPAN, height)):
-            for j in range(width):
-                column[j + _SPAN] |= measured[k, j] > 0
-        near[:] = False
-        for k in range(1, 2 * _SPAN):
-            for j in range(width):
-                near[j] |= column[j + k]
+    # Whether pixels were measured, of the rows around one and with a margin; and which of the
+    # row's were not but lie between two that were: most holes are far from all that was. Bytes,
+    # of which the compiler takes more at a time than of truth values.
+    known = np.zeros((_ROWS, width + 2 * _SPAN), np.uint8)
+    between = np.empty(width, np.uint8)
+    for i in range(first - 2 * _SPAN, after):
+        _find_known(i + _SPAN, measured, known[(i + _SPAN) % _ROWS, _SPAN:])
+        if i < first:
+            continue
+        between[:] = 0
+        for di, dj in _DIRECTIONS:
+            _find_between(
+                known[(i - di) % _ROWS, _SPAN - dj :],
+                known[(i - 2 * di) % _ROWS, _SPAN - 2 * dj :],
+                known[(i - 3 * di) % _ROWS, _SPAN - 3 * dj :],
+                known[(i + di) % _ROWS, _SPAN + dj :],
+                known[(i + 2 * di) % _ROWS, _SPAN + 2 * dj :],
+                known[(i + 3 * di) % _ROWS, _SPAN + 3 * dj :],
+                between,
+            )
+        here = known[i % _ROWS, _SPAN:]
         for j in range(width):
-            if measured[i, j] > 0 or not near[j]:
+            between[j] &= here[j] ^ 1
+        for j in range(width):
+            if between[j] == 0:
                 continue
             step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
             best, value = 2 * _SPAN, np.float32(0)
-            for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+            for di, dj in _DIRECTIONS:
                 back, ahead = 0, 0
                 for k in range(1, _SPAN):
                     u, v = i - k * di, j - k * dj
@@ -114,3 +128,31 @@ def _bridge(
                         here, there = measured_rays[bi, bj, k], measured_rays[ai, aj, k]
                         rays[i, j, k] = here + share * (there - here)
             inverse[i, j] = value
+
+
+@njit(cache=True, nogil=True)
+def _find_known(i: int, measured: NDArray[np.float32], known: NDArray[np.uint8]) -> None:
+    """Which pixels of a row were measured; none outside of the image."""
+    known[:] = 0
+    if 0 <= i < len(measured):
+        for j in range(measured.shape[1]):
+            known[j] = measured[i, j] > 0
+
+
+@njit(cache=True, nogil=True)
+def _find_between(
+    back: NDArray[np.uint8],
+    back2: NDArray[np.uint8],
+    back3: NDArray[np.uint8],
+    ahead: NDArray[np.uint8],
+    ahead2: NDArray[np.uint8],
+    ahead3: NDArray[np.uint8],
+    between: NDArray[np.uint8],
+) -> None:
+    """Add the pixels with measured ones behind and ahead of them, at most `_SPAN` apart.
+
+    Those behind and ahead in one direction, by 1, 2 and 3 pixels, are given apart.
+    """
+    for j in range(len(between)):
+        near = ahead[j] | ahead2[j]
+        between[j] |= (back[j] & (near | ahead3[j])) | (back2[j] & near) | (back3[j] & ahead[j])

@@ -73,9 +73,12 @@ def _find_jumps(
     mean = np.full((_ROWS, width + 2 * _MARGIN), np.float32(np.nan))
     # Of every second row of blocks in turn: the smallest deviation, and the clear step.
     limit, bound = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
-    across = np.zeros(width, np.bool_)
-    # Of every second row in turn.
+    # Between each pixel and the one before it, first and last there is none.
+    across = np.zeros(width + 1, np.bool_)
+    # Of every second row in turn: deviations from the next, strong pixels, their columns and the
+    # number of these, and on which side of their local mean they lie.
     down, strong = np.zeros((2, width), np.bool_), np.zeros((2, width), np.bool_)
+    places, count = np.empty((2, width), np.int32), np.zeros(2, np.int32)
     side = np.zeros((2, width), np.bool_)
     for k in range(max(first - _MARGIN, 0), min(first + _MARGIN - 1, height)):
         _find_means(k, inverse, mean[k % _ROWS])
@@ -104,18 +107,21 @@ def _find_jumps(
             down[i % 2] = False
         if i < first:
             continue
-        row = mean[i % _ROWS, _MARGIN - 4 :]
-        _leave(row, row[3:], row[6:], row[9:], limit[block % 2], across[: width - 1])
-        strong[i % 2, 0] = down[0, 0] | down[1, 0] | across[0]
-        for j in range(1, width):
-            strong[i % 2, j] = down[0, j] | down[1, j] | across[j] | across[j - 1]
+        row, now = mean[i % _ROWS, _MARGIN - 4 :], i % 2
+        _leave(row, row[3:], row[6:], row[9:], limit[block % 2], across[1:width])
         for j in range(width):
-            if strong[i % 2, j]:
-                side[i % 2, j] = _is_above_mean(i, j, inverse)
+            strong[now, j] = down[0, j] | down[1, j] | across[j] | across[j + 1]
+        count[now] = 0
+        for j in range(width):
+            if strong[now, j]:
+                places[now, count[now]] = j
+                count[now] += 1
+        if count[now] > 0:
+            _find_sides(i, inverse, places[now, : count[now]], side[now])
         if i < after:
-            _cross_right(i, inverse, strong, side, limit, bound, horizontal[i])
+            _cross_right(i, inverse, strong, side, places, count, limit, bound, horizontal[i])
         if i > first:
-            _cross_down(i - 1, inverse, strong, side, limit, bound, vertical[i - 1])
+            _cross_down(i - 1, inverse, strong, side, places, count, limit, bound, vertical[i - 1])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -162,16 +168,29 @@ def _leave(
 
 
 @njit(cache=True, nogil=True)
-def _is_above_mean(i: int, j: int, inverse: NDArray[np.float32]) -> bool:
-    """Whether a pixel is nearer than the mean of the 7 x 7 around it."""
+def _find_sides(
+    i: int, inverse: NDArray[np.float32], places: NDArray[np.int32], side: NDArray[np.bool_]
+) -> None:
+    """Whether pixels at some places of a row are nearer than the mean of the 7 x 7 around them."""
     height, width = inverse.shape
-    # In float64, in which no order of the sum rounds.
-    total, count = 0.0, 0
-    for k in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, height)):
-        for m in range(max(j - _WINDOW, 0), min(j + _WINDOW + 1, width)):
-            total += np.float64(inverse[k, m])
-            count += inverse[k, m] > 0
-    return bool(inverse[i, j] * np.float32(count) > np.float32(total))
+    top, bottom = max(i - _WINDOW, 0), min(i + _WINDOW + 1, height)
+    # Of the columns, each once; in float64, in which no order of the sum rounds.
+    total, count = np.empty(width), np.empty(width, np.int32)
+    summed = 0
+    for j in places:
+        left, right = max(j - _WINDOW, 0), min(j + _WINDOW + 1, width)
+        for m in range(max(left, summed), right):
+            around, measured = 0.0, 0
+            for k in range(top, bottom):
+                around += np.float64(inverse[k, m])
+                measured += inverse[k, m] > 0
+            total[m], count[m] = around, measured
+        summed = right
+        around, measured = 0.0, 0
+        for m in range(left, right):
+            around += total[m]
+            measured += count[m]
+        side[j] = inverse[i, j] * np.float32(measured) > np.float32(around)
 
 
 # Boundaries are crossed between strong pixels on unlike sides of the local mean, and at every
@@ -186,26 +205,26 @@ def _cross_right(
     inverse: NDArray[np.float32],
     strong: NDArray[np.bool_],
     side: NDArray[np.bool_],
+    places: NDArray[np.int32],
+    count: NDArray[np.int32],
     limit: NDArray[np.float32],
     bound: NDArray[np.float32],
     result: NDArray[np.bool_],
 ) -> None:
     """Jumps between the pixels of a row."""
     width = inverse.shape[1]
-    row, now = inverse[i], i % 2
-    step, clear = limit[i // BLOCK % 2], bound[i // BLOCK % 2]
-    for j in range(width - 1):
-        here, there = row[j], row[j + 1]
-        result[j] = (here > 0) & (there > 0) & (abs(here - there) > clear[j])
-    for j in range(width - 1):
-        if not (strong[now, j] | strong[now, j + 1]) or row[j] == 0 or row[j + 1] == 0:
-            continue
-        before = row[j - 1] if j > 0 else np.float32(0)
-        after = row[j + 2] if j + 2 < width else np.float32(0)
-        both = strong[now, j] & strong[now, j + 1]
-        result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
-            before, row[j], row[j + 1], after, step[j]
-        )
+    row, now, block = inverse[i], i % 2, i // BLOCK % 2
+    _step_clearly(row, row[1:], bound[block], result)
+    for k in range(count[now]):
+        for j in range(max(places[now, k] - 1, 0), min(places[now, k] + 1, width - 1)):
+            if row[j] == 0 or row[j + 1] == 0:
+                continue
+            before = row[j - 1] if j > 0 else np.float32(0)
+            after = row[j + 2] if j + 2 < width else np.float32(0)
+            both = strong[now, j] & strong[now, j + 1]
+            result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
+                before, row[j], row[j + 1], after, limit[block, j]
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -214,26 +233,40 @@ def _cross_down(
     inverse: NDArray[np.float32],
     strong: NDArray[np.bool_],
     side: NDArray[np.bool_],
+    places: NDArray[np.int32],
+    count: NDArray[np.int32],
     limit: NDArray[np.float32],
     bound: NDArray[np.float32],
     result: NDArray[np.bool_],
 ) -> None:
     """Jumps between the pixels of a row and those below."""
-    height, width = inverse.shape
-    row, below = inverse[i], inverse[i + 1]
-    step, clear = limit[i // BLOCK % 2], bound[i // BLOCK % 2]
-    for j in range(width):
-        here, there = row[j], below[j]
-        result[j] = (here > 0) & (there > 0) & (abs(here - there) > clear[j])
-    for j in range(width):
-        if not (strong[0, j] | strong[1, j]) or row[j] == 0 or below[j] == 0:
-            continue
-        before = inverse[i - 1, j] if i > 0 else np.float32(0)
-        after = inverse[i + 2, j] if i + 2 < height else np.float32(0)
-        both = strong[0, j] & strong[1, j]
-        result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
-            before, row[j], below[j], after, step[j]
-        )
+    height = len(inverse)
+    row, below, block = inverse[i], inverse[i + 1], i // BLOCK % 2
+    _step_clearly(row, below, bound[block], result)
+    for now in range(2):
+        for k in range(count[now]):
+            j = places[now, k]
+            if row[j] == 0 or below[j] == 0:
+                continue
+            before = inverse[i - 1, j] if i > 0 else np.float32(0)
+            after = inverse[i + 2, j] if i + 2 < height else np.float32(0)
+            both = strong[0, j] & strong[1, j]
+            result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
+                before, row[j], below[j], after, limit[block, j]
+            )
+
+
+@njit(cache=True, nogil=True)
+def _step_clearly(
+    here: NDArray[np.float32],
+    there: NDArray[np.float32],
+    clear: NDArray[np.float32],
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the steps between measured pixels are clear by themselves."""
+    for j in range(len(result)):
+        step = abs(here[j] - there[j])
+        result[j] = (here[j] > 0) & (there[j] > 0) & (step > clear[j])
 
 
 @njit(cache=True, nogil=True)
