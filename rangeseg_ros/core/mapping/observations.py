@@ -29,7 +29,7 @@ ANOTHER = 0.7
 # residue of bands, grazing views and ragged borders: that of `fitting.coplanar`.
 RESIDUE = 2.5
 # Samples along a side of a cell of the image, see `views`.
-_SAMPLES = 8
+_SAMPLES = 16
 
 
 class PoseNoise(NamedTuple):

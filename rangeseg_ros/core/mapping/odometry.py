@@ -5,9 +5,9 @@ An extended Kalman filter of the camera and the planes it sees (Smith, Self and 
 state has the errors of
 
 * the pose: a turn theta in the camera's axes, true rotation = R exp([theta]x), and a shift;
-* the velocity in the camera's axes, turning and going, which persists for a while and has the
-  spread of a hand's (Ornstein and Uhlenbeck): where planes hold the camera it is measured, and
-  where they do not, it makes the covariance of the pose grow without bound;
+* the velocity in the camera's axes, turning and going (`camera_motion`): where planes hold the
+  camera it is measured, and where they do not, it makes the covariance of the pose grow without
+  bound;
 * each plane: x of `plane_errors`, and beta of `observations`, which is considered, not estimated,
   as in `plane_filter`.
 
@@ -31,23 +31,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.camera_motion import predict
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
     observations,
     persistence,
 )
-from rangeseg_ros.core.mapping.plane_errors import (
-    cross_matrices,
-    shifted,
-    tangents,
-    to_errors,
-)
+from rangeseg_ros.core.mapping.plane_errors import shifted, tangents, to_errors
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.tracker import NOMINAL, SHIFT, TURN
 
-# Seconds for which a velocity persists: hands and heads change their minds about that often.
-_PERSISTENCE = 0.5
 # Planes that count, the largest in the image: with 16 the motion is no better, and less is known
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
@@ -167,35 +161,12 @@ class PlaneOdometry:
         )
 
     def _predict(self, elapsed: float) -> None:
-        """Go on with the velocity, which fades."""
+        """Go on with the velocity."""
         assert self._pose is not None
-        turn, shift = self._pose
-        part = elapsed / _PERSISTENCE
-        kept, reach = np.exp(-part), _PERSISTENCE * -np.expm1(-part)
-        turned = Rotation.from_rotvec(reach * self._velocity[:3]).as_matrix()
-        change = np.eye(_CAMERA)
-        change[:3, :3] = turned.T
-        change[:3, 6:9] = reach * np.eye(3)
-        change[3:6, :3] = -reach * turn @ cross_matrices(self._velocity[None, 3:])[0]
-        change[3:6, 9:] = reach * turn
-        change[6:, 6:] *= kept
+        self._pose, self._velocity, change, noise = predict(self._pose, self._velocity, elapsed)
         self._covariance[:_CAMERA] = change @ self._covariance[:_CAMERA]
         self._covariance[:, :_CAMERA] = self._covariance[:, :_CAMERA] @ change.T
-        # Of the path and the velocity of an Ornstein-Uhlenbeck process (Uhlenbeck and Ornstein
-        # 1930), for unit variance; the axes are alike, so that no rotation counts.
-        path = _PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
-        both, speed = _PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
-        variance = np.repeat([TURN**2, SHIFT**2], 3)
-        k = np.arange(6)
-        self._covariance[k, k] += variance * path
-        self._covariance[k + 6, k + 6] += variance * speed
-        across = np.zeros((6, 6))
-        across[:3, :3], across[3:, 3:] = TURN**2 * np.eye(3), SHIFT**2 * turn
-        self._covariance[:6, 6:12] += both * across
-        self._covariance[6:12, :6] += both * across.T
-        moved = turn @ (reach * self._velocity[3:]) + shift
-        self._pose = Transform(turn @ turned, moved)
-        self._velocity = kept * self._velocity
+        self._covariance[:_CAMERA, :_CAMERA] += noise
 
     def _update(self, seen: Observations, which: NDArray[np.intp]) -> None:
         """Take in observations `which` (N,) of the planes; those that do not fit are forgotten."""

@@ -1,0 +1,72 @@
+"""How a camera goes on that a hand or a robot carries: a velocity that persists for a while.
+
+An Ornstein-Uhlenbeck process (Uhlenbeck and Ornstein, "On the theory of the Brownian motion",
+1930) with the spread of what cameras commonly do. The error of its state is that of `odometry`: a
+turn in the camera's axes, a shift, and the velocity in the camera's axes, turning and going.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.mapping.plane_errors import cross_matrices
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.tracking.tracker import SHIFT, TURN
+
+# Seconds for which a velocity persists: hands and heads change their minds about that often.
+_PERSISTENCE = 0.5
+
+
+class Prediction(NamedTuple):
+    """Where a camera is after a while, when nothing is seen.
+
+    Attributes
+    ----------
+    pose : Transform
+    velocity : (6,) float64
+    change, noise : (12, 12) float64
+        The errors are `change` times those before, and have the covariance `noise` more.
+    """
+
+    pose: Transform
+    velocity: NDArray[np.float64]
+    change: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> Prediction:
+    """Go on with a velocity, which fades.
+
+    Parameters
+    ----------
+    pose : Transform
+        From the frame of the image.
+    velocity : (6,) float64
+        In that frame: radians per second, then metres per second.
+    elapsed : float
+        Seconds.
+    """
+    turn, shift = pose
+    part = elapsed / _PERSISTENCE
+    kept, reach = np.exp(-part), _PERSISTENCE * -np.expm1(-part)
+    turned = Rotation.from_rotvec(reach * velocity[:3]).as_matrix()
+    change = np.eye(12)
+    change[:3, :3] = turned.T
+    change[:3, 6:9] = reach * np.eye(3)
+    change[3:6, :3] = -reach * turn @ cross_matrices(velocity[None, 3:])[0]
+    change[3:6, 9:] = reach * turn
+    change[6:, 6:] *= kept
+    # Of the path and the velocity, for unit variance; the axes are alike, so that no rotation
+    # counts.
+    path = _PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
+    both, speed = _PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
+    variance = np.diag(np.repeat([TURN**2, SHIFT**2], 3))
+    across = np.zeros((6, 6))
+    across[:3, :3], across[3:, 3:] = TURN**2 * np.eye(3), SHIFT**2 * turn
+    noise = np.block([[path * variance, both * across], [both * across.T, speed * variance]])
+    moved = turn @ (reach * velocity[3:]) + shift
+    return Prediction(Transform(turn @ turned, moved), kept * velocity, change, noise)
