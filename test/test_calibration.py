@@ -83,6 +83,23 @@ def test_second_coefficient_where_the_range_is_offset():
         assert rms(off) < 0.35 * rms(truth)
 
 
+def test_near_planes_that_are_much_noisier_do_not_outvote_the_others():
+    def some_near(number, frame):
+        labels, image = frame
+        if number % 6:
+            return labels, image
+        random = np.random.default_rng(number)
+        noise = 0.2 * smooth_field(CAMERA.shape, (3.0, 3.0), random)
+        return labels, RangeImage.from_depth(
+            (1 / (5 + noise + 0 * image.inverse)).astype(np.float32), CAMERA
+        )
+
+    cells = [find_sightings(*some_near(*pair)) for pair in enumerate(frames(40, true_map()))]
+    result = calibrate(concatenate(cells), CAMERA.shape)
+    assert rms(result.distortion.offset - true_map()) < 0.4 * rms(true_map())
+    assert result.gain > 0.9 and result.after < 0.85 * result.before
+
+
 def test_sensor_without_distortion_gets_a_field_below_its_uncertainty():
     distortion = calibrate(seen(30, 0.0), CAMERA.shape).distortion
     assert rms(distortion.offset) < max(rms(distortion.deviation), 2e-5)
@@ -93,7 +110,7 @@ def test_joint_solution_is_that_of_dense_least_squares():
     cells = seen(6, true_map(), noise=0.0)
     grid = cell_grid(CAMERA.shape)
     size, weight = grid[0] * grid[1], np.random.default_rng(0).uniform(0.5, 1, len(cells.cell))
-    found = solve(cells, np.ones((1, len(weight))), weight, grid, 1.0)[0]
+    found = solve(cells, np.ones((1, len(weight))), weight, grid, [1.0])[0]
     planes = len(cells.frame)
     design = np.zeros((len(weight), size + 3 * planes))
     rows = np.arange(len(weight))

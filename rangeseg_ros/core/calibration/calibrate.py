@@ -9,7 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
-from rangeseg_ros.core.calibration.validation import BLOCKS, Fold, learn, without_plane
+from rangeseg_ros.core.calibration.validation import (
+    BLOCKS,
+    Fold,
+    learn,
+    root_mean_square,
+    without_plane,
+)
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 
@@ -44,7 +50,8 @@ class Calibration(NamedTuple):
         Bands of columns within the map, 1/m.
     gain : float
         Share of the field that held on frames left out.
-    smoothness : float
+    smoothness : tuple of float
+        Of the offset and the slope.
     folds : list of Fold
         The blocks left out.
     """
@@ -53,18 +60,18 @@ class Calibration(NamedTuple):
     views: NDArray[np.intp]
     profile: NDArray[np.float64]
     gain: float
-    smoothness: float
+    smoothness: tuple[float, ...]
     folds: list[Fold]
 
     @property
     def before(self) -> float:
         """Root mean square residual of the cells of planes, 1/m."""
-        return _rms([(fold.cells, fold.before) for fold in self.folds])
+        return root_mean_square([(fold.weight, fold.before) for fold in self.folds])
 
     @property
     def after(self) -> float:
         """The same on frames left out, with the map of the others, 1/m."""
-        return _rms([(fold.cells, fold.after) for fold in self.folds])
+        return root_mean_square([(fold.weight, fold.after) for fold in self.folds])
 
 
 def calibrate(
@@ -137,11 +144,6 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
             f'too few ranges: most parts of the image see planes at {typical} distances or less, '
             f'{_FEWEST_VIEWS} are needed to tell the sensor from the shape of things; {ADVICE}'
         )
-
-
-def _rms(parts: list[tuple[int, float]]) -> float:
-    cells, value = np.array(parts, np.float64).T
-    return float(np.sqrt((cells * value**2).sum() / cells.sum()))
 
 
 def _in_pixels(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:

@@ -7,15 +7,19 @@ rays of a plane's cells and P = W - W R (R^T W R)^-1 R^T W, the field solves
 
     (sum_p P_p + smoothness L) m = sum_p P_p y_p,
 
-L the Laplacian of the cells (first differences between neighbours, squared). It is solved by
-conjugate gradients, as no matrix but those of single planes is ever formed. Weights fall as
-1 / (1 + (e / (k s))^2) with the residual e (Cauchy), s their robust standard deviation, so that
-wrong regions do not bend the field.
+L the Laplacian of the cells (first differences between neighbours, squared), with a smoothness
+for each coefficient. It is solved by conjugate gradients, as no matrix but those of single planes
+is ever formed. Weights fall as 1 / s^2 with the robust standard deviation s of a plane's residuals
+(where ranges err, near planes are much noisier in inverse depth), and as 1 / (1 + (e / (k s))^2)
+with the residual e (Cauchy), so that wrong regions do not bend the field.
 
 A plane in inverse depth over the whole image is in the null space: any of it may be added to m.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -36,7 +40,7 @@ def solve(
     basis: NDArray[np.float64],
     weight: NDArray[np.float64],
     grid: tuple[int, int],
-    smoothness: float,
+    smoothness: Sequence[float],
     start: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Coefficients of the field.
@@ -50,7 +54,7 @@ def solve(
     weight : (N,) float64
     grid : (int, int)
         Rows and columns of cells.
-    smoothness : float
+    smoothness : (K,) float
         Weight of the squared difference of neighbouring cells, in sightings of a cell.
     start : (K, rows * columns) float64, optional
         Where to begin.
@@ -65,14 +69,14 @@ def solve(
     inverses, residual = _planes(seen.start, seen.ray, seen.inverse, weight)
     target = np.stack([np.bincount(seen.cell, weight * b * residual, size) for b in basis])
     weights = np.stack([np.bincount(seen.cell, weight * b * b, size) for b in basis])
-    diagonal = weights + 4 * smoothness + _RIDGE
+    diagonal = weights + 4 * np.asarray(smoothness)[:, None] + _RIDGE
 
     def product(vector: NDArray[np.float64]) -> NDArray[np.float64]:
         result = np.zeros_like(vector)
         sums = seen.start, seen.cell, seen.ray, weight, basis, inverses
         _add_normal_product(*sums, vector, result)
-        for part, image in zip(result, vector, strict=True):
-            _add_laplacian(image, grid, smoothness, part)
+        for part, image, strength in zip(result, vector, smoothness, strict=True):
+            _add_laplacian(image, grid, float(strength), part)
         return result
 
     rest = target - product(field)
@@ -93,10 +97,15 @@ def solve(
 
 
 def robust_weights(seen: Sightings, error: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cauchy weights (N,) of cells whose inverse depth is wrong by `error` (N,)."""
+    """Weights (N,), at most 1, of cells whose inverse depth is wrong by `error` (N,)."""
     residual = residuals(seen, seen.inverse - error)
-    spread = max(1.4826 * float(np.median(np.abs(residual))), 1e-9)
-    weight: NDArray[np.float64] = 1 / (1 + (residual / (_CAUCHY * spread)) ** 2)
+    size = np.abs(residual)
+    typical = max(float(np.median(size)), 1e-9)
+    # A plane that looks better than most is as likely too small to show its errors.
+    middle = [max(float(np.median(size[a:b])), typical) for a, b in pairwise(seen.start)]
+    spread = 1.4826 * np.array(middle)[seen.plane()]
+    weight: NDArray[np.float64] = (1.4826 * typical / spread) ** 2
+    weight /= 1 + (residual / (_CAUCHY * spread)) ** 2
     return weight
 
 

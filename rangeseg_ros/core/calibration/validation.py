@@ -1,14 +1,18 @@
 """How much of the residuals a field explains on frames it was not learned from.
 
 The frames are cut into blocks of consecutive ones, as neighbours in time see almost the same. Each
-block is left out once; what the field of the others does to its residuals decides how smooth the
-field is, whether it depends on the distance, and by how much it is scaled down where little of it
-holds. The fields of the blocks left out also tell the uncertainty (delete-a-group jackknife), to
-which the difference to a less smooth field is added.
+block is left out once, and the field of the others is tried on it. With two blocks, of which each
+sees much that the other does not, this decides how smooth the field is, and whether it depends on
+the distance. With more blocks, whose fields are almost that of all frames, it tells how much of
+the residual is explained, by how much the field is scaled down where little of it holds, and its
+uncertainty (delete-a-group jackknife, to which the difference to a less smooth field is added).
+
+Cells count by their weights, as in the solution: a few wrong regions would outvote the field.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -24,8 +28,11 @@ BLOCKS = 5
 """Parts of the recording that are left out in turn."""
 # Tried from the smoothest on, in sightings of a cell, a factor of 4 apart.
 _SMOOTHNESS = (64.0, 16.0, 4.0)
-# Less of the residual that a second coefficient must leave: it doubles what is learned.
-_WORTH = 0.9
+# By how much the second coefficient is smoother: it is known worse, as distances differ little.
+_SLOPE_SMOOTHER = (64.0, 16.0, 4.0)
+# Times the variance explained that a second coefficient must explain. Sensors without it stay
+# below 1.00 and a Kinect below 1.15; with it, readers of page 1 alone are left without a map.
+_WORTH = 1.2
 # Cells over which the uncertainty is averaged: four degrees of freedom are few.
 _AVERAGED = 2.0
 
@@ -41,8 +48,8 @@ class Fold(NamedTuple):
         Field of the other frames, with the bands, 1/m.
     before, after : float
         Root mean square residual of the cells of the block, without and with the field, 1/m.
-    cells : int
-        Number of these cells.
+    weight : float
+        Sum of the weights of these cells.
     projection : (float, float)
         Sums over these cells of residual times field's share, and of its square.
     """
@@ -51,7 +58,7 @@ class Fold(NamedTuple):
     error: NDArray[np.float64]
     before: float
     after: float
-    cells: int
+    weight: float
     projection: tuple[float, float]
 
 
@@ -68,7 +75,7 @@ class Learned(NamedTuple):
         Standard deviation of the offset, 1/m.
     reference : float
         Inverse depth at which the offset holds, 1/m.
-    smoothness : float
+    smoothness : tuple of K float
     gain : float
         By which the field was scaled down, 0...1.
     folds : list of Fold
@@ -78,7 +85,7 @@ class Learned(NamedTuple):
     profile: NDArray[np.float64]
     deviation: NDArray[np.float64]
     reference: float
-    smoothness: float
+    smoothness: tuple[float, ...]
     gain: float
     folds: list[Fold]
 
@@ -94,7 +101,7 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
         Of the images.
     """
     reference = float(np.median(seen.inverse))
-    spread = max(float(seen.inverse.std()), 1e-6)
+    spread = max(1.4826 * float(np.median(np.abs(seen.inverse - reference))), 1e-6)
     # Of the planes, not of the measurements: a slope that is the same everywhere is then free, as
     # it only scales the planes, and cannot explain the noise away.
     slope = (seen.inverse - residuals(seen, seen.inverse) - reference) / spread
@@ -102,39 +109,48 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     grid = cell_grid(shape)
     # Two rounds of weights: the first are those of residuals without any field.
     weight = robust_weights(seen, np.zeros(len(seen.inverse)))
-    first = solve(seen, one, weight, grid, _SMOOTHNESS[-2])
+    first = solve(seen, one, weight, grid, _SMOOTHNESS[1:2])
     weight = robust_weights(seen, first[0, seen.cell])
 
-    blocks = np.array_split(np.unique(seen.frame), BLOCKS)
-    with ThreadPoolExecutor() as pool:
-        tasks = [
-            pool.submit(_folds, seen, one, weight, shape, (block[0], block[-1]), _SMOOTHNESS)
-            for block in blocks
-        ]
-        found = [task.result() for task in tasks]
-        totals = [_total([folds[i] for folds in found]) for i in range(len(_SMOOTHNESS))]
-        best = int(np.argmin(totals))
-        folds, basis = [folds[best] for folds in found], one
-        two = np.stack([one[0], slope])
-        smoothness = _SMOOTHNESS[best]
-        tasks = [
-            pool.submit(_folds, seen, two, weight, shape, (block[0], block[-1]), (smoothness,))
-            for block in blocks
-        ]
-        sloped = [task.result()[0] for task in tasks]
-    if _total(sloped) < _WORTH * totals[best]:
-        folds, basis = sloped, two
+    # Of two halves each sees much that the other does not, as later recordings will.
+    tried: list[tuple[float, ...]] = [(value,) for value in _SMOOTHNESS]
+    explained = [_explained(folds) for folds in _leave_out(seen, one, weight, shape, 2, tried)]
+    basis, smoothness = one, tried[int(np.argmax(explained))]
+    two, least = np.stack([one[0], slope]), _WORTH * max(*explained, 0.0)
+    tried = [(*smoothness, smoothness[0] * factor) for factor in _SLOPE_SMOOTHER]
+    explained = [_explained(folds) for folds in _leave_out(seen, two, weight, shape, 2, tried)]
+    if max(explained) > least:
+        basis, smoothness = two, tried[int(np.argmax(explained))]
+    (folds,) = _leave_out(seen, basis, weight, shape, BLOCKS, [smoothness])
     profile = column_profile(seen)
     banded = seen._replace(inverse=seen.inverse - _in_cells(profile, shape)[seen.cell])
     field = solve(banded, basis, weight, grid, smoothness)
     along, square = np.sum([fold.projection for fold in folds], axis=0)
     gain = float(np.clip(along / square, 0, 1)) if square > 0 else 0.0
     # What smoothing costs shows in a field that is less smooth.
-    rougher = solve(banded, basis, weight, grid, smoothness / 4, field)
+    rougher = solve(banded, basis, weight, grid, [value / 4 for value in smoothness], field)
     bias = rougher[0] - field[0]
     deviation = gain * _deviation([fold.error[0] for fold in folds], bias, seen, grid)
     field[1:] /= spread
     return Learned(gain * field, gain * profile, deviation, reference, smoothness, gain, folds)
+
+
+def _leave_out(
+    seen: Sightings,
+    basis: NDArray[np.float64],
+    weight: NDArray[np.float64],
+    shape: tuple[int, int],
+    count: int,
+    tried: Sequence[Sequence[float]],
+) -> list[list[Fold]]:
+    """For each smoothness that is tried, a `Fold` of each of `count` blocks of frames."""
+    blocks = [
+        (int(block[0]), int(block[-1])) for block in np.array_split(np.unique(seen.frame), count)
+    ]
+    with ThreadPoolExecutor() as pool:
+        tasks = [pool.submit(_folds, seen, basis, weight, shape, block, tried) for block in blocks]
+        found = [task.result() for task in tasks]
+    return [list(folds) for folds in zip(*found, strict=True)]
 
 
 def _folds(
@@ -143,7 +159,7 @@ def _folds(
     weight: NDArray[np.float64],
     shape: tuple[int, int],
     block: tuple[int, int],
-    smoothness: tuple[float, ...],
+    tried: Sequence[Sequence[float]],
 ) -> list[Fold]:
     """A `Fold` for each smoothness, of the frames from the first to the last of the block."""
     frames = np.arange(len(seen.jumps))
@@ -152,26 +168,30 @@ def _folds(
     out = outside[seen.frame][seen.plane()]
     bands = _in_cells(column_profile(train), shape)
     train = train._replace(inverse=train.inverse - bands[train.cell])
-    before = residuals(test, test.inverse)
+    before, counts = residuals(test, test.inverse), weight[~out]
     field, result = None, []
-    for value in smoothness:
-        field = solve(train, basis[:, out], weight[out], cell_grid(shape), value, field)
+    for smoothness in tried:
+        field = solve(train, basis[:, out], weight[out], cell_grid(shape), smoothness, field)
         error = field.copy()
         error[0] += bands
-        share = (basis[:, ~out] * error[:, test.cell]).sum(axis=0)
-        share = residuals(test, share)
-        squares = [float((part**2).mean()) for part in (before, before - share)]
-        projection = float((before * share).sum()), float((share**2).sum())
-        rms = np.sqrt(squares)
-        result.append(Fold(block, error, rms[0], rms[1], len(before), projection))
+        share = residuals(test, (basis[:, ~out] * error[:, test.cell]).sum(axis=0))
+        squares = [float(counts @ part**2) for part in (before, before - share)]
+        projection = float(counts @ (before * share)), float(counts @ share**2)
+        total = float(counts.sum())
+        rms = np.sqrt(np.array(squares) / total)
+        result.append(Fold(block, error, rms[0], rms[1], total, projection))
     return result
 
 
-def _total(folds: list[Fold]) -> float:
-    """Root mean square residual of all blocks, with the field."""
-    cells = np.array([fold.cells for fold in folds])
-    squares = np.array([fold.after**2 for fold in folds])
-    return float(np.sqrt((cells * squares).sum() / cells.sum()))
+def _explained(folds: list[Fold]) -> float:
+    """Sum of the squares that the field takes away from the residuals of all blocks."""
+    return sum(fold.weight * (fold.before**2 - fold.after**2) for fold in folds)
+
+
+def root_mean_square(parts: list[tuple[float, float]]) -> float:
+    """Of parts with a weight and a root mean square each."""
+    weight, value = np.array(parts, np.float64).T
+    return float(np.sqrt((weight * value**2).sum() / weight.sum()))
 
 
 def _in_cells(profile: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
