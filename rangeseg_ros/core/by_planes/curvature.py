@@ -30,6 +30,11 @@ _NOISE = 9.0 * 3.0 * 4.0
 _STRIDE = 2
 # Standard deviations, of noise and twice the distortion, to which a residual is the region's.
 _INLIER = 4.0
+# Exponents of x and y in the terms of a quadratic, in the powers of x and y up to the fourth, and
+# which of these are the products of two terms.
+_TERMS = [(n - b, b) for n in range(3) for b in range(n + 1)]
+_POWERS = [(a, b) for b in range(5) for a in range(5 - b)]
+_PRODUCTS = np.array([[_POWERS.index((a + c, b + d)) for c, d in _TERMS] for a, b in _TERMS])
 
 
 def find_curved(
@@ -64,8 +69,8 @@ def find_curved(
     limit = np.square(_INLIER) * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
     parts = map_halves(_normal_equations, len(filled), *arrays, theta, slope, limit)
-    normal, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
-    normal += np.triu(normal, 1).transpose(0, 2, 1)
+    powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
+    normal = powers[:, _PRODUCTS]
     size = np.maximum(normal[:, 0, 0], 1)
     # What the quadratic explains more than its constant and linear terms do.
     whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
@@ -148,58 +153,78 @@ def _normal_equations(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of a quadratic in the pixel coordinates, from some rows of blocks.
 
-    Of the symmetric matrices the upper triangles. `slope` is |theta|, 0 where there is no plane.
-    What is fitted for each region are residuals in standard deviations of the noise of a pixel,
-    of a block their mean as often as it has pixels; those of a mean square beyond `limit` are
-    left out. The third array (3, M + 1) has the sum of their squares, the area of each region in
-    square metres, and the sum over its pixels of the standard deviation in metres, both on and
-    across its plane: neither depends on how obliquely it is seen.
+    The first array (M + 1, 15) has the sums of x^0 ... x^4, of x^0 y ... x^3 y and so on to y^4,
+    which the matrices consist of. `slope` is |theta|, 0 where there is no plane. What is fitted
+    are residuals in standard deviations of the noise of a pixel, of a block their mean as often as
+    it has pixels; those of a mean square beyond `limit` are left out. The third array (3, M + 1)
+    has the sum of their squares, the area of each region in square metres, and the sum over its
+    pixels of the standard deviation in metres, both on and across its plane: neither depends on
+    how obliquely it is seen.
     """
     height, width = regions.shape
     count = len(theta)
-    normal, right, total = np.zeros((count, 6, 6)), np.zeros((count, 6)), np.zeros((3, count))
+    normal, right, total = np.zeros((count, 15)), np.zeros((count, 6)), np.zeros((3, count))
     for bi in range(first, after):
-        for bj in range(filled.shape[1]):
-            label, squared = int(filled[bi, bj]), blocks.squared[bi, bj]
+        # Of blocks of a region side by side, sums over powers of x: y is the same.
+        run, middle = 0, bi * BLOCK + BLOCK // 2
+        s0 = s1 = s2 = s3 = s4 = t0 = t1 = t2 = squares = areas = deviations = 0.0
+        for bj in range(filled.shape[1] + 1):
+            label = int(filled[bi, bj]) if bj < filled.shape[1] else 0
+            if label != run:
+                y, powers = (2 * middle - 1 - height) / width, (s0, s1, s2, s3, s4)
+                _add_terms(normal[run], right[run], y, powers, (t0, t1, t2))
+                _add_size(total, run, squares, areas, deviations)
+                s0 = s1 = s2 = s3 = s4 = t0 = t1 = t2 = squares = areas = deviations = 0.0
+                run = label
+            if bj == filled.shape[1]:
+                continue
+            squared = blocks.squared[bi, bj]
             if label > 0:
                 # Of too few pixels there is no plane.
                 if squared == 0 or slope[label] == 0:
                     continue
-                moments = blocks.moments[bi, bj]
-                pixels = moments[COUNT]
-                deviation = np.sqrt(random_variance(sensor, squared))
-                left = squares_left(moments, theta[label])
-                square = max(left, 0.0) / (deviation * deviation * pixels)
+                moments, variance = blocks.moments[bi, bj], random_variance(sensor, squared)
+                pixels, left = moments[COUNT], squares_left(moments, theta[label])
+                square = max(left, 0.0) / (variance * pixels)
+                if square > limit[label]:
+                    continue
                 # The mean of residuals times the plane's inverse range, which hardly varies.
                 along = 0.0
                 for m in range(3):
                     along += theta[label, m] * moments[6 + m]
                 level = max(left - moments[CHI2] + 2 * along, 1e-300)
-                residual = (along - level) / np.sqrt(level * pixels) / deviation
-                i, j = bi * BLOCK + BLOCK // 2, bj * BLOCK + BLOCK // 2
-                if square <= limit[label]:
-                    x, y = (2 * j - 1 - width) / width, (2 * i - 1 - height) / width
-                    _add_terms(normal[label], right[label], x, y, pixels, residual)
-                    mean = np.sqrt(squared)
-                    _add_size(label, i, j, mean, deviation, pixels, square, rays, slope, total)
+                residual = (along - level) / np.sqrt(level * pixels * variance)
+                j = bj * BLOCK + BLOCK // 2
+                x = (2 * j - 1 - width) / width
+                a, b = pixels * x * x, pixels * residual
+                s0, s1, s2 = s0 + pixels, s1 + pixels * x, s2 + a
+                s3, s4 = s3 + a * x, s4 + a * x * x
+                t0, t1, t2 = t0 + b, t1 + b * x, t2 + b * x * x
+                area, deviation = _size(middle, j, squared, variance, rays)
+                squares += pixels * square
+                areas += pixels * area * slope[label]
+                deviations += pixels * deviation / slope[label]
                 continue
             for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):
                 for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), _STRIDE):
                     label, value = int(regions[i, j]), float(inverse[i, j])
                     if label == 0 or value == 0 or slope[label] == 0:
                         continue
-                    deviation = np.sqrt(random_variance(sensor, value * value))
+                    squared = value * value
+                    variance = random_variance(sensor, squared)
                     residual = value
                     for m in range(3):
                         residual -= theta[label, m] * rays[i, j, m]
-                    residual /= deviation
+                    residual /= np.sqrt(variance)
                     square, pixels = residual * residual, float(_STRIDE**2)
                     if square <= limit[label]:
                         x, y = (2 * j - width) / width, (2 * i - height) / width
-                        _add_terms(normal[label], right[label], x, y, pixels, residual)
-                        _add_size(
-                            label, i, j, value, deviation, pixels, square, rays, slope, total
-                        )
+                        a, b = pixels * x * x, pixels * residual
+                        powers = pixels, pixels * x, a, a * x, a * x * x
+                        _add_terms(normal[label], right[label], y, powers, (b, b * x, b * x * x))
+                        area, deviation = _size(i, j, squared, variance, rays)
+                        area, deviation = area * slope[label], deviation / slope[label]
+                        _add_size(total, label, pixels * square, pixels * area, pixels * deviation)
     return normal, right, total
 
 
@@ -207,38 +232,47 @@ def _normal_equations(
 def _add_terms(
     normal: NDArray[np.float64],
     right: NDArray[np.float64],
-    x: float,
     y: float,
-    pixels: float,
-    residual: float,
+    powers: tuple[float, float, float, float, float],
+    residuals: tuple[float, float, float],
 ) -> None:
-    """Add so many pixels at a place to the normal equations of a quadratic."""
-    terms = (1.0, x, y, x * x, x * y, y * y)
-    for m in range(6):
-        right[m] += pixels * residual * terms[m]
-        for n in range(m, 6):
-            normal[m, n] += pixels * terms[m] * terms[n]
+    """Add pixels at one y to the normal equations of a quadratic.
+
+    Given are the sums of x^0 ... x^4 over them, and of their residuals times x^0 ... x^2.
+    """
+    entry, of_y = 0, 1.0
+    for b in range(5):
+        for a in range(5 - b):
+            normal[entry] += powers[a] * of_y
+            entry += 1
+        of_y *= y
+    t0, t1, t2 = residuals
+    for entry, value in enumerate((t0, t1, t0 * y, t2, t1 * y, t0 * y * y)):
+        right[entry] += value
 
 
 @njit(cache=True, inline='always')
 def _add_size(
-    label: int,
-    i: int,
-    j: int,
-    inverse: float,
-    deviation: float,
-    pixels: float,
-    square: float,
-    rays: NDArray[np.float32],
-    slope: NDArray[np.float64],
-    total: NDArray[np.float64],
+    total: NDArray[np.float64], label: int, square: float, area: float, deviation: float
 ) -> None:
-    """Add so many pixels to the third result of `_normal_equations`."""
-    total[0, label] += pixels * square
+    """Add to the third result of `_normal_equations`."""
+    total[0, label] += square
+    total[1, label] += area
+    total[2, label] += deviation
+
+
+@njit(cache=True, inline='always')
+def _size(
+    i: int, j: int, squared: float, variance: float, rays: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Area over |theta|, and standard deviation times |theta|, of a pixel on its plane.
+
+    Of such a squared inverse range and variance. The area is 0 where it is not known.
+    """
     # An error of the inverse leaves the plane by distance / inverse times as much.
-    total[2, label] += pixels * deviation / (slope[label] * inverse)
+    deviation = np.sqrt(variance / squared)
     if i == 0 or j == 0:
-        return
+        return 0.0, deviation
     across = down = length = left = above = 0.0
     for k in range(3):
         across += (rays[i, j, k] - rays[i, j - 1, k]) ** 2
@@ -247,6 +281,7 @@ def _add_size(
         left += rays[i, j - 1, k] ** 2
         above += rays[i - 1, j, k] ** 2
     # Rays of a cloud are 0 where nothing was measured.
-    if min(length, left, above) > 0:
-        # Seen face on it is smaller by the cosine, distance inverse / length.
-        total[1, label] += pixels * np.sqrt(across * down * length) * slope[label] / inverse**3
+    if min(length, left, above) == 0:
+        return 0.0, deviation
+    # Seen face on it is smaller by the cosine, distance inverse / length.
+    return np.sqrt(across * down * length / squared) / squared, deviation
