@@ -7,7 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows
-from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.grid import CHUNK, Grid
 
 VGA = 640 * 480
 """Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
@@ -106,29 +106,43 @@ def _find_components(
     start = first * width
     count = 0
     for i in range(first, after):
+        # Views of the rows, of which the compiler takes many pixels at a time.
+        above = max(i - 1, first)
+        here, over, below = labels[i], labels[above], grid.below[min(above, len(grid.below) - 1)]
+        own, upper, right, measured = found[i], found[above], grid.right[i], valid[i]
         # What was last found equivalent: most pixels tell what the one before has told.
         known = -1
-        for j in range(width):
-            if not valid[i, j]:
-                found[i, j] = 0
-                continue
-            here = labels[i, j]
-            left = j > 0 and grid.right[i, j - 1] > 0 and labels[i, j - 1] == here
-            up = i > first and grid.below[i - 1, j] > 0 and labels[i - 1, j] == here
-            left &= found[i, j - 1] > 0
-            up = up and found[i - 1, j] > 0
-            if left:
-                found[i, j] = found[i, j - 1]
-                if up and found[i - 1, j] != known:
-                    known = found[i - 1, j]
-                    _unite(int(found[i, j]), int(known), parent)
-            elif up:
-                found[i, j] = known = found[i - 1, j]
-            else:
-                known = -1
-                count += 1
-                parent[start + count] = start + count
-                found[i, j] = start + count
+        for chunk in range(0, width, CHUNK):
+            stop = min(chunk + CHUNK, width)
+            if chunk > 0 and own[chunk - 1] > 0:
+                label, number = here[chunk - 1], own[chunk - 1]
+                a, b = here[chunk:stop], right[chunk - 1 : stop - 1]
+                c, d, e = measured[chunk:stop], upper[chunk:stop], own[chunk:stop]
+                alike = True
+                for k in range(len(a)):
+                    alike &= (a[k] == label) & (b[k] > 0) & c[k] & (d[k] == known)
+                if alike:
+                    for k in range(len(e)):
+                        e[k] = number
+                    continue
+            for j in range(chunk, stop):
+                if not measured[j]:
+                    own[j] = 0
+                    continue
+                left = j > 0 and right[j - 1] > 0 and here[j - 1] == here[j] and own[j - 1] > 0
+                up = i > first and below[j] > 0 and over[j] == here[j] and upper[j] > 0
+                if left:
+                    own[j] = own[j - 1]
+                    if up and upper[j] != known:
+                        known = upper[j]
+                        _unite(int(own[j]), int(known), parent)
+                elif up:
+                    own[j] = known = upper[j]
+                else:
+                    known = -1
+                    count += 1
+                    parent[start + count] = start + count
+                    own[j] = start + count
     return count
 
 
@@ -216,20 +230,26 @@ def _counts(
     height, width = regions.shape
     area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
     for i in range(first, after):
-        for j in range(width):
-            here = regions[i, j]
-            area[here] += 1
-            if (
-                i == 0
-                or j == 0
-                or i == height - 1
-                or j == width - 1
-                or regions[i, j - 1] != here
-                or regions[i, j + 1] != here
-                or regions[i - 1, j] != here
-                or regions[i + 1, j] != here
-            ):
-                perimeter[here] += 1
+        own, above, below = regions[i], regions[max(i - 1, 0)], regions[min(i + 1, height - 1)]
+        rim = i in (0, height - 1)
+        for chunk in range(0, width, CHUNK):
+            stop = min(chunk + CHUNK, width)
+            if not rim and chunk > 0 and stop < width:
+                a, b, c = own[chunk:stop], own[chunk - 1 : stop - 1], own[chunk + 1 : stop + 1]
+                d, e = above[chunk:stop], below[chunk:stop]
+                unlike = own[chunk] ^ own[chunk]
+                for k in range(len(a)):
+                    unlike |= (a[k] ^ b[k]) | (a[k] ^ c[k]) | (a[k] ^ d[k]) | (a[k] ^ e[k])
+                if unlike == 0:
+                    area[own[chunk]] += stop - chunk
+                    continue
+            for j in range(chunk, stop):
+                here = own[j]
+                area[here] += 1
+                left, right = own[max(j - 1, 0)], own[min(j + 1, width - 1)]
+                inside = not rim and 0 < j < width - 1 and left == here == right
+                if not inside or above[j] != here or below[j] != here:
+                    perimeter[here] += 1
     return area, perimeter
 
 
@@ -274,6 +294,8 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
 
 def drop_regions(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
+    if not dropped.any():
+        return regions
     kept = ~dropped
     kept[0] = False
     return relabel(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))

@@ -27,7 +27,6 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.graphcut.expansion import (
-    CHUNK,
     GridLabelling,
     Sites,
     are_alike,
@@ -37,6 +36,7 @@ from rangeseg_ros.core.graphcut.expansion import (
     fronts,
 )
 from rangeseg_ros.core.runtime.threads import run_rows, submit
+from rangeseg_ros.core.sensing.grid import CHUNK
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # An improvement smaller than this is rounding.

@@ -14,9 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
-
-CHUNK = 16
-"""Sites that are compared at a time."""
+from rangeseg_ros.core.sensing.grid import CHUNK
 
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
