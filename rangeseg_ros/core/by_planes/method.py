@@ -20,6 +20,7 @@ from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.interior import Inside
 from rangeseg_ros.core.regions import VGA, by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
@@ -139,9 +140,10 @@ def unite_regions(
     sensor : SensorModel
     grid : Grid
     """
-    fits = Fits.of(regions, image, sensor, blocks)
-    count = len(fits.theta)
-    group = group_coplanar(fits, find_borders(regions, grid, count, fits.inner))
+    inside, count = Inside.of(regions), int(regions.max(initial=0)) + 1
+    borders = submit(find_borders, regions, grid, count, inside.inner)
+    fits = Fits.of(regions, image, sensor, blocks, inside)
+    group = group_coplanar(fits, borders.result())
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)

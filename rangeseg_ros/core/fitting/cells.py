@@ -82,7 +82,7 @@ class Cells(NamedTuple):
         return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def measure_regions(
     labels: NDArray[np.uint16], inner: NDArray[np.uint16], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:

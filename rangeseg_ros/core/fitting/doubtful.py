@@ -28,12 +28,42 @@ _OUTLIER = 4.0
 _SURE, _OUTLYING, _AT_RIM = 0, 1, 2
 
 
-def first_sums(
-    labels: NDArray[np.uint16],
+def sums_of_blocks(
     image: RangeImage,
     sensor: SensorModel,
     blocks: Blocks,
     filled: NDArray[np.uint16],
+    count: int,
+) -> NDArray[np.float64]:
+    """Sums over the blocks that regions fill.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    sensor : SensorModel
+    blocks : Blocks
+        Of the image.
+    filled : (rows, columns) uint16
+        See `interior.fill`.
+    count : int
+        M + 1.
+
+    Returns
+    -------
+    (M + 1, 25) float64
+        As of a cell. Zeros for a cloud, as blocks do not tell its points.
+    """
+    if image.camera is None:
+        return np.zeros((count, RECORD))
+    return _sum_blocks(filled, blocks, sensor, count)
+
+
+def first_sums(
+    sums: NDArray[np.float64],
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    sensor: SensorModel,
     area: NDArray[np.intp],
 ) -> NDArray[np.float64]:
     """Sums over regions that tell which pixels are outliers.
@@ -42,15 +72,13 @@ def first_sums(
 
     Parameters
     ----------
+    sums : (M + 1, 25) float64
+        Of the blocks, see `sums_of_blocks`.
     labels : (H, W) uint16
         0...M.
     image : RangeImage
         (H, W).
     sensor : SensorModel
-    blocks : Blocks
-        Of the image.
-    filled : (rows, columns) uint16
-        See `interior.fill`.
     area : (M + 1,) int
         Pixels of each region.
 
@@ -59,18 +87,13 @@ def first_sums(
     (M + 1, 25) float64
         As of a cell.
     """
-    central = image.camera is not None
-    sums = np.zeros((len(area), RECORD))
-    if central:
-        sums = np.add(*map_halves(_sum_blocks, len(filled), filled, blocks, sensor, len(area)))
-    # Of a cloud, blocks do not tell the points.
     ragged = 2 * sums[:, COUNT] < area
     ragged[0] = False
-    if ragged.any():
-        arrays = labels, image.inverse, image.rays, ragged, sensor, central
-        pixels = np.add(*map_halves(_sum_pixels, len(labels), *arrays))
-        sums = np.where(ragged[:, None], pixels, sums)
-    return sums
+    if not ragged.any():
+        return sums
+    arrays = labels, image.inverse, image.rays, ragged, sensor, image.camera is not None
+    pixels = np.add(*map_halves(_sum_pixels, len(labels), *arrays))
+    return np.where(ragged[:, None], pixels, sums)
 
 
 def sums_without_doubtful(
@@ -93,7 +116,7 @@ def sums_without_doubtful(
     cells : Cells
         Empty, of M + 1 regions.
     labels, image, sensor, blocks
-        As for `first_sums`.
+        As for `first_sums` and `sums_of_blocks`.
     theta : (M + 1, 3) float64
         First planes.
     inner : (rows, columns) uint16
@@ -112,28 +135,29 @@ def sums_without_doubtful(
     taken = np.where((cells.of_blocks() & central)[inner], inner, np.uint16(0))
     arrays = labels, image.inverse, image.rays, blocks, taken, cells, sensor, theta, central
     parts = map_halves(_sort, len(labels), *arrays)
-    (pixels, outliers, rims), (sure, outlying, rim) = (a + b for a, b in zip(*parts, strict=True))
+    (counts, sums), (lower_counts, lower_sums) = parts
+    pixels, outliers, rims = counts + lower_counts
+    sums += lower_sums
+    sure, outlying, rim = (cells._replace(sums=part) for part in sums)
+    kept, few = 2 * outliers > pixels, 2 * (outliers + rims) <= pixels
+    explained = sure.regions() + rim.regions() + kept[:, None] * outlying.regions()
     region = np.repeat(np.arange(len(cells.size)), np.diff(cells.start))
-    kept = 2 * outliers > pixels
-    sure += rim + outlying * kept[region, None]
-    explained = cells._replace(sums=sure).regions()
-    few = 2 * (outliers + rims) <= pixels
-    sure -= rim * few[region, None]
-    return cells._replace(sums=sure), pixels, outliers, explained
+    for part, chosen in ((outlying, kept), (rim, ~few)):
+        added = np.flatnonzero(chosen[region])
+        sure.sums[added] += part.sums[added]
+    return sure, pixels, outliers, explained
 
 
 @njit(cache=True, nogil=True)
 def _sum_blocks(
-    first: int,
-    after: int,
     filled: NDArray[np.uint16],
     blocks: Blocks,
     sensor: SensorModel,
     count: int,
 ) -> NDArray[np.float64]:
-    """Sums (count, 25) over the blocks of each region in some rows of blocks."""
+    """Sums (count, 25) over the blocks of each region."""
     sums = np.zeros((count, RECORD))
-    for i in range(first, after):
+    for i in range(len(filled)):
         for j in range(filled.shape[1]):
             if filled[i, j] > 0 and blocks.squared[i, j] > 0:
                 record = sums[filled[i, j]]

@@ -9,8 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
-from rangeseg_ros.core.fitting.doubtful import first_sums, sums_without_doubtful
-from rangeseg_ros.core.fitting.interior import fill, interior
+from rangeseg_ros.core.fitting.doubtful import (
+    first_sums,
+    sums_of_blocks,
+    sums_without_doubtful,
+)
+from rangeseg_ros.core.fitting.interior import Inside
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
@@ -18,6 +22,7 @@ from rangeseg_ros.core.fitting.uncertainty import (
     systematic_field,
     theta_covariances,
 )
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -77,6 +82,7 @@ class Fits(NamedTuple):
         image: RangeImage,
         sensor: SensorModel,
         blocks: Blocks | None = None,
+        inside: Inside | None = None,
     ) -> Fits:
         """Fit a plane to every region.
 
@@ -97,13 +103,16 @@ class Fits(NamedTuple):
             Errors of the image.
         blocks : Blocks, optional
             Of the image, where they are known.
+        inside : Inside, optional
+            Of the labels, where it is known.
         """
         blocks = blocks or Blocks.of(image)
-        filled = fill(labels)
-        inner = interior(labels, filled)
+        filled, inner = inside or Inside.of(labels)
         count = int(labels.max(initial=0)) + 1
-        box, border, area = measure_regions(labels, inner, count)
-        first = _theta(first_sums(labels, image, sensor, blocks, filled, area))
+        measures = submit(measure_regions, labels, inner, count)
+        sums = sums_of_blocks(image, sensor, blocks, filled, count)
+        box, border, area = measures.result()
+        first = _theta(first_sums(sums, labels, image, sensor, area))
         cells, pixels, outliers, explained = sums_without_doubtful(
             Cells.empty(box, border), labels, image, first, sensor, blocks, inner
         )

@@ -105,7 +105,7 @@ def plane_jacobians(
     return jacobian
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _middles(
     cells: Cells,
     theta: NDArray[np.float64],
