@@ -13,28 +13,20 @@ only blocks whose four parts are flat themselves are compared, scale by scale.
 
 from __future__ import annotations
 
-from functools import cache
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
-from rangeseg_ros.core.fitting.alike import Sets, alike, median, quantiles
+from rangeseg_ros.core.fitting.alike import median
+from rangeseg_ros.core.fitting.errors import Errors, explaining, variances
 from rangeseg_ros.core.fitting.quantisation import quantisation
+from rangeseg_ros.core.fitting.scale import QUANTILE, Scale
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quad_sums, quads
-from rangeseg_ros.core.sensing.moments import COUNT, SIZE
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import (
-    FLOOR,
-    SensorModel,
-    correlated_residuals,
-)
+from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
 
-# Most blocks lie on planes, but edges and curvature only ever add to the residuals.
-_QUANTILE = 0.4
 # Blocks of a scale that weigh as much as what is known beforehand.
 _PRIOR = 12
 ROUGH = 2.7
@@ -42,115 +34,15 @@ ROUGH = 2.7
 of a plane."""
 # The same with 9 degrees of freedom, of what one plane through four blocks leaves.
 _BENT = 3.1
-# Blocks of a scale that are looked at, about: a quantile of fifty in each of `alike`'s sets is off
-# by 6 % of a standard deviation, and the mean of these by little more than 1 %.
-_MOST = 1200
 # Share of the pixels of the fullest block that a block needs to count.
 _SHARE = 0.5
-# Rounds of least squares that settle the weights.
-_ROUNDS = 5
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
 # Median of chi-squared of 9 degrees of freedom over its mean.
 _MEDIAN = 0.927
-# Half of the likelihood ratio that is no chance, for one block: quantile 0.999 of chi-squared with
-# one degree of freedom times the relative variance of a median of chi-squared with nine.
-_CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
-
-
-class Errors(NamedTuple):
-    """A variance constant + quartic y^4 + tilt t at the inverse range y and squared slope t."""
-
-    constant: float
-    quartic: float
-    tilt: float
-
-    def at(self, squared: NDArray[np.float64], slope: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Variances where the squares of inverse range and slope are these."""
-        return FLOOR + self.constant + self.quartic * squared**2 + self.tilt * slope
-
-    def times(self, factor: float) -> Errors:
-        """So many times the variance."""
-        return Errors(factor * self.constant, factor * self.quartic, factor * self.tilt)
-
-
-class _Scale(NamedTuple):
-    """Blocks of a scale that count, as many as it takes.
-
-    Attributes
-    ----------
-    place : (N,) int
-        Their numbers among all blocks of the scale.
-    squared, slope : (N,) float64
-        As of `Blocks`.
-    sets : Sets
-        Of these N.
-    """
-
-    place: NDArray[np.intp]
-    squared: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    sets: Sets
-
-    @classmethod
-    def of(cls, blocks: Blocks, used: NDArray[np.bool_]) -> _Scale:
-        place = np.flatnonzero(used)
-        place = place[:: max(len(place) // _MOST, 1)]
-        squared, slope = blocks.squared.ravel()[place], blocks.slope.ravel()[place]
-        return cls(place, squared, slope, alike(squared, slope))
-
-    def pixels(self, blocks: Blocks) -> NDArray[np.float64]:
-        """Measured pixels (N,) of each."""
-        pixels: NDArray[np.float64] = blocks.moments.reshape(-1, SIZE)[self.place, COUNT]
-        return pixels
-
-    def variance_ratio(
-        self, blocks: Blocks, level: NDArray[np.float64] | float
-    ) -> NDArray[np.float64]:
-        """Mean square residuals (N,) of what the quantile of those of a variance `level` is."""
-        freedom = np.maximum(self.pixels(blocks) - 3, 1)
-        ratio = blocks.residual.ravel()[self.place]
-        ratio /= level if isinstance(level, float) else level.ravel()[self.place]
-        return ratio / (freedom * _share(median(freedom)))
-
-    def mean(self, ratio: NDArray[np.float64], quantile: float) -> float:
-        """Mean over the sets of a quantile of what their blocks show of what was expected."""
-        return float(np.mean(quantiles(ratio, self.sets, quantile)))
-
-    def errors(
-        self,
-        variance: NDArray[np.float64],
-        quantile: float,
-        kinds: tuple[int, ...],
-        least: Errors,
-        known: Errors,
-    ) -> Errors:
-        """What explains the `variance` of most blocks.
-
-        At `least` so much there is, and of this so much is `known` and not asked for.
-        """
-        squared, tilt = (quantiles(term, self.sets, 0.5) for term in (self.squared, self.slope))
-        shown = quantiles(variance, self.sets, quantile)
-        shown = np.maximum(shown, least.at(squared, tilt))
-        there = known.at(squared, tilt) - FLOOR
-        blocks = len(self.place) / len(shown)
-        # What faces the sensor first: noise makes slopes of its own, that would explain it.
-        # Indices and no slice: kernels are compiled for layouts, and a slice's follows the size.
-        facing = np.arange(0, len(shown), self.sets.slopes)
-        terms = np.ones(len(squared)), squared**2
-        # A sensor errs in disparity or in range: of both together a few blocks tell nothing.
-        likeliest = [
-            (*_likeliest(terms[kind][facing], shown[facing], there[facing], blocks), kind)
-            for kind in kinds
-        ]
-        factor, _, kind = min(likeliest, key=lambda found: found[1])
-        constant, quartic = (factor, 0.0) if kind == 0 else (0.0, factor)
-        there += constant + quartic * terms[1]
-        straight, _ = _likeliest(tilt, shown, there, blocks)
-        return Errors(constant, quartic, straight)
 
 
 def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
@@ -172,38 +64,37 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     used = count >= _SHARE * count.max(initial=0)
     if np.count_nonzero(used) < _PRIOR:
         return prior
-    scale = _Scale.of(coarse, used)
+    scale = Scale.of(coarse, used)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
     none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
     variance = scale.variance_ratio(coarse, 1.0)
-    noise = scale.errors(variance, _QUANTILE, (0, 1), rounded, none)
-    level, flat = _flat_blocks(blocks, noise.at(coarse.squared, coarse.slope))
+    noise = explaining(scale, variance, QUANTILE, True, rounded, none)
+    level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope))
     if not flat.any():
         return prior
-    scale = _Scale.of(blocks, flat)
-    within = [scale.mean(scale.variance_ratio(blocks, level), _QUANTILE)]
+    scale = Scale.of(blocks, flat)
+    within = [scale.mean(scale.variance_ratio(blocks, level), QUANTILE)]
     between = filled = 1.0
     distortion = none
     # What is new in every pixel shows in the smallest blocks.
     shown = noise.times(within[0])
     # Lasers err in range alone.
-    kinds = (0, 1) if noise.quartic > 0 else (0,)
+    in_range = noise.quartic > 0
     side, parts = BLOCK, blocks
     while True:
-        whole = quad_sums(flat.astype(np.float64)) == 4
+        whole, apart, level = _of_four(flat, parts.residual, level)
         if np.count_nonzero(whole) < _PRIOR:
             break
-        apart, level = quad_sums(parts.residual), quad_sums(level) / 4
         parts = (
             coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
         )
-        scale = _Scale.of(parts, whole)
+        scale = Scale.of(parts, whole)
         excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
-        bending = scale.errors(excess.ravel()[scale.place], 0.5, kinds, none, shown)
-        within.append(scale.mean(scale.variance_ratio(parts, level), _QUANTILE))
+        bending = explaining(scale, excess.ravel()[scale.place], 0.5, in_range, none, shown)
+        within.append(scale.mean(scale.variance_ratio(parts, level), QUANTILE))
         # Measured in each of the four blocks: s^2 where there are no holes.
         pixels = median(scale.pixels(parts)) / 4
         if side == BLOCK:
@@ -211,10 +102,12 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
             filled = pixels / side**2
         # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
         smooth = bending.times(8 / pixels)._replace(tilt=0.0)
-        expected = shown.at(parts.squared, parts.slope) + bending.at(parts.squared, parts.slope)
+        expected = variances(shown, parts.squared, parts.slope)
+        expected += variances(bending, parts.squared, parts.slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
-            median(errors.at(scale.squared, scale.slope)) for errors in (distortion, smooth)
+            median(variances(errors, scale.squared, scale.slope))
+            for errors in (distortion, smooth)
         ]
         if typical[1] > typical[0]:
             distortion = smooth
@@ -253,39 +146,21 @@ def _flat_blocks(
     return level, flat
 
 
-@cache
-def _share(freedom: float) -> float:
-    """Quantile of chi-squared of so many degrees of freedom over its mean."""
-    return 2 * float(gammaincinv(freedom / 2, _QUANTILE)) / freedom
-
-
 @njit(cache=True)
-def _likeliest(
-    term: NDArray[np.float64],
-    variances: NDArray[np.float64],
-    known: NDArray[np.float64],
-    blocks: float,
-) -> tuple[float, float]:
-    """Factor >= 0 of a term (N,) that with what is `known` explains variances (N,).
-
-    Variances are spread in proportion to themselves (chi-squared): the likeliest factor is that of
-    least squares weighted by what it explains, found in a few rounds. It is 0 where what is known
-    explains medians of so many blocks as well. Also returns how unlikely it is, the deviance but
-    for a constant.
-    """
-    explained = np.full(len(variances), np.mean(variances))
-    factor = 0.0
-    for _ in range(_ROUNDS):
-        weight = term / explained**2
-        factor = max((weight * (variances - known)).sum(), 0.0)
-        factor /= max((weight * term).sum(), 1e-300)
-        explained = np.maximum(known + factor * term, 1e-3 * variances)
-    unlikely = (np.log(explained) + variances / explained).sum()
-    if known.min() > 0:
-        without = (np.log(known) + variances / known).sum()
-        if without - unlikely < _CHANCE / blocks:
-            return 0.0, without
-    return factor, unlikely
+def _of_four(
+    flat: NDArray[np.bool_], residual: NDArray[np.float64], level: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Of every 2 x 2 blocks (rows, columns): whether there are four, all of them flat; the sums
+    of their residuals; a fourth of that of their variances `level`."""
+    rows, columns = flat.shape
+    shape = (rows + 1) // 2, (columns + 1) // 2
+    count, apart, mean = np.zeros(shape, np.uint8), np.zeros(shape), np.zeros(shape)
+    for i in range(rows):
+        for j in range(columns):
+            count[i // 2, j // 2] += flat[i, j]
+            apart[i // 2, j // 2] += residual[i, j]
+            mean[i // 2, j // 2] += level[i, j] / 4
+    return count == 4, apart, mean
 
 
 def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:

@@ -108,27 +108,24 @@ def _sum_blocks(
                 moments[bi, bj, entry] = value
 
 
-@njit(cache=True)
 def quads(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
     """Moments (ceil(rows / 2), ceil(columns / 2), 13) of every 2 x 2 blocks."""
     rows, columns = blocks.shape[:2]
     result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, SIZE))
-    for i in range(rows):
+    run_rows(_sum_quads, len(result), blocks, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _sum_quads(
+    first: int, after: int, blocks: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """The same for some of its rows."""
+    rows, columns = blocks.shape[:2]
+    for i in range(2 * first, min(2 * after, rows)):
         for j in range(columns):
             for k in range(SIZE):
                 result[i // 2, j // 2, k] += blocks[i, j, k]
-    return result
-
-
-@njit(cache=True)
-def quad_sums(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums (ceil(rows / 2), ceil(columns / 2)) of every 2 x 2 values."""
-    rows, columns = values.shape
-    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2))
-    for i in range(rows):
-        for j in range(columns):
-            result[i // 2, j // 2] += values[i, j]
-    return result
 
 
 @njit(cache=True, nogil=True)

@@ -1,0 +1,104 @@
+"""Errors of a sensor that explain what blocks of one size show."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numba.extending import register_jitable
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.fitting.alike import quantiles
+from rangeseg_ros.core.fitting.scale import Scale
+from rangeseg_ros.core.sensing.sensor import FLOOR
+
+# Rounds of least squares that settle the weights.
+_ROUNDS = 5
+# Half of the likelihood ratio that is no chance, for one block: quantile 0.999 of chi-squared with
+# one degree of freedom times the relative variance of a median of chi-squared with nine.
+_CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
+
+
+class Errors(NamedTuple):
+    """A variance constant + quartic y^4 + tilt t at the inverse range y and squared slope t."""
+
+    constant: float
+    quartic: float
+    tilt: float
+
+    def times(self, factor: float) -> Errors:
+        """So many times the variance."""
+        return Errors(factor * self.constant, factor * self.quartic, factor * self.tilt)
+
+
+@register_jitable
+def variances(
+    errors: Errors, squared: NDArray[np.float64], slope: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Variances where the squares of inverse range and slope are these."""
+    return FLOOR + errors.constant + errors.quartic * squared**2 + errors.tilt * slope
+
+
+@njit(cache=True)
+def explaining(
+    scale: Scale,
+    variance: NDArray[np.float64],
+    quantile: float,
+    in_range: bool,
+    least: Errors,
+    known: Errors,
+) -> Errors:
+    """What explains the `variance` (N,) of most blocks of a scale.
+
+    At `least` so much there is, and of this so much is `known` and not asked for. Errors are in
+    disparity, or `in_range` if these explain more: of both together a few blocks tell nothing.
+    """
+    squared = quantiles(scale.squared, scale.sets, 0.5)
+    tilt = quantiles(scale.slope, scale.sets, 0.5)
+    shown = quantiles(variance, scale.sets, quantile)
+    shown = np.maximum(shown, variances(least, squared, tilt))
+    there = variances(known, squared, tilt) - FLOOR
+    blocks = len(scale.place) / len(shown)
+    # What faces the sensor first: noise makes slopes of its own, that would explain it.
+    # Indices and no slice: kernels are compiled for layouts, and a slice's follows the size.
+    facing = np.arange(0, len(shown), scale.sets.slopes)
+    ahead, before = shown[facing], there[facing]
+    constant, unlikely = _likeliest(np.ones(len(facing)), ahead, before, blocks)
+    quartic = 0.0
+    if in_range:
+        factor, less = _likeliest(squared[facing] ** 2, ahead, before, blocks)
+        if less < unlikely:
+            constant, quartic = 0.0, factor
+    there += constant + quartic * squared**2
+    straight, _ = _likeliest(tilt, shown, there, blocks)
+    return Errors(constant, quartic, straight)
+
+
+@njit(cache=True)
+def _likeliest(
+    term: NDArray[np.float64],
+    variances: NDArray[np.float64],
+    known: NDArray[np.float64],
+    blocks: float,
+) -> tuple[float, float]:
+    """Factor >= 0 of a term (N,) that with what is `known` explains variances (N,).
+
+    Variances are spread in proportion to themselves (chi-squared): the likeliest factor is that of
+    least squares weighted by what it explains, found in a few rounds. It is 0 where what is known
+    explains medians of so many blocks as well. Also returns how unlikely it is, the deviance but
+    for a constant.
+    """
+    explained = np.full(len(variances), np.mean(variances))
+    factor = 0.0
+    for _ in range(_ROUNDS):
+        weight = term / explained**2
+        factor = max((weight * (variances - known)).sum(), 0.0)
+        factor /= max((weight * term).sum(), 1e-300)
+        explained = np.maximum(known + factor * term, 1e-3 * variances)
+    unlikely = (np.log(explained) + variances / explained).sum()
+    if known.min() > 0:
+        without = (np.log(known) + variances / known).sum()
+        if without - unlikely < _CHANCE / blocks:
+            return 0.0, without
+    return factor, unlikely
