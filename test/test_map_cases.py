@@ -120,3 +120,8 @@ def test_what_is_widened_can_be_united():
     wide = widened(shapely.Polygon(notch), 0.015)
     assert wide.is_valid
     assert wide.union(shapely.box(1.3, -0.1, 1.5, 0.1)).area > wide.area
+
+
+def test_an_outline_of_details_alone_is_empty():
+    speck = shapely.box(0, 0, 0.01, 0.01)
+    assert unite_outlines(widened(shapely.Polygon(), 0.025), speck, 0.05).is_empty

@@ -94,7 +94,7 @@ def simplify(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPol
         parts = shapely.get_parts(outline.simplify(resolution / 4))
         parts = parts[shapely.area(parts) >= least]
         parts = [_filled(part, least) for part in parts.tolist()]
-        result = parts[0] if len(parts) == 1 else shapely.multipolygons(parts)
+        result = parts[0] if len(parts) == 1 else MultiPolygon(parts)
         if shapely.get_num_coordinates(result) <= _CORNERS:
             return result
         resolution, least = 2 * resolution, 4 * least
