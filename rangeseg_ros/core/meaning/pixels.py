@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import CellSize
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE
 from rangeseg_ros.core.meaning.ground_field import GroundField, planes_of_row, spread_planes
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -127,7 +127,9 @@ def _bound(
         if kind == GROUND:
             low, high = min(low, -doubt), max(high, doubt)
         drop, obstacle = min(low, -unsure), max(high, unsure)
-        if kind > GROUND:
+        if kind == HIDDEN:
+            low, high = np.float32(np.inf), np.float32(-np.inf)
+        elif kind > GROUND:
             low, high = np.float32(np.inf), np.float32(-np.inf)
             drop = high if kind == OBSTACLE else low
             obstacle = drop

@@ -1,0 +1,58 @@
+"""How far the surfaces beside the ground lie above it, or below."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.meaning.under_robot import FEWEST
+
+
+def around(where: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Cells within three columns, or twelve rows, of one that is set."""
+    result = cv2.dilate(where.view(np.uint8), np.ones((25, 7), np.uint8))
+    return result.astype(np.uint8, copy=False)
+
+
+@njit(cache=True, nogil=True)
+def sides_of(
+    height: NDArray[np.float32],
+    unsure: NDArray[np.float32],
+    surface: NDArray[np.int32],
+    near: NDArray[np.uint8],
+    count: int,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes of surfaces, how far they lie above the ground, and the noise of that, metres.
+
+    Medians of the cells beside the ground, or of all; NaN for surfaces that are too small.
+    """
+    sizes = np.zeros(count + 1, np.int64)
+    beside = np.zeros(count + 1, np.int64)
+    for i in range(surface.shape[0]):
+        for c in range(surface.shape[1]):
+            sizes[surface[i, c]] += 1
+            beside[surface[i, c]] += near[i, c]
+    sizes[0] = 0
+    # Cells in the order of their surfaces.
+    start = np.zeros(count + 2, np.int64)
+    for k in range(count + 1):
+        start[k + 1] = start[k] + (sizes[k] if sizes[k] >= FEWEST else 0)
+    heights = np.empty(start[-1], np.float32)
+    noises = np.empty(start[-1], np.float32)
+    filled = np.zeros(count + 1, np.int64)
+    for i in range(surface.shape[0]):
+        for c in range(surface.shape[1]):
+            k = surface[i, c]
+            if sizes[k] >= FEWEST and (near[i, c] or beside[k] < FEWEST):
+                heights[start[k] + filled[k]] = height[i, c]
+                noises[start[k] + filled[k]] = unsure[i, c]
+                filled[k] += 1
+    side = np.full(count + 1, np.nan)
+    noise = np.full(count + 1, np.nan)
+    for k in range(count + 1):
+        if filled[k]:
+            side[k] = np.median(heights[start[k] : start[k] + filled[k]])
+            noise[k] = np.median(noises[start[k] : start[k] + filled[k]])
+    return sizes, side, noise

@@ -1,0 +1,149 @@
+"""What the columns of cells tell, outwards from the robot: edges it falls from, ends, and feet."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.meaning.cells import Cells
+from rangeseg_ros.core.meaning.classes import GROUND
+from rangeseg_ros.core.meaning.continuity import Steps
+
+# Cells along a column whose mean tells a level.
+_MEAN = 4
+# Columns most of which must agree: wider than the correlation of a stereo camera's noise.
+_BESIDE = 7
+
+
+def below_edges(
+    height: NDArray[np.float32],
+    cells: Cells,
+    steps: Steps,
+    steep: NDArray[np.bool_],
+    broken: NDArray[np.bool_],
+    turned: bool,
+) -> NDArray[np.bool_]:
+    """Cells beyond an edge that the ground falls from, up to where it comes back by another one.
+
+    A surface may pass the end of its edge, or a gap that noise makes in it: what most of the
+    columns around show has fallen.
+
+    Parameters
+    ----------
+    height : (rows, columns) float32
+        Above a plane, metres; NaN where not measured.
+    cells : Cells
+    steps : Steps
+    steep, broken : (rows, columns) bool
+        See `surfaces_of`.
+    turned : bool
+        Whether up is down along the columns.
+    """
+    fallen = _fallen(height, cells.place, steps, steep, broken, turned)
+    most = cv2.boxFilter(fallen.view(np.uint8) * np.uint8(_BESIDE), -1, (_BESIDE, 1))
+    result: NDArray[np.bool_] = 2 * most > _BESIDE
+    return result
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _fallen(
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    steps: Steps,
+    steep: NDArray[np.bool_],
+    broken: NDArray[np.bool_],
+    turned: bool,
+) -> NDArray[np.bool_]:
+    """The same of each column by itself."""
+    rows, columns = height.shape
+    result = np.zeros((rows, columns), np.bool_)
+    total = np.empty((2, 4))
+    for c in range(columns):
+        near = np.nan  # mean height of the ground before
+        x = y = 0.0  # where its last cell is
+        edge = fallen = False
+        for m in range(rows):  # outwards
+            i = m if turned else rows - 1 - m
+            # Between this cell and the one before.
+            edge |= broken[i, c] if not turned else m > 0 and broken[i - 1, c]
+            if np.isnan(height[i, c]) or steep[i, c]:
+                edge |= steep[i, c]
+                continue
+            if edge:
+                # Sums of height and place beyond the edge, and farther away.
+                total[:] = 0
+                n = m
+                while total[1, 0] < 3 * _MEAN and n < rows:
+                    k = n if turned else rows - 1 - n
+                    if not (np.isnan(height[k, c]) or steep[k, c]):
+                        part = total[int(total[0, 0] >= _MEAN)]
+                        part[0] += 1
+                        part[1] += height[k, c]
+                        part[2] += place[1, k, c]
+                        part[3] += place[2, k, c]
+                    n += 1
+                _, far, p, q = total[0] / total[0, 0]
+                # A ramp that hides behind its edge falls on.
+                ramp = 0.0
+                if fallen:  # it takes more than a patch of noise to come back
+                    far = (total[0, 1] + total[1, 1]) / (total[0, 0] + total[1, 0])
+                elif total[1, 0] > 0:
+                    _, farther, v, w = total[1] / total[1, 0]
+                    fall = (far - farther) / np.sqrt((v - p) * (v - p) + (w - q) * (w - q))
+                    ramp = min(max(fall, 0.0), steps.slope)
+                    ramp *= np.sqrt((p - x) * (p - x) + (q - y) * (q - y))
+                fallen = near - far > steps.least + ramp
+                edge = False
+            result[i, c] = fallen
+            if not fallen:
+                near = height[i, c] if np.isnan(near) else near + (height[i, c] - near) / _MEAN
+                x, y = place[1, i, c], place[2, i, c]
+    return result
+
+
+@njit(cache=True, nogil=True)
+def ends_of(
+    said: NDArray[np.int8], height: NDArray[np.float32], least: float, turned: bool
+) -> tuple[int, int]:
+    """Columns in which something stands where the ground ends, and in which it falls off."""
+    rows, columns = height.shape
+    stands = falls = 0
+    for c in range(columns):
+        beyond = 0
+        for m in range(rows):  # towards the robot
+            i = rows - 1 - m if turned else m
+            if said[i, c] == GROUND and abs(height[i, c]) <= least:
+                stands += beyond > 0
+                falls += beyond < 0
+                break
+            if abs(height[i, c]) > least:
+                beyond = 1 if height[i, c] > 0 else -1
+    return stands, falls
+
+
+@njit(cache=True, nogil=True)
+def feet_of(
+    height: NDArray[np.float32],
+    steep: NDArray[np.bool_],
+    error: NDArray[np.float32],
+    least: float,
+    turned: bool,
+) -> NDArray[np.bool_]:
+    """Cells of a steep surface that rises to an obstacle above them in the image."""
+    rows, columns = height.shape
+    foot = np.zeros((rows, columns), np.bool_)
+    above = np.zeros(columns, np.bool_)
+    for m in range(rows):
+        i = rows - 1 - m if turned else m
+        for c in range(columns):
+            if np.isnan(height[i, c]):
+                continue
+            if height[i, c] > least:
+                above[c] = True
+            elif above[c] and steep[i, c] and height[i, c] > error[i, c]:
+                foot[i, c] = True
+            else:
+                above[c] = False
+    return foot
