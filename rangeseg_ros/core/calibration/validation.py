@@ -129,8 +129,9 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     gain = float(np.clip(along / square, 0, 1)) if square > 0 else 0.0
     # What smoothing costs shows in a field that is less smooth.
     rougher = solve(banded, basis, weight, grid, [value / 4 for value in smoothness], field)
-    bias = rougher[0] - field[0]
-    deviation = gain * _deviation([fold.error[0] for fold in folds], bias, seen, grid)
+    # What was scaled off may be true.
+    biases = [gain * (rougher[0] - field[0]), (1 - gain) * field[0]]
+    deviation = _deviation([gain * fold.error[0] for fold in folds], biases, seen, grid)
     field[1:] /= spread
     return Learned(gain * field, gain * profile, deviation, reference, smoothness, gain, folds)
 
@@ -203,15 +204,16 @@ def _in_cells(profile: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[n
 
 def _deviation(
     fields: list[NDArray[np.float64]],
-    bias: NDArray[np.float64],
+    biases: list[NDArray[np.float64]],
     seen: Sightings,
     grid: tuple[int, int],
 ) -> NDArray[np.float64]:
-    """Standard deviation of a field from those without one block each, and from its bias."""
+    """Standard deviation of a field from those without one block each, and from its biases."""
     known = np.bincount(seen.cell, minlength=grid[0] * grid[1]) > 0
     each = np.stack([without_plane(field.reshape(grid), known.reshape(grid)) for field in fields])
     variance = (len(fields) - 1) * each.var(axis=0)
-    variance += without_plane(bias.reshape(grid), known.reshape(grid)) ** 2
+    for bias in biases:
+        variance += without_plane(bias.reshape(grid), known.reshape(grid)) ** 2
     weight = known.reshape(grid).astype(np.float64)
     smooth = cv2.GaussianBlur(variance * weight, (0, 0), _AVERAGED)
     smooth /= np.maximum(cv2.GaussianBlur(weight, (0, 0), _AVERAGED), 1e-6)
