@@ -24,6 +24,7 @@ from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.cloud_bags import CloudBag, open_frames
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import natural_order, replacing
 from rangeseg_ros.io.images import read_depth
@@ -35,7 +36,7 @@ PART = 10
 
 @dataclass(frozen=True)
 class Source:
-    """Depth images of a recording: a bag, or a folder of images of one camera.
+    """Frames of a recording: a bag of images or clouds, or a folder of images of one camera.
 
     Attributes
     ----------
@@ -45,7 +46,7 @@ class Source:
     scale : float or None
         Metres per unit of a folder's images.
     depth_topic, camera_topic : str or None
-        Of a bag, see `DepthBag`.
+        Of a bag, see `open_frames`.
     """
 
     path: Path
@@ -95,8 +96,8 @@ class Source:
         files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
         return repr([(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files])
 
-    def _bag(self) -> DepthBag:
-        return DepthBag(self.path, self.depth_topic, self.camera_topic)
+    def _bag(self) -> DepthBag | CloudBag:
+        return open_frames(self.path, self.depth_topic, self.camera_topic)
 
 
 class Seen(NamedTuple):

@@ -57,7 +57,7 @@ _HEADER = '# Written by rangeseg calibrate.\n'
     help='Intrinsics of the images in folders: a ROS camera-calibration YAML file.',
 )
 @options.depth_scale
-@click.option('--depth-topic', help='Depth images of bags.  [default: found by type and name]')
+@click.option('--depth-topic', help='Images or clouds of bags.  [default: found by type and name]')
 @click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
 @click.option(
     '--segment-with',
@@ -83,7 +83,8 @@ def command(
 ) -> None:
     """Learn the fixed distortion of a sensor from the planes in RECORDINGs of it.
 
-    Recordings are bags, or folders of depth images in the order of their names, with --camera.
+    Recordings are bags of depth images or of organised clouds (z forward), or folders of depth
+    images in the order of their names, with --camera.
     Writes the map and, beside it, <stem>_report.html. See docs/calibration.md for how to record.
 
     An interrupted run goes on where it was when it is started again.

@@ -15,6 +15,7 @@ from rangeseg_ros.io.chunks import Lost, Record
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
+CLOUD = 'sensor_msgs/msg/PointCloud2'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 EARLY_TRANSFORMS = 'tf/msg/tfMessage'
 """Of ROS 1, until its nodes used tf2."""
