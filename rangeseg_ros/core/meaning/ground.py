@@ -168,8 +168,9 @@ def _terrain(
     flat = GroundField.of(under.theta[None, None], size, up)
     height = cell_heights(cells, flat, size)
     start = nearest_part(height, cells.place, surface, under.surface, steps.least)
-    fallen = below_edges(height, cells, steps, steep, broken, turned)
-    own = (surface == under.surface) & ~fallen
+    own = surface == under.surface
+    fallen = below_edges(height, cells, steps, steep, broken, turned) & own
+    own &= ~fallen
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
     field = GroundField.of(ground_field(cells, ground, under.theta), size, up)
@@ -194,7 +195,7 @@ def _terrain(
     verdict[0] = UNKNOWN
     verdict[large] = np.where(side[large] > 0, OBSTACLE, DROP)
     # A surface of far cells is as sure as each of them, as their errors are alike.
-    verdict[large & (np.abs(side) <= blur)] = UNKNOWN
+    verdict[large & (np.abs(side) <= blur)] = HIDDEN
     verdict[level] = GROUND
     said = np.where(ground, np.int8(GROUND), verdict[surface])
     said[fallen & (said == UNKNOWN)] = HIDDEN
