@@ -1,5 +1,6 @@
 """The map of planes: estimates against truth, growth, what is gone, what is one."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -92,11 +93,13 @@ def mapped(scene, frames, config=None, seed=0, start=0):
     return plane_map
 
 
-def add(plane_map, scene, k, random, start=0):
+def add(plane_map, scene, k, random, start=0, apart=False):
     view = simulate_kinect(scene, CAMERA, frame=k, seed=seed_of(scene))
     image = RangeImage.from_depth(view.depth, CAMERA)
     planes = with_roles(fit_planes(view.labels, image, SENSOR), Config(), (0, -1, 0))
     planes = [plane for plane in planes if plane.count > 100]
+    if apart:
+        planes = [replace(plane, surface=plane.label) for plane in planes]
     pose = scene.poses[k]
     off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
     told = Transform(off @ pose.rotation, pose.position + random.normal(0, NOISE.shift, 3))
@@ -142,6 +145,20 @@ def test_a_walk_maps_every_face_once_and_better_than_single_frames(seed):
         assert plane.covariance == pytest.approx(plane.covariance.T)
         for ring in (plane.hull, *plane.holes):
             np.testing.assert_allclose(ring @ plane.normal + plane.distance, 0, atol=1e-6)
+
+
+def test_what_a_frame_finds_on_two_surfaces_is_not_one_plane():
+    # A step so low that the errors of the sensor and of the pose would hide it.
+    step = box((1.0, 2.0, 0.04), np.eye(3), (3.0, 0, 0.02))
+    poses = [Pose.looking((0.05 * k, 0, 1.4), 0, 25, 0) for k in range(12)]
+    scene = Scene((half_space((0, 0, 1), (0, 0, 0)), step), tuple(poses))
+    random, plane_map = np.random.default_rng(0), PlaneMap()
+    for k in range(len(poses)):
+        add(plane_map, scene, k, random, apart=True)
+    flat = [plane for plane in plane_map.planes if plane.normal[2] > 0.9]
+    assert len(flat) == 2
+    low, high = sorted(flat, key=lambda plane: plane.centroid[2])
+    assert low.centroid[2] < 0.02 < high.centroid[2]
 
 
 def test_what_rays_pass_through_is_gone_within_seconds():

@@ -50,8 +50,9 @@ class Record:
     """What is kept of a plane beside its equation.
 
     `first` and `last` are stamps; `seen` and `united` are of the map's own time, which goes on
-    where stamps do not: when it was seen last, and when its outline was looked at last. `margin`
-    is the outline and what is so near that it is no detail of the map.
+    where stamps do not: when it was seen last, and when its outline was looked at last.
+    `surface` is that of the frame that saw it last. `margin` is the outline and what is so near
+    that it is no detail of the map.
     """
 
     id: int
@@ -65,6 +66,7 @@ class Record:
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
     margin: shapely.Geometry = field(default_factory=shapely.Polygon)
     seen: int = 0
+    surface: int = 0
     united: int = 0
     frames: int = 0
     looks: int = 0
@@ -78,7 +80,7 @@ class Record:
     def add(self, plane: Plane, stamp: int, now: int) -> None:
         """Take in a plane of a frame."""
         self.frames += now > self.seen
-        self.last, self.seen = stamp, now
+        self.last, self.seen, self.surface = stamp, now, plane.surface
         self.observations += 1
         self.pixels += plane.count
         self.squares += plane.count * plane.rms**2

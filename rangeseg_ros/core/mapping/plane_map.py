@@ -146,9 +146,12 @@ class PlaneMap:
         fits = (value < _GATE) & (away <= 2 * reach[which])
         # The one it lies on, or else the likeliest.
         order = np.lexsort([value, away > 0])
-        for pair in order[fits[order]]:
-            if match[which[pair]] < 0:
-                match[which[pair]] = index[pair]
+        # What one frame finds on two surfaces is not one plane, however badly its pose is known.
+        surface: dict[int, int] = {}
+        order = order[fits[order]]
+        for k, m in zip(index[order].tolist(), which[order].tolist(), strict=True):
+            if match[m] < 0 and surface.setdefault(k, planes[m].surface) == planes[m].surface:
+                match[m] = k
         return match
 
     def _fuse(
@@ -204,7 +207,7 @@ class PlaneMap:
         grown = [k for k, record in enumerate(self._records) if record.united == self._time]
         for k in grown:
             for m in filters.alike(k, camera, _GATE, SURE_TURN, _FARTHEST).tolist():
-                if m in gone or k in gone or not self._touch(k, m):
+                if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
                     continue
                 kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
                 filters.absorb(kept, lost)
@@ -213,6 +216,11 @@ class PlaneMap:
                 gone.append(lost)
         if gone:
             self._keep(np.isin(np.arange(len(self._records)), gone, invert=True))
+
+    def _distinct(self, k: int, m: int) -> bool:
+        """Whether this frame has found planes on two surfaces."""
+        a, b = self._records[k], self._records[m]
+        return a.seen == b.seen == self._time and a.surface != b.surface
 
     def _touch(self, k: int, m: int) -> bool:
         """Whether outlines are no farther apart than the smaller one is large."""
