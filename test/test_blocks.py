@@ -88,14 +88,15 @@ def test_slopes_and_residuals_are_those_of_the_planes():
     assert blocks.squared[i, j] == pytest.approx((y**2).mean(), rel=1e-6)
     # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
     expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
-    assert blocks.slope[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
+    assert blocks.slope((1.0, 1.0))[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
 
 
 def test_weights_count_in_variances_of_the_sensor():
     inverse, rays, _ = grid(80, 80, seed=4)
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
     plain = block_moments(inverse, rays, 4)
-    facing = Blocks.planes(plain, rays, 4)._replace(slope=np.zeros(plain.shape[:2]))
+    flat = np.zeros(plain.shape[:2])
+    facing = Blocks.planes(plain, rays, 4)._replace(across=flat, down=flat)
     blocks = weigh_blocks(facing, np.ones(plain.shape[:2], bool), sensor)
     theta, residual = fit_all(blocks.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.reshape(-1, SIZE))

@@ -33,7 +33,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     edges = weights(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(**sensor))
     blocks = Blocks.of(image)
-    blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
+    blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, 4), model)
     return join_surfaces(blocks, block_links(edges, 4), 4, least)
 

@@ -241,7 +241,7 @@ def small_room(seed=900):
     sensor = SensorModel.from_config(Config())
     edges = weights(image)
     blocks = Blocks.of(image)
-    blocks = blocks._replace(slope=np.zeros_like(blocks.slope))
+    blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
     found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK)
     return Problem.of(image, sensor, edges, BLOCK), (found[0], blocks, found[1]), sensor

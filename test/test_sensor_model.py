@@ -71,6 +71,33 @@ def test_noise_of_the_range_is_told_from_that_of_its_inverse():
     assert sensor.noise <= 1e-4
 
 
+def tilted_planes(random):
+    """Inverse ranges of 48 planes that slope one way or the other, and both slopes."""
+    inverse, across, down = np.empty((3, *CAMERA.shape))
+    for i, j in np.ndindex(6, 8):
+        part = slice(80 * i, 80 * i + 80), slice(80 * j, 80 * j + 80)
+        # Linear over the pixels, as planes are over a camera's rays.
+        slopes = random.permutation([random.choice([-0.003, -0.001, 0.001, 0.003]), 0])
+        v, u = np.mgrid[-40:40, -40:40]
+        inverse[part] = random.uniform(0.4, 0.8) + slopes[0] * u + slopes[1] * v
+        across[part], down[part] = slopes
+    return inverse, across, down
+
+
+@pytest.mark.parametrize('errors', [(0.6, 0.6), (0.6, 0.0), (0.0, 0.6), (0.0, 0.0)])
+def test_directions_err_both_ways_or_one(errors):
+    """As a camera's and a turning scanner's do."""
+    random = np.random.default_rng(7)
+    inverse, across, down = tilted_planes(random)
+    for error, slope in zip(errors, (across, down), strict=True):
+        inverse += error * slope * random.normal(size=CAMERA.shape)
+    inverse += random.normal(0, 0.0005, CAMERA.shape)
+    sensor = sensor_of(inverse)
+    # Blocks that are compared slope alike to a third or so.
+    assert sensor.column_noise == pytest.approx(errors[0], rel=0.3)
+    assert sensor.row_noise == pytest.approx(errors[1], rel=0.3)
+
+
 def test_clutter_and_outliers_change_little():
     random = np.random.default_rng(3)
     inverse = three_planes() + random.normal(0, 0.002, CAMERA.shape)
@@ -156,7 +183,7 @@ def test_jumps_follow_the_noise():
     """About 0.0065 1/m for a Kinect."""
     random = np.random.default_rng(7)
     image = RangeImage(CAMERA.rays, three_planes().astype(np.float32), CAMERA)
-    steps, _ = jump_steps(Blocks.of(image), STATED._replace(pixel_noise=0.0))
+    steps, _ = jump_steps(Blocks.of(image), STATED._replace(column_noise=0.0, row_noise=0.0))
     np.testing.assert_allclose(steps, 0.0065, rtol=0.05)
     inverse = three_planes() + random.normal(0, 1e-5, CAMERA.shape)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)

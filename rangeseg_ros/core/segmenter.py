@@ -217,8 +217,10 @@ class Segmenter:
         watch.lap('noise')
         # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
         # a surface seen at a grazing angle costs it less than one too few.
-        grazing = sensor.pixel_noise if config.method == 'planes' else 0.0
-        steps, slopes = jump_steps(blocks, sensor._replace(pixel_noise=grazing))
+        grazing = sensor
+        if config.method == 'normals':
+            grazing = sensor._replace(column_noise=0.0, row_noise=0.0)
+        steps, slopes = jump_steps(blocks, grazing)
         if config.edge_step > 0:
             steps = np.full_like(steps, config.edge_step)
         # What was measured tells the planes; where they end is told with small holes bridged.
@@ -313,7 +315,8 @@ def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
     sensor = sensor._replace(
         correlation=2 * sensor.correlation,
         distortion_length=2 * sensor.distortion_length,
-        pixel_noise=2 * sensor.pixel_noise,
+        column_noise=2 * sensor.column_noise,
+        row_noise=2 * sensor.row_noise,
     )
     survey = coarse.survey
     if isinstance(survey, Survey):

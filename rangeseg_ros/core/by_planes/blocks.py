@@ -15,6 +15,7 @@ from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     random_variance,
     systematic_variance,
+    tilt_variance,
 )
 
 # Share of a block that must have been measured.
@@ -172,7 +173,7 @@ def _weigh(
                 continue
             count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
             level = random_variance(sensor, squared)
-            tilt = sensor.pixel_noise**2 * blocks.slope[i, j] / level
+            tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
             weight = 1 / (level * (1 + tilt))
             for entry in range(COUNT):
                 result[i, j, entry] = weight * blocks.moments[i, j, entry]

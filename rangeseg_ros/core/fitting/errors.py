@@ -9,7 +9,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import quantiles
+from rangeseg_ros.core.fitting.alike import alike, quantiles
 from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.sensing.sensor import FLOOR
 
@@ -18,6 +18,13 @@ _ROUNDS = 5
 # Half of the likelihood ratio that is no chance, for one block: quantile 0.999 of chi-squared with
 # one degree of freedom times the relative variance of a median of chi-squared with nine.
 _CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
+# Quantile 0.999 of F with one and 22 degrees of freedom: slopes that explain more are no chance.
+_SIGNIFICANT = 14.4
+# Six standard deviations: directions that err one way alone, as those of scanners that turn.
+_CERTAIN = 36.0
+
+BOTH = (1.0, 1.0)
+"""Directions that err as much along the rows as down the columns."""
 
 
 class Errors(NamedTuple):
@@ -71,8 +78,38 @@ def explaining(
         if less < unlikely:
             constant, quartic = 0.0, factor
     there += constant + quartic * squared**2
-    straight, _ = _likeliest(tilt, shown, there, blocks)
+    straight, unlikely = _likeliest(tilt, shown, there, blocks)
+    if there.min() > 0 and _advantage(_deviance(there, shown), unlikely, shown) < _SIGNIFICANT:
+        straight = 0.0
     return Errors(constant, quartic, straight)
+
+
+@njit(cache=True)
+def turning(
+    squared: NDArray[np.float64],
+    across: NDArray[np.float64],
+    down: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    quantile: float,
+    noise: Errors,
+    least: Errors,
+) -> tuple[float, tuple[float, float]]:
+    """Tilt of the `noise`, and the way in which directions err: BOTH, or certainly one alone.
+
+    Of N blocks of these squared inverse ranges, and slopes along the row and down the column.
+    """
+    sets = alike(squared, down - across)
+    squared, across = quantiles(squared, sets, 0.5), quantiles(across, sets, 0.5)
+    down = quantiles(down, sets, 0.5)
+    shown = np.maximum(quantiles(variance, sets, quantile), variances(least, squared, across))
+    there = variances(Errors(noise.constant, noise.quartic, 0.0), squared, across)
+    blocks = len(variance) / len(shown)
+    _, cameras = _likeliest(across + down, shown, there, blocks)
+    rows, along = _likeliest(across, shown, there, blocks)
+    columns, below = _likeliest(down, shown, there, blocks)
+    if _advantage(cameras, min(along, below), shown) < _CERTAIN:
+        return noise.tilt, (1.0, 1.0)
+    return (rows, (1.0, 0.0)) if along < below else (columns, (0.0, 1.0))
 
 
 @njit(cache=True)
@@ -96,9 +133,27 @@ def _likeliest(
         factor = max((weight * (variances - known)).sum(), 0.0)
         factor /= max((weight * term).sum(), 1e-300)
         explained = np.maximum(known + factor * term, 1e-3 * variances)
-    unlikely = (np.log(explained) + variances / explained).sum()
+    unlikely = _deviance(explained, variances)
     if known.min() > 0:
-        without = (np.log(known) + variances / known).sum()
+        without = _deviance(known, variances)
         if without - unlikely < _CHANCE / blocks:
             return 0.0, without
     return factor, unlikely
+
+
+@njit(cache=True)
+def _deviance(explained: NDArray[np.float64], variances: NDArray[np.float64]) -> float:
+    """How unlikely variances (N,) are where such (N,) are expected, but for a constant."""
+    return (np.log(explained) + variances / explained).sum()
+
+
+@njit(cache=True)
+def _advantage(without: float, unlikely: float, variances: NDArray[np.float64]) -> float:
+    """F of a term that makes variances (N,) so much less `unlikely` than they are `without`.
+
+    Edges among the blocks of a set leave more than chance would: what is left of a perfect fit
+    tells by how much (quasi-likelihood; Wedderburn 1974). 0 where too few tell.
+    """
+    freedom = max(len(variances) - 2, 0)
+    left = unlikely - _deviance(variances, variances)
+    return (without - unlikely) * freedom / max(left, 1e-12)

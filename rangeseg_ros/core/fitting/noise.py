@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import median
-from rangeseg_ros.core.fitting.errors import Errors, explaining, variances
+from rangeseg_ros.core.fitting.errors import BOTH, Errors, explaining, turning, variances
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.scale import QUANTILE, Scale
 from rangeseg_ros.core.runtime.threads import submit
@@ -64,7 +64,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     used = count >= _SHARE * count.max(initial=0)
     if np.count_nonzero(used) < _PRIOR:
         return prior
-    scale = Scale.of(coarse, used)
+    scale = Scale.of(coarse, used, BOTH)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
@@ -72,10 +72,13 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
     variance = scale.variance_ratio(coarse, 1.0)
     noise = explaining(scale, variance, QUANTILE, True, rounded, none)
-    level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope))
+    slopes = coarse.across.ravel()[scale.place], coarse.down.ravel()[scale.place]
+    tilt, way = turning(scale.squared, *slopes, variance, QUANTILE, noise, rounded)
+    noise = noise._replace(tilt=tilt)
+    level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope(way)))
     if not flat.any():
         return prior
-    scale = Scale.of(blocks, flat)
+    scale = Scale.of(blocks, flat, way)
     within = [scale.mean(scale.variance_ratio(blocks, level), QUANTILE)]
     between = filled = 1.0
     distortion = none
@@ -91,7 +94,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         parts = (
             coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
         )
-        scale = Scale.of(parts, whole)
+        scale = Scale.of(parts, whole, way)
         excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
         bending = explaining(scale, excess.ravel()[scale.place], 0.5, in_range, none, shown)
         within.append(scale.mean(scale.variance_ratio(parts, level), QUANTILE))
@@ -102,8 +105,9 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
             filled = pixels / side**2
         # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
         smooth = bending.times(8 / pixels)._replace(tilt=0.0)
-        expected = variances(shown, parts.squared, parts.slope)
-        expected += variances(bending, parts.squared, parts.slope)
+        slope = parts.slope(way)
+        expected = variances(shown, parts.squared, slope)
+        expected += variances(bending, parts.squared, slope)
         flat = whole & (excess < _BENT * expected)
         typical = [
             median(variances(errors, scale.squared, scale.slope))
@@ -115,11 +119,15 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if len(within) == 1:
         return prior
     total, white, width = _random(within, between, filled)
+    # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
+    # blocks hide nothing of it.
+    turned = np.sqrt(noise.tilt * (total if way == BOTH else 1.0)) * np.array(way)
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
         noise=max(float(np.sqrt(noise.constant * total)), rounding),
         range_noise=max(float(np.sqrt(noise.quartic * total)), range_rounding),
-        pixel_noise=float(np.sqrt(noise.tilt * total)),
+        column_noise=float(turned[0]),
+        row_noise=float(turned[1]),
         white=white,
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),

@@ -28,7 +28,7 @@ class Scale(NamedTuple):
     place : (N,) int
         Their numbers among all blocks of the scale.
     squared, slope : (N,) float64
-        As of `Blocks`.
+        As of `Blocks`, the slope of the way in which directions err.
     sets : Sets
         Of these N.
     """
@@ -39,11 +39,11 @@ class Scale(NamedTuple):
     sets: Sets
 
     @classmethod
-    def of(cls, blocks: Blocks, used: NDArray[np.bool_]) -> Scale:
+    def of(cls, blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float]) -> Scale:
         place = np.flatnonzero(used)
         # A copy, as the layout of a slice follows the size, and kernels are compiled for layouts.
         place = place[:: max(len(place) // _MOST, 1)].copy()
-        squared, slope = blocks.squared.ravel()[place], blocks.slope.ravel()[place]
+        squared, slope = blocks.squared.ravel()[place], blocks.slope(way).ravel()[place]
         return cls(place, squared, slope, alike(squared, slope))
 
     def pixels(self, blocks: Blocks) -> NDArray[np.float64]:

@@ -10,7 +10,7 @@ from rangeseg_ros.core.fitting.noise import ROUGH
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, tilt_variance
 
 
 def jump_steps(
@@ -56,39 +56,51 @@ def _find_steps(
 ) -> None:
     """The same of some rows of blocks, in loops without branches but where a block is not flat."""
     rows, columns = steps.shape
-    # Slopes of the flat blocks of three rows of blocks in turn, and those taken for one row.
-    flat, slope = np.full((3, columns + 2), np.inf), np.empty(columns)
+    # Squared slopes of the flat blocks of three rows of blocks in turn with the variances that
+    # they add, and those taken for one row.
+    flat, tilted = np.full((3, columns + 2), np.inf), np.zeros((3, columns + 2))
+    slope, tilt = np.empty(columns), np.empty(columns)
     for i in range(first - 1, after + 1):
         flat[i % 3] = np.inf
         if 0 <= i < rows:
-            _find_flat(i, blocks, sensor, flat[i % 3])
+            _find_flat(i, blocks, sensor, flat[i % 3], tilted[i % 3])
         if i <= first:
             continue
         for j in range(columns):
-            slope[j] = flat[(i - 1) % 3, j + 1]
+            slope[j], tilt[j] = flat[(i - 1) % 3, j + 1], tilted[(i - 1) % 3, j + 1]
             if slope[j] == np.inf:
                 # That of a block that a jump crosses is the jump's: its neighbours' then.
                 for k in range(3):
                     for m in range(j, j + 3):
-                        slope[j] = min(slope[j], flat[k, m])
+                        if flat[k, m] < slope[j]:
+                            slope[j], tilt[j] = flat[k, m], tilted[k, m]
                 if slope[j] == np.inf:
-                    slope[j] = 0.0
+                    slope[j] = tilt[j] = 0.0
         for j in range(columns):
             squared = blocks.squared[i - 1, j]
-            variance = random_variance(sensor, squared) + sensor.pixel_noise**2 * slope[j]
+            variance = random_variance(sensor, squared) + tilt[j]
             rounding = max(sensor.quantum, sensor.range_quantum * squared)
             steps[i - 1, j] = max(np.sqrt(factor * variance), 2.2 * rounding)
             slopes[i - 1, j] = np.sqrt(slope[j])
 
 
 @njit(cache=True, nogil=True)
-def _find_flat(i: int, blocks: Blocks, sensor: SensorModel, flat: NDArray[np.float64]) -> None:
+def _find_flat(
+    i: int,
+    blocks: Blocks,
+    sensor: SensorModel,
+    flat: NDArray[np.float64],
+    tilted: NDArray[np.float64],
+) -> None:
     """Slopes of the blocks of a row of which noise explains what their planes leave.
 
-    `flat` has a margin of one; it keeps what it holds there and for the other blocks.
+    `flat` has a margin of one; it keeps what it holds there and for the other blocks. `tilted` are
+    the variances that slopes add.
     """
     for j in range(blocks.squared.shape[1]):
-        count, slope = blocks.moments[i, j, COUNT], blocks.slope[i, j]
-        variance = random_variance(sensor, blocks.squared[i, j]) + sensor.pixel_noise**2 * slope
+        count, slope = blocks.moments[i, j, COUNT], blocks.across[i, j] + blocks.down[i, j]
+        tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j])
+        variance = random_variance(sensor, blocks.squared[i, j]) + tilt
         is_flat = (count > 3) & (blocks.residual[i, j] < ROUGH * variance * (count - 3))
         flat[j + 1] = slope if is_flat else flat[j + 1]
+        tilted[j + 1] = tilt

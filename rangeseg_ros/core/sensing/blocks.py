@@ -26,17 +26,22 @@ class Blocks(NamedTuple):
         With unit weights, of the measured pixels.
     squared : (rows, columns) float64
         Mean square of the inverse range, 1/m^2.
-    slope : (rows, columns) float64
-        Square of the change of the inverse range from pixel to pixel on the plane, 1/m^2, less
-        what noise adds to it.
+    across, down : (rows, columns) float64
+        Squares of the change of the inverse range from pixel to pixel on the plane, along the row
+        and down the column, 1/m^2, less what noise adds to them.
     residual : (rows, columns) float64
         Sum of the squared residuals, 1/m^2.
     """
 
     moments: NDArray[np.float64]
     squared: NDArray[np.float64]
-    slope: NDArray[np.float64]
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
     residual: NDArray[np.float64]
+
+    def slope(self, way: tuple[float, float]) -> NDArray[np.float64]:
+        """Sums (rows, columns) of so much of the squared slopes along the row and the column."""
+        return way[0] * self.across + way[1] * self.down
 
     @classmethod
     def of(cls, image: RangeImage) -> Blocks:
@@ -47,9 +52,9 @@ class Blocks(NamedTuple):
     def planes(cls, moments: NDArray[np.float64], rays: NDArray[np.float32], size: int) -> Blocks:
         """Planes of the blocks of `size` pixels with these moments."""
         squared = moments[..., CHI2] / np.maximum(moments[..., COUNT], 1)
-        slope, residual = np.zeros_like(squared), np.zeros_like(squared)
-        run_rows(_fit_blocks, len(moments), moments, rays, size, slope, residual)
-        return cls(moments, squared, slope, residual)
+        across, down, residual = (np.zeros_like(squared) for _ in range(3))
+        run_rows(_fit_blocks, len(moments), moments, rays, size, across, down, residual)
+        return cls(moments, squared, across, down, residual)
 
 
 def block_moments(
@@ -135,7 +140,8 @@ def _fit_blocks(
     moments: NDArray[np.float64],
     rays: NDArray[np.float32],
     size: int,
-    slope: NDArray[np.float64],
+    across: NDArray[np.float64],
+    down: NDArray[np.float64],
     residual: NDArray[np.float64],
 ) -> None:
     """Slopes and residuals of rows of blocks."""
@@ -153,9 +159,11 @@ def _fit_blocks(
             residual[bi, bj] = fit(moments[bi, bj], theta)
             if i < 0 or j < 0 or count <= 3:
                 continue
-            across, down = 0.0, 0.0
+            right, below = 0.0, 0.0
             for k in range(3):
-                across += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
-                down += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+                right += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
+                below += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+            square = right * right + below * below
             noise = residual[bi, bj] / (count - 3) * doubt / count
-            slope[bi, bj] = max(across * across + down * down - noise, 0.0)
+            share = max(square - noise, 0.0) / max(square, 1e-300)
+            across[bi, bj], down[bi, bj] = share * right * right, share * below * below

@@ -34,9 +34,9 @@ class SensorModel(NamedTuple):
         Smooth systematic error of the range, metres.
     distortion_length : float
         Width of the Gaussian kernel the distortion looks smoothed with, pixels.
-    pixel_noise : float
-        Random error of a pixel's direction, pixels: what surfaces seen at a grazing angle are
-        noisier by.
+    column_noise, row_noise : float
+        Random error of a pixel's direction, along its row and down its column, pixels: what
+        surfaces seen at a grazing angle are noisier by.
     quantum : float
         Step that the inverse range is rounded to, 1/m; 0 for none.
     range_quantum : float
@@ -50,7 +50,8 @@ class SensorModel(NamedTuple):
     distortion: float
     range_distortion: float
     distortion_length: float
-    pixel_noise: float = 0.0
+    column_noise: float = 0.0
+    row_noise: float = 0.0
     quantum: float = 0.0
     range_quantum: float = 0.0
 
@@ -65,6 +66,7 @@ class SensorModel(NamedTuple):
             config.distortion,
             config.range_distortion,
             config.distortion_length,
+            config.pixel_noise,
             config.pixel_noise,
         )
 
@@ -148,6 +150,12 @@ def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -
     An error ds of the range is one of ds / s^2 of its inverse.
     """
     return FLOOR + sensor.noise**2 + (sensor.range_noise * squared) ** 2
+
+
+@njit(cache=True, inline='always')
+def tilt_variance(sensor: SensorModel, across: float, down: float) -> Any:
+    """Variance that errors of direction add where the squared slopes are these, (1/m)^2."""
+    return sensor.column_noise**2 * across + sensor.row_noise**2 * down
 
 
 @njit(cache=True, inline='always')
