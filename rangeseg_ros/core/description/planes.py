@@ -13,6 +13,7 @@ from rangeseg_ros.core.fitting.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits, symmetric
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwich
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
@@ -142,10 +143,10 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []
+    surfaces = submit(common_surfaces, fits)
     distance = np.zeros(len(theta))
     distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
     normal = -theta * distance[:, None]
-    surface = common_surfaces(fits)
     jacobian = plane_jacobians(normal, distance)
     covariance = sandwich(jacobian, fits.covariance)
 
@@ -170,6 +171,7 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         finite = shapes.finite() & np.isfinite(centroid).all(1)
         kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
         found = np.setdiff1d(found, doubtful[~kept])
+    surface = surfaces.result()
     return [
         Plane(
             label=int(k),

@@ -173,7 +173,7 @@ def _by_falling_size(fits: Fits) -> NDArray[np.intp]:
     return order[np.any(fits.theta[order] != 0, axis=1)]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _groups(order: NDArray[np.intp], fits: Fits) -> NDArray[np.intp]:
     surface = np.zeros(len(fits.theta), np.intp)
     for rank in range(len(order)):

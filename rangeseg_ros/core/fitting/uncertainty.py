@@ -20,6 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import (
     FLOOR,
@@ -78,7 +79,8 @@ def theta_covariances(
     random = Field(
         sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
     )
-    middle = _middles(cells, theta, sensor, random, systematic_field(sensor))
+    fields = random, systematic_field(sensor)
+    middle = np.add(*map_halves(_middles, len(theta), cells, theta, sensor, *fields))
     return sandwich(inverse, middle), middle
 
 
@@ -107,17 +109,22 @@ def plane_jacobians(
 
 @njit(cache=True, nogil=True)
 def _middles(
+    first: int,
+    after: int,
     cells: Cells,
     theta: NDArray[np.float64],
     sensor: SensorModel,
     random: Field,
     systematic: Field,
 ) -> NDArray[np.float64]:
-    """Sums over pairs of pixels of w_i w_j r_i r_j^T cov(e_i, e_j), (M + 1, 3, 3)."""
+    """Sums over pairs of pixels of w_i w_j r_i r_j^T cov(e_i, e_j), (M + 1, 3, 3).
+
+    Of the regions from the first to before the second; zeros for others.
+    """
     result = np.zeros((len(theta), 3, 3))
     white = sensor.white if sensor.correlation > 0 else 1.0
     part = np.empty((3, 3))
-    for k in range(1, len(theta)):
+    for k in range(max(first, 1), after):
         if not theta[k].any():
             continue
         own = cells.sums[cells.start[k] : cells.start[k + 1]]
