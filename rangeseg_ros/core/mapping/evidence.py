@@ -28,6 +28,10 @@ class Evidence:
     centres : (K, 2) float64
         Of the cells, metres along the axes of the plane.
     odds : (K,) float64
+    middle : (2,) float64
+        Centre of a circle with all of the cells' centres.
+    reach : float
+        Its radius, metres.
     """
 
     def __init__(self) -> None:
@@ -35,6 +39,7 @@ class Evidence:
         self._side = 0.0
         self._keys = np.zeros(0, np.int64)
         self.odds = np.zeros(0)
+        self.middle, self.reach = np.zeros(2), 0.0
 
     def follow(self, outline: Polygon | MultiPolygon) -> None:
         """Have the cells of an outline; what is new has just been seen."""
@@ -63,6 +68,9 @@ class Evidence:
             odds[known] = self.odds[place[known]]
         self._keys, self.odds = keys, odds
         self.centres = (cells[order] + 0.5) * side
+        if len(cells):
+            least, most = self.centres.min(axis=0), self.centres.max(axis=0)
+            self.middle, self.reach = (least + most) / 2, math.dist(least, most) / 2
 
     def remaining(self, outline: Polygon | MultiPolygon) -> Polygon | MultiPolygon:
         """What is left of an outline without the cells that rays pass through."""

@@ -165,11 +165,16 @@ class PlaneFilters:
         self.lasting[k] = self.view[k] = 0
         self._shift(np.array([k]), (fused @ information[1] @ gap[0])[None])
 
+    def points(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (K, 3) at coordinates (K, 2) of planes."""
+        along: NDArray[np.float64] = np.einsum('ka,kai->ki', at, self.axes[index])
+        return self.point[index] + along
+
     def places(
         self, index: NDArray[np.intp], at: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points (K, 3) at coordinates (K, 2) of planes, and their standard deviations (K,)."""
-        points = self.point[index] + np.einsum('ka,kai->ki', at, self.axes[index])
+        points = self.points(index, at)
         lever = np.column_stack([at, np.ones(len(at))])
         variance = np.einsum('ki,kij,kj->k', lever, self._covariance(index), lever)
         return points, np.sqrt(variance)

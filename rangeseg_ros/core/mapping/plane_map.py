@@ -27,7 +27,7 @@ from rangeseg_ros.core.mapping.observations import (
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
-from rangeseg_ros.core.mapping.sightings import THERE, find_sightings
+from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -269,8 +269,28 @@ class PlaneMap:
         filters = self._filters
         if filters is None or not self._records:
             return
-        evidence = [record.evidence for record in self._records]
-        owner = np.repeat(np.arange(len(evidence)), [len(one.centres) for one in evidence])
+        middles = np.array([record.evidence.middle for record in self._records])
+        reaches = np.array([record.evidence.reach for record in self._records])
+        middles = filters.points(np.arange(len(middles)), middles)
+        middles = (middles - pose.shift) @ pose.rotation
+        shown = np.flatnonzero(may_be_in_sight(middles, reaches, image))
+        if len(shown):
+            self._look(shown, filters, image, pose, noise)
+        self._forget()
+
+    def _look(
+        self,
+        shown: NDArray[np.intp],
+        filters: PlaneFilters,
+        image: RangeImage,
+        pose: Transform,
+        noise: PoseNoise,
+    ) -> None:
+        """Take away what rays pass through of some planes."""
+        records = [self._records[k] for k in shown.tolist()]
+        evidence = [record.evidence for record in records]
+        which = np.repeat(np.arange(len(evidence)), [len(one.centres) for one in evidence])
+        owner = shown[which]
         at = np.concatenate([one.centres for one in evidence])
         points, sigma = filters.places(owner, at)
         points = (points - pose.shift) @ pose.rotation
@@ -282,13 +302,15 @@ class PlaneMap:
             image,
             SensorModel.from_config(self.config),
         )
-        there = np.bincount(owner[found == THERE], minlength=len(evidence))
-        for k in np.flatnonzero(2 * there > np.bincount(owner, minlength=len(evidence))).tolist():
-            self._records[k].looks += 1
+        there = np.bincount(which[found == THERE], minlength=len(evidence))
+        for k in np.flatnonzero(2 * there > np.bincount(which, minlength=len(evidence))).tolist():
+            records[k].looks += 1
         for k in see(evidence, found).tolist():
-            record = self._records[k]
-            record.outline = record.evidence.remaining(record.outline)
-            self._follow(record)
+            records[k].outline = records[k].evidence.remaining(records[k].outline)
+            self._follow(records[k])
+
+    def _forget(self) -> None:
+        """Drop planes of which nothing is left, those not confirmed, and what is too much."""
         kept = [
             not r.outline.is_empty and (r.confirmed or self._time - r.seen < _PROBATION)
             for r in self._records

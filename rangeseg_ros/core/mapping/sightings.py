@@ -16,6 +16,40 @@ _GATE = 4.0
 _GRAZING = 0.05
 
 
+def may_be_in_sight(
+    centres: NDArray[np.float64], radii: NDArray[np.float64], image: RangeImage
+) -> NDArray[np.bool_]:
+    """Whether spheres reach into what the camera of an image looks at.
+
+    Parameters
+    ----------
+    centres : (K, 3) float64
+        In the frame of the image, metres.
+    radii : (K,) float64
+    image : RangeImage
+        Of a camera: of a cloud, nobody knows.
+
+    Returns
+    -------
+    (K,) bool
+    """
+    camera = image.camera
+    if camera is None:
+        return np.zeros(len(centres), np.bool_)
+    # Four sides of a pyramid through the borders of the outermost pixels, and its front.
+    sides = np.array(
+        [
+            (camera.fx, 0, camera.cx + 0.5),
+            (-camera.fx, 0, camera.width - 0.5 - camera.cx),
+            (0, camera.fy, camera.cy + 0.5),
+            (0, -camera.fy, camera.height - 0.5 - camera.cy),
+            (0, 0, 1),
+        ]
+    )
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    return (centres @ sides.T >= -radii[:, None]).all(axis=1)
+
+
 def find_sightings(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],

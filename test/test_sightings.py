@@ -1,0 +1,30 @@
+"""What rays say of places where something is known to be."""
+
+import numpy as np
+
+from rangeseg_ros.core.mapping.sightings import find_sightings, may_be_in_sight
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+CAMERA = Camera(40, 30, 35.0, 38.0, 17.0, 16.0)
+SENSOR = SensorModel(0.001, 0, 1.0, 0, 0, 0, 35)
+
+
+def test_whatever_rays_tell_of_lies_in_spheres_that_may_be_in_sight():
+    random = np.random.default_rng(1)
+    image = RangeImage.from_depth(np.full(CAMERA.shape, 8.0), CAMERA)
+    centres = random.normal(0, 2, (4000, 3))
+    radii = random.exponential(0.5, 4000)
+    within = random.normal(size=(4000, 3))
+    within *= (radii * random.random(4000) / np.linalg.norm(within, axis=1))[:, None]
+    points = centres + within
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    found = find_sightings(points, normals, np.full(4000, 0.01), image, SENSOR)
+    shown = may_be_in_sight(centres, radii, image)
+    assert np.count_nonzero(found) > 200
+    assert shown[found != 0].all()
+    # What is behind the camera or far to its sides is not.
+    assert not may_be_in_sight(
+        np.array([[0, 0, -2.0], [9, 0, 2], [0, -9, 2]]), np.ones(3), image
+    ).any()
