@@ -5,8 +5,9 @@ import pytest
 
 from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, theta_covariances
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.fields import smooth_field
@@ -185,3 +186,20 @@ def test_uniting_nothing_changes_no_covariance():
     fits = Fits.of(labels, image, SensorModel(0.1, 0, 0.33, 2, 0.00145, 0, 35))
     united = fits.united(np.arange(2), central=True)
     assert np.array_equal(united.covariance, fits.covariance)
+
+
+def test_cells_whose_weight_is_lost_by_rounding_count_for_nothing():
+    camera = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
+    labels = np.ones(camera.shape, np.uint16)
+    image = RangeImage.from_depth(np.full(camera.shape, 2.0), camera)
+    sensor = SensorModel(0.001, 0, 0.33, 2, 0.001, 0, 7)
+    fits = Fits.of(labels, image, sensor)
+    covariances = []
+    for count in (0, 5):
+        sums = fits.cells.sums.copy()
+        cell = np.flatnonzero(sums[:, COUNT])[0]
+        sums[cell] = 0
+        sums[cell, COUNT] = count
+        cells = fits.cells._replace(sums=sums)
+        covariances.append(theta_covariances(cells, fits.theta, fits.inverse, sensor)[0])
+    np.testing.assert_array_equal(*covariances)

@@ -132,7 +132,7 @@ def _middles(
         systematic_square = np.zeros((3, 3))
         count = 0.0
         for c in range(len(own)):
-            if own[c, COUNT] == 0:
+            if _is_empty(own[c]):
                 continue
             count += own[c, COUNT]
             # Squares of the same scale as the rays: variance times weight.
@@ -147,12 +147,21 @@ def _middles(
             systematic_square += mean * systematic_variance(sensor, level**2) * part
         result[k] = white * random_square
         # Sides of pixels overstate the length of a border by 4 / pi on average.
-        share = np.pi / 4 * cells.border[k] / count
+        share = np.pi / 4 * cells.border[k] / max(count, 1.0)
         if white < 1:
             result[k] += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
         if systematic.constant + systematic.quartic > 0:
             result[k] += _field(cells, k, theta[k], systematic, systematic_square, share)
     return result
+
+
+@njit(cache=True)
+def _is_empty(cell: NDArray[np.float64]) -> bool:
+    """Whether no pixel is in a cell, or rounding has left nothing of what weighs next to nothing.
+
+    Of pixels whose weights differ by 1e16, where others were taken off again.
+    """
+    return cell[COUNT] == 0 or cell[WEIGHT] <= 0
 
 
 @njit(cache=True)
@@ -232,7 +241,7 @@ def _scaled_rays(
     columns = cells.columns[k]
     rays = np.zeros((len(own) // columns, columns, 3))
     for c in range(len(own)):
-        if own[c, COUNT] > 0:
+        if not _is_empty(own[c]):
             level = _level(own[c], theta)
             deviation = np.sqrt(field.constant + field.quartic * level**4)
             for p in range(3):
