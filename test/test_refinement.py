@@ -8,13 +8,14 @@ import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
+from rangeseg_ros.core.by_planes.descent import descended
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, weights
 from rangeseg_ros.core.sensing.moments import RATIO
@@ -106,9 +107,9 @@ def expand(alpha, labels, cost, problem, models, reach=12):
     """Expand a label from everywhere; in place."""
     labels, cost = labels.ravel(), cost.ravel()
     rows = 0, len(labels) // problem.width
-    start, sites = expansion.fronts(labels, problem.links, problem.width, len(models.theta), rows)
+    start, sites = fronts(labels, problem.links, problem.width, len(models.theta), rows)
     front = sites[start[alpha] : start[alpha + 1]]
-    labelling = expansion.GridLabelling.of(labels, cost, problem.links, problem.width)
+    labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
     helped = refinement._expand(alpha, front, rows, reach, labelling, problem, models)
     assert (labelling.position == -1).all()
     return helped
@@ -212,9 +213,7 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
     """Nor by none: the labels of the neighbours it is connected with are what it may take."""
     problem, models, _ = random_case(seed, 20, 24, 4)
     blocks = np.random.default_rng(seed).integers(0, 5, (5, 6)).astype(np.int32)
-    labels, cost = (
-        array.reshape(20, 24) for array in refinement._descended(problem, blocks, models)
-    )
+    labels, cost = (array.reshape(20, 24) for array in descended(problem, blocks, models))
     measured = problem.weight.reshape(20, 24) > 0
     assert not labels[~measured].any()
     np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
@@ -266,7 +265,7 @@ def test_each_stage_lowers_the_energy(monkeypatch):
 
         monkeypatch.setattr(refinement, name, run)
 
-    watched('_descended', lambda arguments, result: (result[0], arguments[2]))
+    watched('descended', lambda arguments, result: (result[0], arguments[2]))
     watched('_minimise', lambda arguments, result: (arguments[0], arguments[3]))
     labels, models = refine(problem, surface, blocks, moments, sensor)
     assert len(values) == 3
@@ -288,7 +287,7 @@ def test_no_expansion_helps_after_the_exact_minimisation():
         pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
         front = np.flatnonzero(pixels & measured).astype(np.int32)
         changed, cost = labels.copy(), costs(labels, problem, models)
-        labelling = expansion.GridLabelling.of(changed, cost, problem.links, problem.width)
+        labelling = GridLabelling.of(changed, cost, problem.links, problem.width)
         refinement._expand(
             alpha, front, (0, len(labels) // problem.width), 1, labelling, problem, models
         )

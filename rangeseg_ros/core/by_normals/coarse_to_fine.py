@@ -16,7 +16,8 @@ from rangeseg_ros.core.by_normals.piece_moves import relabel_regions
 from rangeseg_ros.core.by_normals.pieces import Pieces, pieces
 from rangeseg_ros.core.graphcut.cut import ROUNDING
 from rangeseg_ros.core.graphcut.energy import link_costs
-from rangeseg_ros.core.graphcut.expansion import GridLabelling, Sites, band, expand, fronts
+from rangeseg_ros.core.graphcut.expansion import expand
+from rangeseg_ros.core.graphcut.sites import GridLabelling, Sites, band, fronts
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Shares of the smoothness under which regions grow, one after the other: under all of it at once,

@@ -31,6 +31,8 @@ from rangeseg_ros.core.sensing.sensor import (
 _SMOOTHNESS = 1.2
 NO_PLANE = 6.0
 """Data cost of label 0."""
+LEAST_GAIN = 1e-6
+"""An improvement of the energy by less is rounding."""
 _CAP = 8.0
 
 

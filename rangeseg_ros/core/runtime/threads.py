@@ -22,6 +22,8 @@ T = TypeVar('T')
 _MOST = 4
 # Rows that are worth the handing over.
 _ROWS = 16
+# Rows on either side of the middle of the image that are looked at again.
+_SEAM = 8
 
 
 @cache
@@ -57,6 +59,19 @@ def map_halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T,
     middle = rows // 2
     lower = submit(kernel, middle, rows, *arguments)
     return kernel(0, middle, *arguments), lower.result()
+
+
+def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> None:
+    """Run kernel(rows, *arguments) on both halves of an image at once, then where they meet.
+
+    Two rows in the middle are left to the end, so that neither half sees the other change: the
+    result is the same for any number of threads.
+    """
+    middle = height // 2
+    lower = submit(kernel, (min(middle + 1, height), height), *arguments)
+    kernel((0, max(middle - 1, 0)), *arguments)
+    lower.result()
+    kernel((max(middle - _SEAM, 0), min(middle + _SEAM, height)), *arguments)
 
 
 def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:

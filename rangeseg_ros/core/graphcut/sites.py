@@ -1,0 +1,205 @@
+"""Sites of a grid that an expansion may change: those around each label.
+
+Sites are pixels, numbered in raster order.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.grid import CHUNK
+
+Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
+"""Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
+
+
+class GridLabelling(NamedTuple):
+    """A labelling of n pixels, in raster order, while expansions change it.
+
+    Attributes
+    ----------
+    labels : (n,) int32
+    data : (n,) float32
+        Data cost of each pixel's label.
+    links : (2, n) float32
+        See `energy.link_costs`.
+    width : int
+        Pixels in a row.
+    position : (n,) int32
+        Scratch of the expansions: -1 between them.
+    """
+
+    labels: NDArray[np.int32]
+    data: NDArray[np.float32]
+    links: NDArray[np.float32]
+    width: int
+    position: NDArray[np.int32]
+
+    @classmethod
+    def of(
+        cls,
+        labels: NDArray[np.int32],
+        data: NDArray[np.float32],
+        links: NDArray[np.float32],
+        width: int,
+    ) -> GridLabelling:
+        """Begin with these labels and data costs, which change in place."""
+        return cls(labels, data, links, width, np.full(len(labels), -1, np.int32))
+
+
+@njit(cache=True, nogil=True)
+def fronts(
+    labels: NDArray[np.int32],
+    links: NDArray[np.float32],
+    width: int,
+    count: int,
+    rows: tuple[int, int],
+) -> Sites:
+    """Sites in some rows that are across an edge from each label's own.
+
+    Parameters
+    ----------
+    labels : (n,) int32
+    links : (2, n) float32
+    width : int
+        Sites in a row.
+    count : int
+        Number of labels.
+    rows : tuple of 2 int
+        The first of the rows, and the one after the last.
+    """
+    first, after = rows[0] * width, rows[1] * width
+    room = 4 * (after - first)
+    beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
+    found = 0
+    for chunk in range(max(first - width, 0), after, CHUNK):
+        stop = min(chunk + CHUNK, after)
+        if are_alike(labels, chunk, stop, width):
+            continue
+        for p in range(chunk, stop):
+            here = labels[p]
+            for k in range(2):
+                q = p + (1 if k == 0 else width)
+                if q < len(labels) and labels[q] != here and links[k, p] > 0:
+                    if first <= q < after:
+                        beside[found], sites[found] = here, q
+                        found += 1
+                    if p >= first:
+                        beside[found], sites[found] = labels[q], p
+                        found += 1
+    return group_sites(beside[:found], sites[:found], count)
+
+
+@njit(cache=True, nogil=True)
+def are_alike(labels: NDArray[np.int32], first: int, after: int, width: int) -> bool:
+    """Whether sites from `first` to before `after` have the labels of those right of and below
+    them, where there are any; `width` sites are in a row."""
+    # As views of their own, whose places are known not to be negative, many are compared at once.
+    here = labels[first:after]
+    right, below = labels[first + 1 : after + 1], labels[first + width : after + width]
+    unlike = here[0] ^ here[0]
+    for p in range(len(right)):
+        unlike |= here[p] ^ right[p]
+    for p in range(len(below)):
+        unlike |= here[p] ^ below[p]
+    return bool(unlike == 0)
+
+
+@njit(cache=True, nogil=True)
+def group_sites(labels: NDArray[np.int32], sites: NDArray[np.int32], count: int) -> Sites:
+    """Sort sites (N,) by their labels (N,), which are below `count`; of a label in order."""
+    start = np.zeros(count + 2, np.int64)
+    for label in labels:
+        start[label + 2] += 1
+    start = np.cumsum(start)
+    result = np.empty_like(sites)
+    for s in range(len(sites)):
+        result[start[labels[s] + 1]] = sites[s]
+        start[labels[s] + 1] += 1
+    return start[: count + 1], result
+
+
+@njit(cache=True, nogil=True)
+def band(
+    alpha: int,
+    front: NDArray[np.int32],
+    reach: int,
+    labelling: GridLabelling,
+    rows: tuple[int, int],
+) -> NDArray[np.int32]:
+    """Sites of other labels, in some rows, within `reach` edges of a label.
+
+    Parameters
+    ----------
+    alpha : int
+    front : (m,) int32
+        Sites next to those of the label.
+    reach : int
+    labelling : GridLabelling
+        `position` receives the place of each site in the result.
+    rows : tuple of 2 int
+        The first of the rows, and the one after the last.
+
+    Returns
+    -------
+    (s,) int32
+    """
+    labels, links, position = labelling.labels, labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
+    first, after = rows[0] * labelling.width, rows[1] * labelling.width
+    sites = np.empty(max(64, 2 * reach * len(front)), np.int32)
+    count = done = 0
+    for p in front:
+        if labels[p] != alpha and position[p] < 0:
+            position[p] = count
+            sites[count] = p
+            count += 1
+    for _ in range(reach - 1):
+        ring = count
+        while done < ring:
+            p = sites[done]
+            done += 1
+            for k in range(4):
+                q = p + offsets[k]
+                linked = first <= q < after and links[k % 2, min(p, q)] > 0
+                if linked and labels[q] != alpha and position[q] < 0:
+                    if count == len(sites):
+                        sites = np.concatenate((sites, np.empty_like(sites)))
+                    position[q] = count
+                    sites[count] = q
+                    count += 1
+    return sites[:count]
+
+
+@njit(cache=True, nogil=True)
+def beyond(
+    alpha: int, sites: NDArray[np.int32], labelling: GridLabelling, rows: tuple[int, int]
+) -> NDArray[np.int32]:
+    """Sites beyond a band that the label has won up to its far side, in some rows.
+
+    They are next to a site of the band that has the label by now, and neither in the band nor of
+    the label themselves.
+    """
+    labels, links, position = labelling.labels, labelling.links, labelling.position
+    offsets = np.array([1, labelling.width, -1, -labelling.width])
+    first, after = rows[0] * labelling.width, rows[1] * labelling.width
+    for p in sites:
+        position[p] = 0
+    result = np.empty(3 * len(sites), np.int32)
+    count = 0
+    for p in sites:
+        if labels[p] != alpha:
+            continue
+        for k in range(4):
+            q = p + offsets[k]
+            linked = first <= q < after and links[k % 2, min(p, q)] > 0
+            if linked and labels[q] != alpha and position[q] < 0:
+                result[count] = q
+                count += 1
+    for p in sites:
+        position[p] = -1
+    return result[:count]
