@@ -98,6 +98,18 @@ def test_directions_err_both_ways_or_one(errors):
     assert sensor.row_noise == pytest.approx(errors[1], rel=0.3)
 
 
+def test_slopes_explain_no_noise_that_is_of_two_kinds():
+    """Which one kind of errors leaves unexplained, at some ranges more than at others."""
+    random = np.random.default_rng(5)
+    inverse, _, _ = tilted_planes(random)
+    scale = random.permutation(np.linspace(0.5, 2, 48)).reshape(6, 8)
+    inverse *= scale.repeat(80, axis=0).repeat(80, axis=1)
+    inverse = np.maximum(inverse, 0.1)
+    noise, range_noise = random.normal(size=(2, *CAMERA.shape))
+    sensor = sensor_of(inverse + 0.002 * noise + 0.01 * inverse**2 * range_noise)
+    assert sensor.column_noise == sensor.row_noise == 0
+
+
 @pytest.mark.parametrize('seed', range(3, 13))
 def test_clutter_and_outliers_change_little(seed):
     random = np.random.default_rng(seed)
