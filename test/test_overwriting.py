@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import stat
 import subprocess
 import sys
@@ -62,6 +63,30 @@ def test_folders_of_killed_processes_are_cleared_and_those_in_use_are_not(tmp_pa
         partial.write_text('')
         clear_abandoned(tmp_path / 'bag')
         assert not left.exists() and partial.exists()
+
+
+@pytest.mark.parametrize('moment', ['mkdir', 'rmtree'])
+@pytest.mark.parametrize('error', ['KeyboardInterrupt', 'SystemExit(143)'])
+def test_a_signal_while_a_folder_is_made_or_removed_leaves_nothing(tmp_path, moment, error):
+    program = f"""
+import pathlib, shutil
+from rangeseg_ros.io.files import replacing
+
+def interrupted(*arguments, **options):
+    place.{moment} = original
+    if {moment!r} == 'mkdir':
+        original(*arguments, **options)
+    raise {error}
+
+place = {{'mkdir': pathlib.Path, 'rmtree': shutil}}[{moment!r}]
+original = place.{moment}
+place.{moment} = interrupted
+with replacing(pathlib.Path('labels.png')) as partial:
+    partial.write_text('labels')
+"""
+    ended = subprocess.run([sys.executable, '-c', program], cwd=tmp_path, stderr=subprocess.PIPE)
+    assert ended.returncode == (143 if '143' in error else -signal.SIGINT)
+    assert [path.name for path in tmp_path.iterdir()] in ([], ['labels.png'])
 
 
 def test_scratch_folders_of_killed_processes_are_cleared(tmp_path, monkeypatch):

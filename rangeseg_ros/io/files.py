@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import os
 import re
@@ -11,6 +12,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import gettempdir
+
+# Temporary folders of this process. A signal may come while one is made or removed, where no
+# `finally` helps; what is still there when the process exits goes then.
+_unfinished: set[Path] = set()
 
 
 class NotReplacedError(OSError):
@@ -62,19 +67,26 @@ def temporary_folder(folder: Path) -> Iterator[None]:
     """
     if abandoned(folder):
         shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(mode=0o700, parents=True)
+    _unfinished.add(folder)
+    try:
+        folder.mkdir(mode=0o700, parents=True)
+    except OSError:
+        _unfinished.discard(folder)
+        raise
     lock = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         yield
     finally:
         os.close(lock)
-        try:
-            shutil.rmtree(folder, ignore_errors=True)
-        except KeyboardInterrupt:
-            # It may come just here.
-            shutil.rmtree(folder, ignore_errors=True)
-            raise
+        shutil.rmtree(folder, ignore_errors=True)
+        _unfinished.discard(folder)
+
+
+@atexit.register
+def _remove_unfinished() -> None:
+    for folder in list(_unfinished):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
