@@ -11,6 +11,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
@@ -193,14 +194,14 @@ def _work(connection: Connection) -> None:
             task = connection.recv()
         except (EOFError, OSError):
             return
-        try:
-            connection.send(_attempted(task))
-        except BrokenPipeError:
-            return
-        except Exception as error:
-            import traceback
+        # A parent that has gone wants no result; the next `recv` says so.
+        with suppress(ConnectionError):
+            try:
+                connection.send(_attempted(task))
+            except Exception as error:
+                import traceback
 
-            connection.send(_Fault(error, traceback.format_exc()))
+                connection.send(_Fault(error, traceback.format_exc()))
 
 
 def _exit(number: int, stack: object) -> None:

@@ -1,5 +1,6 @@
 """Tasks in many processes: results, failures, workers and parents that die."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -10,7 +11,14 @@ from pathlib import Path
 
 import pytest
 
-from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
+from rangeseg_ros.tasks import (
+    Failure,
+    SchedulerError,
+    _work,
+    attempt_all,
+    check_scheduler,
+    run_all,
+)
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,17 @@ class Deadly:
 class Sleeps:
     def run(self):
         time.sleep(600)
+
+
+@pytest.mark.parametrize('task', [Square(2), Raises(RuntimeError('interrupted'))])
+def test_a_worker_whose_parent_has_gone_ends_in_silence(task, capfd):
+    here, there = multiprocessing.Pipe()
+    here.send(task)
+    here.close()
+    worker = multiprocessing.get_context('spawn').Process(target=_work, args=(there,))
+    worker.start()
+    worker.join(60)
+    assert (worker.exitcode, capfd.readouterr().err) == (0, '')
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):
