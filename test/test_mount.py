@@ -35,7 +35,7 @@ def test_angles_and_height_are_within_their_errors(height, pitch, roll):
         view = simulate_kinect(scene, CAMERA, frame=k, sensor_seed=int(height * 10))
         image = RangeImage.from_depth(view.depth, CAMERA)
         sequence.segment(image, 10**9 + k * 10**8, pose=Transform.identity())
-    mount = mount_of(sequence.map.planes, len(scene.poses))
+    mount = mount_of(sequence.map.planes, len(scene.poses), 10.0)
     assert not mount.doubts
     error = np.array([mount.roll - np.radians(roll), mount.pitch - np.radians(pitch)])
     assert np.all(np.abs(error) < np.radians(1.0))

@@ -41,7 +41,7 @@ def command(
     with DepthBag(recording) as source:
         for _, frame, _, _ in segment_frames(source, sequence, lambda frame: still):
             frames, name = frames + 1, frame.frame_id
-    mount = mount_of(sequence.map.planes, frames)
+    mount = mount_of(sequence.map.planes, frames, sequence.config.role_tolerance)
     if mount is None:
         raise click.ClickException(f'{recording}: no plane that faces up in {frames} frames')
     for line in _told(mount, base, name):

@@ -29,9 +29,6 @@ _BAND_PIXELS = 4
 # A label reaches farther where it gains more than this, two steps of the 305 directions: there the
 # pixels beyond a boundary are another surface, not noise of this one.
 _OUTLIER_DEGREES = 15.0
-# Share of the pixels that may speak against the labels of the frame before: the rest is the same
-# scene.
-_MAX_CHANGED_SHARE = 0.25
 
 
 def minimise(
@@ -85,7 +82,7 @@ def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | Non
     bound = (links[parts.graph.start[1:]] - links[parts.graph.start[:-1]]) / 2
     lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
     against = lost > bound
-    if against[parts.image[inside]].sum() > _MAX_CHANGED_SHARE * inside.sum():
+    if 2 * against[parts.image[inside]].sum() > inside.sum():
         return None
     return np.where(against, parts.votes, labels)
 

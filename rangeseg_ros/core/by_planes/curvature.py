@@ -13,6 +13,7 @@ from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.significance import OUTLIER
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
@@ -28,8 +29,6 @@ _FLATNESS = 0.007
 _NOISE = 9.0 * 3.0 * 4.0
 # Rows and columns from one pixel that is looked at to the next.
 _STRIDE = 2
-# Standard deviations, of noise and twice the distortion, to which a residual is the region's.
-_INLIER = 4.0
 # Exponents of x and y in the terms of a quadratic, in the powers of x and y up to the fourth, and
 # which of these are the products of two terms.
 _TERMS = [(n - b, b) for n in range(3) for b in range(n + 1)]
@@ -66,7 +65,8 @@ def find_curved(
     moments = np.add(*map_halves(_sum_moments, len(filled), *arrays, count))
     theta, _ = fit_all(moments)
     ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
-    limit = np.square(_INLIER) * (1 + 4 * ratio)
+    # A residual is the region's up to noise and twice the distortion.
+    limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
     parts = map_halves(_normal_equations, len(filled), *arrays, theta, slope, limit)
     powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))

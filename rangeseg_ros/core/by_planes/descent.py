@@ -20,8 +20,8 @@ from rangeseg_ros.core.graphcut.sites import are_alike
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 from rangeseg_ros.core.sensing.grid import CHUNK
 
-# Blocks from a surface in which its label may win pixels.
-_REACH = 2
+REACH = 2
+"""Blocks from a surface in which its label may win pixels."""
 
 
 def descended(
@@ -30,7 +30,7 @@ def descended(
     """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
     labels = np.zeros(len(problem.inverse), np.int32)
     cost = np.zeros(len(labels), np.float32)
-    window = np.ones((2 * _REACH + 1, 2 * _REACH + 1), np.uint8)
+    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
     exact = surfaces.astype(np.float32)
     least = cv2.erode(exact, window)
     settled = (least > 0) & (least == cv2.dilate(exact, window))
@@ -57,7 +57,7 @@ def _take_nearest(
     rows, columns = surfaces.shape
     width, block = problem.width, problem.block
     height = len(labels) // width
-    side = 2 * _REACH + 1
+    side = 2 * REACH + 1
     candidates, scale = np.empty(side * side, np.int32), np.empty(side * side)
     for bi in range(first, after):
         top, bottom = bi * block, min((bi + 1) * block, height)
@@ -69,8 +69,8 @@ def _take_nearest(
                         labels[p] = surfaces[bi, bj] if problem.weight[p] > 0 else 0
                 continue
             count, last = 0, np.int32(0)
-            for i in range(max(bi - _REACH, 0), min(bi + _REACH + 1, rows)):
-                for j in range(max(bj - _REACH, 0), min(bj + _REACH + 1, columns)):
+            for i in range(max(bi - REACH, 0), min(bi + REACH + 1, rows)):
+                for j in range(max(bj - REACH, 0), min(bj + REACH + 1, columns)):
                     label = surfaces[i, j]
                     if label in (np.int32(0), last):
                         continue

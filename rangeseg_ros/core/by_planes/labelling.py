@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.descent import descended
+from rangeseg_ros.core.by_planes.descent import REACH, descended
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     Models,
@@ -26,13 +26,14 @@ from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import expand
 from rangeseg_ros.core.graphcut.sites import GridLabelling, Sites, band, beyond, fronts
 from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
-# Pixels from a boundary to cut anew.
-_BAND = 2
-# Blocks from a surface that its label is expanded to when exact. Its plane may well explain pixels
-# anywhere in the image, but these are rarely the surface's.
-_DOMAIN = 4
+# Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
+_BAND = BLOCK // 2
+# Blocks from a surface that its label is expanded to when exact: where two surfaces may both win
+# pixels. Its plane may well explain pixels anywhere in the image, rarely the surface's.
+_DOMAIN = 2 * REACH
 
 
 def refine(

@@ -15,7 +15,7 @@ _NOISE = 16.0 * 4.0
 # are merged at once.
 _CLEAR = 24.0
 WITHIN_PATCH = 2.0
-"""Systematic variances granted between blocks of a patch."""
+"""Systematic variances granted between blocks of a patch: that of a difference is twice one."""
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = 10.0
 # Steps of a variance by which patches are told to be flatter: the mean residual of the largest

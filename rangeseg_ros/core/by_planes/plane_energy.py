@@ -26,6 +26,7 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
+from rangeseg_ros.core.significance import OUTLIER
 
 # For each pixel that has to agree with its neighbour to count as one measurement.
 _SMOOTHNESS = 1.2
@@ -33,7 +34,8 @@ NO_PLANE = 6.0
 """Data cost of label 0."""
 LEAST_GAIN = 1e-6
 """An improvement of the energy by less is rounding."""
-_CAP = 8.0
+# That of an outlier, minus the logarithm of a likelihood.
+_CAP = OUTLIER**2 / 2
 
 
 class Problem(NamedTuple):

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from rangeseg_ros.core.calibration.sightings import Sightings
+from rangeseg_ros.core.significance import CERTAIN
 
-# Standard deviations beyond which a step is none by chance: 1e-6 in 1000 columns.
-_SIGNIFICANT = 6.0
 # Columns over which the slope of the smooth distortion is alike; many enough that their median
 # takes next to nothing off the noise of one.
 _REACH = 10
@@ -31,6 +30,6 @@ def column_profile(seen: Sightings) -> NDArray[np.float64]:
     # Columns seen in few rows are as much noisier.
     noise = change * np.sqrt(count / max(count.max(initial=0), 1))
     spread = 1.4826 * np.median(np.abs(noise[count > 0])) if count.any() else 0.0
-    steps = np.where(np.abs(noise) > _SIGNIFICANT * max(spread, 1e-12), change, 0.0)
+    steps = np.where(np.abs(noise) > CERTAIN * max(spread, 1e-12), change, 0.0)
     profile: NDArray[np.float64] = np.concatenate([[0.0], np.cumsum(steps)])
     return profile - profile.mean()

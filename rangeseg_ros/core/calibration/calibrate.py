@@ -23,10 +23,9 @@ from rangeseg_ros.core.sensing.distortion import DistortionMap
 _FEWEST_FRAMES = 2 * BLOCKS
 # Inverse depths that count as different views of a cell differ by this part.
 _VIEW = 0.1
-# Different views that most cells need: what one surface shows in one place may be its own shape.
+# Different views that most cells need, one more than the two coefficients of a cell: what one
+# surface shows in one place may be its own shape.
 _FEWEST_VIEWS = 3
-# Share of the image that must have been seen.
-_COVERAGE = 0.5
 ADVICE = (
     'record walls, floor and other flat things for half a minute while the camera moves slowly: '
     'nearer and farther, turned in all directions, so that flat surfaces cross every part of the '
@@ -133,10 +132,10 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
             f'{_FEWEST_FRAMES} are needed; {ADVICE}'
         )
     covered = float((views > 0).mean())
-    if covered < _COVERAGE:
+    if covered < 0.5:
         raise CalibrationError(
             f'too few positions: planes cover {covered:.0%} of the image, '
-            f'{_COVERAGE:.0%} are needed; {ADVICE}'
+            f'half of it is needed; {ADVICE}'
         )
     typical = int(np.median(views[views > 0]))
     if typical < _FEWEST_VIEWS:

@@ -28,8 +28,6 @@ BLOCKS = 5
 """Parts of the recording that are left out in turn."""
 # Tried from the smoothest on, in sightings of a cell, a factor of 4 apart.
 _SMOOTHNESS = (64.0, 16.0, 4.0)
-# By how much the second coefficient is smoother: it is known worse, as distances differ little.
-_SLOPE_SMOOTHER = (64.0, 16.0, 4.0)
 # Times the variance explained that a second coefficient must explain. Sensors without it stay
 # below 1.00 and a Kinect below 1.15; with it, readers of page 1 alone are left without a map.
 _WORTH = 1.2
@@ -117,7 +115,8 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     explained = [_explained(folds) for folds in _leave_out(seen, one, weight, shape, 2, tried)]
     basis, smoothness = one, tried[int(np.argmax(explained))]
     two, least = np.stack([one[0], slope]), _WORTH * max(*explained, 0.0)
-    tried = [(*smoothness, smoothness[0] * factor) for factor in _SLOPE_SMOOTHER]
+    # The second coefficient is known worse, as distances differ little.
+    tried = [(*smoothness, smoothness[0] * factor) for factor in _SMOOTHNESS]
     explained = [_explained(folds) for folds in _leave_out(seen, two, weight, shape, 2, tried)]
     if max(explained) > least:
         basis, smoothness = two, tried[int(np.argmax(explained))]

@@ -17,15 +17,20 @@ from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_
 # Pairs of regions and how much links them, see `find_borders`.
 Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
 
-# Quantile 0.99 of chi-squared with the three degrees of freedom of a plane, and what the parts of
-# a face differ by beyond their errors, as factor of variances: the residue of bands, of grazing
-# views and of ragged borders, from 239 pairs of parts in simulated rooms (median 2.9). Of 725
-# pairs of different faces that meet, one was within the quantile alone, and 14 are with it.
-_LIMIT = 11.34 * 2.5
+RESIDUE = 2.5
+"""What the parts of a face differ by beyond their errors, as factor of variances.
+
+The residue of bands, of grazing views and of ragged borders, from 239 pairs of parts in simulated
+rooms (median 2.9).
+"""
+# Of 725 pairs of different faces that meet, one was within the quantile alone, and 14 are with the
+# residue.
+_LIMIT = RESIDUE * 11.34
 # The same for regions that touch where no jump is. These are rarely parts of a face, but faces
 # that meet there meet in a crease: of 2300 pairs in simulated and real frames, 11 of parts were
 # apart by 0 to 56 (others, of bent or ragged parts, by more), those of faces by 119 at least.
-_TOUCHING_LIMIT = 11.34 * 6.0
+_TOUCHING = 6.0
+_TOUCHING_LIMIT = _TOUCHING * 11.34
 # Share of its outline along which a region lies in another. Two planes meet along a line, and a
 # line is never more than half of an outline.
 _ENCLOSED = 0.6

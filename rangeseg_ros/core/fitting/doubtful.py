@@ -21,9 +21,8 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
+from rangeseg_ros.core.significance import OUTLIER
 
-# Standard deviations of random and systematic error beyond which a pixel is an outlier.
-_OUTLIER = 4.0
 # Kinds of pixels.
 _SURE, _OUTLYING, _AT_RIM = 0, 1, 2
 
@@ -224,7 +223,7 @@ def _sort(
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             # No pixel is farther off than all together.
             left = squares_left(blocks.moments[bi, bj], theta[label])
-            explained[bi, bj] = left <= _OUTLIER**2 * variance or not _has_outliers(
+            explained[bi, bj] = left <= OUTLIER**2 * variance or not _has_outliers(
                 bi * BLOCK, bj * BLOCK, inverse, rays, sensor, theta[label]
             )
             if explained[bi, bj] and bi >= first_block and squared > 0:
@@ -279,7 +278,7 @@ def _has_outliers(
             residual -= theta[2] * rays[i, j, 2]
             squared = y * y
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-            found |= (y > 0) & (residual * residual > _OUTLIER**2 * variance)
+            found |= (y > 0) & (residual * residual > OUTLIER**2 * variance)
     return found
 
 
@@ -301,7 +300,7 @@ def _kind(
     residual -= theta[label, 2] * rays[i, j, 2]
     squared = y * y
     variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-    if residual * residual > _OUTLIER**2 * variance:
+    if residual * residual > OUTLIER**2 * variance:
         return _OUTLYING
     if inside[j // BLOCK] > 0:
         return _SURE

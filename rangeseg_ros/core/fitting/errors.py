@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.fitting.alike import alike, quantiles
 from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.sensing.sensor import FLOOR
+from rangeseg_ros.core.significance import CERTAIN
 
 # Rounds of least squares that settle the weights.
 _ROUNDS = 5
@@ -21,8 +22,9 @@ _CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
 # Quantile 0.999 of F with one and 22 degrees of freedom, those of the 24 sets of an image of VGA:
 # slopes that explain more are no chance. The few sets of small images would ask for more.
 _SIGNIFICANT = 14.4
-# Six standard deviations: directions that err one way alone, as those of scanners that turn.
-_CERTAIN = 36.0
+# Directions that err one way alone, as those of scanners that turn: cameras show four standard
+# deviations at most.
+_CERTAIN = CERTAIN**2
 
 BOTH = (1.0, 1.0)
 """Directions that err as much along the rows as down the columns."""

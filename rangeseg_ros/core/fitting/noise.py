@@ -26,16 +26,13 @@ from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
+from rangeseg_ros.core.significance import SAMPLES
 
-# Blocks of a scale that weigh as much as what is known beforehand.
-_PRIOR = 12
 ROUGH = 2.7
 """Chi-squared of 13 degrees of freedom over its mean, quantile 0.999: what is rougher is no part
 of a plane."""
 # The same with 9 degrees of freedom, of what one plane through four blocks leaves.
 _BENT = 3.1
-# Share of the pixels of the fullest block that a block needs to count.
-_SHARE = 0.5
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
@@ -61,8 +58,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     # slopes of its own.
     coarse = Blocks.planes(quads(blocks.moments), image.rays, 2 * BLOCK)
     count = coarse.moments[..., COUNT]
-    used = count >= _SHARE * count.max(initial=0)
-    if np.count_nonzero(used) < _PRIOR:
+    used = 2 * count >= count.max(initial=0)
+    if np.count_nonzero(used) < SAMPLES:
         return prior
     scale = Scale.of(coarse, used, BOTH)
     quantum, range_quantum = quanta.result()
@@ -89,7 +86,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     side, parts = BLOCK, blocks
     while True:
         whole, apart, level = _of_four(flat, parts.residual, level)
-        if np.count_nonzero(whole) < _PRIOR:
+        if np.count_nonzero(whole) < SAMPLES:
             break
         parts = (
             coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)

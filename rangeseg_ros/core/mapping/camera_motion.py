@@ -15,10 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.tracking.tracker import SHIFT, TURN
-
-# Seconds for which a velocity persists: hands and heads change their minds about that often.
-_PERSISTENCE = 0.5
+from rangeseg_ros.core.tracking.tracker import PERSISTENCE, SHIFT, TURN
 
 
 class Prediction(NamedTuple):
@@ -51,8 +48,8 @@ def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> P
         Seconds.
     """
     turn, shift = pose
-    part = elapsed / _PERSISTENCE
-    kept, reach = np.exp(-part), _PERSISTENCE * -np.expm1(-part)
+    part = elapsed / PERSISTENCE
+    kept, reach = np.exp(-part), PERSISTENCE * -np.expm1(-part)
     turned = Rotation.from_rotvec(reach * velocity[:3]).as_matrix()
     change = np.eye(12)
     change[:3, :3] = turned.T
@@ -62,8 +59,8 @@ def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> P
     change[6:, 6:] *= kept
     # Of the path and the velocity, for unit variance; the axes are alike, so that no rotation
     # counts.
-    path = _PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
-    both, speed = _PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
+    path = PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
+    both, speed = PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
     variance = np.diag(np.repeat([TURN**2, SHIFT**2], 3))
     across = np.zeros((6, 6))
     across[:3, :3], across[3:, 3:] = TURN**2 * np.eye(3), SHIFT**2 * turn

@@ -11,15 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.transforms import quaternion
+from rangeseg_ros.core.significance import OUTLIER
 
 # Largest angle between up and -y of the camera, so that no wall is taken for the floor.
 _STEEPEST = np.radians(60.0)
-# Share of the area of the floor from which another plane may be the floor as well, and of the
-# frames in which the floor is to be seen.
-_RIVAL, _SEEN = 0.5, 0.5
-# Standard deviation of roll or pitch from which the floor is not sure: a quarter of the
-# role_tolerance by which it is told from other planes.
-_UNSURE = np.radians(2.5)
+# Share of the area of the floor from which another plane may be the floor as well.
+_RIVAL = 0.5
 
 
 class Mount(NamedTuple):
@@ -59,7 +56,7 @@ class Mount(NamedTuple):
         return angles
 
 
-def mount_of(planes: Sequence[MapPlane], frames: int) -> Mount | None:
+def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount | None:
     """The mount by the floor among planes that were fused in the frame of the camera.
 
     The floor is the largest plane that faces up; of a robot that drives on a flat floor, it alone
@@ -71,6 +68,8 @@ def mount_of(planes: Sequence[MapPlane], frames: int) -> Mount | None:
         In the optical frame.
     frames : int
         Number of frames they are from.
+    tolerance : float
+        Angle by which a floor is told from other planes, degrees: the parameter `role_tolerance`.
 
     Returns
     -------
@@ -94,12 +93,12 @@ def mount_of(planes: Sequence[MapPlane], frames: int) -> Mount | None:
     forward = np.array([0, 0, 1.0]) - up[2] * up
     forward /= np.linalg.norm(forward)
     doubts = []
-    if floor.observations < _SEEN * frames:
+    if 2 * floor.observations < frames:
         doubts.append(f'it was found in {floor.observations} of {frames} frames')
     if len(order) > 1 and weight[order[1]] > _RIVAL * weight[order[0]]:
         other = facing[order[1]]
         doubts.append(f'a plane {other.distance:.2f} m below the camera may be the floor as well')
-    if sigma[:2].max() > _UNSURE:
+    if OUTLIER * sigma[:2].max() > np.radians(tolerance):
         doubts.append(f'its direction is known to {np.degrees(sigma[:2].max()):.1f} degrees only')
     frame = np.stack([forward, np.cross(up, forward), up])
     return Mount(roll, pitch, floor.distance, sigma, frame, doubts)

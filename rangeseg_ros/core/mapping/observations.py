@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -25,9 +26,6 @@ LASTING = 0.8
 # Overlap in the image from which two observations are of the same pixels, so that small motions to
 # and fro do not count as new looks. From 0.5 to 0.85 the map is as good and as sure of itself.
 ANOTHER = 0.7
-# What planes differ by from the truth beyond their covariances, as factor of variances, by the
-# residue of bands, grazing views and ragged borders: that of `fitting.coplanar`.
-RESIDUE = 2.5
 # Samples along a side of a cell of the image, see `views`.
 _SAMPLES = 16
 

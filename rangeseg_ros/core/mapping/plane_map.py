@@ -35,8 +35,6 @@ from rangeseg_ros.core.tracking.tracker import NOMINAL, SURE_TURN
 
 # Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
 _GATE = 16.27
-# Nanoseconds after which what is not confirmed and not seen again is forgotten.
-_PROBATION = 3 * 10**9
 # Largest offset, as share of the range, of what may be one plane: beyond is no error of the sensor
 # but another plane, however uncertain both are; so it is beyond `SURE_TURN`.
 _FARTHEST = 0.1
@@ -311,8 +309,9 @@ class PlaneMap:
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, those not confirmed, and what is too much."""
+        trial = 1e9 * self.config.track_time
         kept = [
-            not r.outline.is_empty and (r.confirmed or self._time - r.seen < _PROBATION)
+            not r.outline.is_empty and (r.confirmed or self._time - r.seen <= trial)
             for r in self._records
         ]
         if (surplus := sum(kept) - self.config.map_planes) > 0:

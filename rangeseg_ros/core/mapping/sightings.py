@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.significance import OUTLIER
 
 THERE, UNSEEN, THROUGH = 1, 0, -1
 
-# Standard deviations beyond which a ray went through: one in 16000 of those that ended there.
-_GATE = 4.0
 # Least cosine of incidence: 3 degrees, where rays run along what they could pass through.
 _GRAZING = 0.05
 
@@ -92,6 +91,6 @@ def find_sightings(
     # Along the ray, the inverse depth changes by 1 / z for every n . p.
     variance += (sigma[k] * expected / slope[k]) ** 2
     beyond = (expected - measured) / np.sqrt(variance)
-    seen = (measured > 0) & (beyond >= -_GATE)
-    found[k[seen]] = np.where(beyond[seen] > _GATE, THROUGH, THERE)
+    seen = (measured > 0) & (beyond >= -OUTLIER)
+    found[k[seen]] = np.where(beyond[seen] > OUTLIER, THROUGH, THERE)
     return found

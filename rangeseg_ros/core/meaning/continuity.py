@@ -16,7 +16,9 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
+from rangeseg_ros.core.sensing.bridges import SPAN
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.significance import OUTLIER
 
 BASELINES = (1, 2, 4, 8, 16)
 """Rows between cells that are compared; neighbours are as far apart as four rows or more."""
@@ -24,11 +26,11 @@ BROAD = 3
 """Baseline of the noise that cells of a patch share."""
 # Baselines of the noise between the halves of a cell, its neighbours, and the next but one.
 _HALF, _NEXT, _SECOND = 1, 1, 2
-# What a step between two cells must exceed, in standard deviations of the noise of one: 4 of the
-# difference, one in 16 000 by chance.
-_DIFFERENCE = 4 * math.sqrt(2.0)
-# Cells without a measurement that a surface may reach across.
-_GAP = 2
+# What a step between two cells must exceed, in standard deviations of the noise of one.
+_DIFFERENCE = OUTLIER * math.sqrt(2.0)
+# Cells without a measurement that a surface may reach across: the holes that are bridged, as a
+# cell has two rows of an image of VGA.
+_GAP = SPAN // 2
 
 
 class Steps(NamedTuple):

@@ -12,11 +12,14 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-# Pixels from one side of a hole to the other, at most: gaps of three, as random holes in a third
-# of the pixels make them, and less than the shadow of any step that is not small itself.
-_SPAN = 4
+SPAN = 4
+"""Pixels from one side of a hole to the other, at most.
+
+Gaps of three, as random holes in a third of the pixels make them, and less than the shadow of any
+step that is not small itself.
+"""
 # Rows of the image that one row is told by, and more: a power of two.
-_ROWS = 2 * _SPAN
+_ROWS = 2 * SPAN
 # Rows and columns from one pixel to the next.
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
@@ -68,34 +71,34 @@ def _bridge(
     # Whether pixels were measured, of the rows around one and with a margin; and which of the
     # row's were not but lie between two that were: most holes are far from all that was. Bytes,
     # of which the compiler takes more at a time than of truth values.
-    known = np.zeros((_ROWS, width + 2 * _SPAN), np.uint8)
+    known = np.zeros((_ROWS, width + 2 * SPAN), np.uint8)
     between = np.empty(width, np.uint8)
-    for i in range(first - 2 * _SPAN, after):
-        _find_known(i + _SPAN, measured, known[(i + _SPAN) % _ROWS, _SPAN:])
+    for i in range(first - 2 * SPAN, after):
+        _find_known(i + SPAN, measured, known[(i + SPAN) % _ROWS, SPAN:])
         if i < first:
             continue
         between[:] = 0
         for di, dj in _DIRECTIONS:
             _find_between(
-                known[(i - di) % _ROWS, _SPAN - dj :],
-                known[(i - 2 * di) % _ROWS, _SPAN - 2 * dj :],
-                known[(i - 3 * di) % _ROWS, _SPAN - 3 * dj :],
-                known[(i + di) % _ROWS, _SPAN + dj :],
-                known[(i + 2 * di) % _ROWS, _SPAN + 2 * dj :],
-                known[(i + 3 * di) % _ROWS, _SPAN + 3 * dj :],
+                known[(i - di) % _ROWS, SPAN - dj :],
+                known[(i - 2 * di) % _ROWS, SPAN - 2 * dj :],
+                known[(i - 3 * di) % _ROWS, SPAN - 3 * dj :],
+                known[(i + di) % _ROWS, SPAN + dj :],
+                known[(i + 2 * di) % _ROWS, SPAN + 2 * dj :],
+                known[(i + 3 * di) % _ROWS, SPAN + 3 * dj :],
                 between,
             )
-        here = known[i % _ROWS, _SPAN:]
+        here = known[i % _ROWS, SPAN:]
         for j in range(width):
             between[j] &= here[j] ^ 1
         for j in range(width):
             if between[j] == 0:
                 continue
             step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
-            best, value = 2 * _SPAN, np.float32(0)
+            best, value = 2 * SPAN, np.float32(0)
             for di, dj in _DIRECTIONS:
                 back, ahead = 0, 0
-                for k in range(1, _SPAN):
+                for k in range(1, SPAN):
                     u, v = i - k * di, j - k * dj
                     if not (0 <= u < height and 0 <= v < width):
                         break
@@ -104,7 +107,7 @@ def _bridge(
                         break
                 if back == 0:
                     continue
-                for k in range(1, _SPAN + 1 - back):
+                for k in range(1, SPAN + 1 - back):
                     u, v = i + k * di, j + k * dj
                     if not (0 <= u < height and 0 <= v < width):
                         break
@@ -149,7 +152,7 @@ def _find_between(
     ahead3: NDArray[np.uint8],
     between: NDArray[np.uint8],
 ) -> None:
-    """Add the pixels with measured ones behind and ahead of them, at most `_SPAN` apart.
+    """Add the pixels with measured ones behind and ahead of them, at most `SPAN` apart.
 
     Those behind and ahead in one direction, by 1, 2 and 3 pixels, are given apart.
     """

@@ -42,14 +42,12 @@ _TRIAL, _ON_TRIAL = 0.32, 0.05
 # as can be while depth is still measured. They count only where planes leave the motion open.
 TURN, SHIFT = np.radians(60.0), 0.9
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
-# speed is kept up for: after longer, the camera may be anywhere.
-NOMINAL, _LONGEST = 1 / 30, 0.5
+# speed is kept up for, as hands and heads change their minds about that often.
+NOMINAL, PERSISTENCE = 1 / 30, 0.5
 # Least intersection over union, and largest changes, of planes the motion is estimated from: the
 # equations are linear in it, and larger changes are rather another plane.
 _SURE_OVERLAP, SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
 _MOTION_ROUNDS = 3
-# Share of the planes that a motion must explain of those that stay where they were without it.
-_AGREED = 0.5
 
 
 class Tracker:
@@ -132,10 +130,11 @@ class Tracker:
         seen, known = Tracks.of(planes, samples, elapsed), self._tracks
         shared = shared_samples(known, samples, len(planes))
         if motion:
-            # Where the frames that tell the motion jump, the planes know better.
+            # Where the frames that tell the motion jump, the planes know better: most of those
+            # that stay where they were without it.
             moved = known.moved(*motion)
             sure = [int(_sure_pairs(tracks, seen, shared).sum()) for tracks in (moved, known)]
-            self.contradicted = sure[0] < _AGREED * sure[1]
+            self.contradicted = 2 * sure[0] < sure[1]
             if not self.contradicted:
                 known = moved
         known = known.moved(*_camera_motion(known, seen, shared, elapsed))
@@ -204,7 +203,7 @@ def _camera_motion(
     angle, offset = (variance[t, s] for variance in variances(known, seen))
     start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
-    reach = min(max(elapsed, NOMINAL), _LONGEST)
+    reach = min(max(elapsed, NOMINAL), PERSISTENCE)
     prior = np.diag(np.repeat([(reach * TURN) ** -2, (reach * SHIFT) ** -2], 3))
     for _ in range(_MOTION_ROUNDS):
         n = start @ rotation.T
