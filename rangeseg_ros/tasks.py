@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import re
 import signal
+import sys
 import threading
 import time
 from collections import Counter, deque
@@ -19,6 +20,8 @@ from typing import Any, Protocol, TypeVar
 
 import cv2
 
+from rangeseg_ros.interrupts import silence_losses
+
 R_co = TypeVar('R_co', covariant=True)
 R = TypeVar('R')
 
@@ -27,8 +30,10 @@ EXPECTED = (ValueError, OSError, MemoryError)
 
 # A task is given to so many workers before it is held to be what ends them.
 _WORKERS_PER_TASK = 2
-# Seconds that a worker has to put away what it has begun.
-_PATIENCE = 5.0
+# Seconds that a worker has to put away what it has begun, and between telling it again: what a
+# signal raises inside compiled code or a destructor may be lost.
+_PATIENCE = 10.0
+_AGAIN = 0.5
 
 
 class Task(Protocol[R_co]):
@@ -155,16 +160,20 @@ class _Pool:
 
     def end(self) -> None:
         """End all workers; those in the middle of a task put away what they have begun."""
-        workers = [*self._idle, *((c, process) for c, (process, _) in self._busy.items())]
-        for connection, process in workers:
+        workers = {process: c for c, process in self._idle}
+        workers.update((process, c) for c, (process, _) in self._busy.items())
+        for connection in workers.values():
             connection.close()
-            process.terminate()
+        alive = list(workers)
         end = time.monotonic() + _PATIENCE
-        for _, process in workers:
-            process.join(max(0.0, end - time.monotonic()))
-            if process.is_alive():
-                process.kill()
-                process.join()
+        while alive and time.monotonic() < end:
+            for process in alive:
+                process.terminate()
+            wait([process.sentinel for process in alive], _AGAIN)
+            alive = [process for process in alive if process.is_alive()]
+        for process in alive:
+            process.kill()
+            process.join()
 
     def _start(self) -> tuple[Connection, SpawnProcess]:
         here, there = self._context.Pipe()
@@ -188,32 +197,42 @@ def _work(connection: Connection) -> None:
     # Interrupted by its parent only.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
+    silence_losses()
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    while True:
-        try:
-            task = connection.recv()
-        except (EOFError, OSError):
-            return
-        # A parent that has gone wants no result; the next `recv` says so.
-        with suppress(ConnectionError):
+    try:
+        while True:
             try:
-                connection.send(_attempted(task))
-            except Exception as error:
-                import traceback
+                task = connection.recv()
+            except (EOFError, OSError):
+                return
+            # A parent that has gone wants no result; the next `recv` says so.
+            with suppress(ConnectionError):
+                try:
+                    connection.send(_attempted(task))
+                except Exception as error:
+                    import traceback
 
-                connection.send(_Fault(error, traceback.format_exc()))
+                    connection.send(_Fault(error, traceback.format_exc()))
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _exit(number: int, stack: object) -> None:
-    raise SystemExit(128 + number)
+    """Raise SystemExit, unless one is on its way and what was begun is being put away."""
+    error = sys.exc_info()[1]
+    while error and not isinstance(error, SystemExit):
+        error = error.__context__
+    if not error:
+        raise SystemExit(128 + number)
 
 
 def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent:
         wait([parent.sentinel])
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(_PATIENCE)
+        for _ in range(round(_PATIENCE / _AGAIN)):
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(_AGAIN)
         os._exit(1)
 
 

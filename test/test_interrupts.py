@@ -7,7 +7,7 @@ from textwrap import dedent
 import pytest
 
 PRELUDE = """
-    import os, signal
+    import ctypes, os, signal
     import click
     from rangeseg_ros.cli import main, options
     def loop():
@@ -21,6 +21,7 @@ LOST = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
             except KeyboardInterrupt: pass"""
 WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
             except KeyboardInterrupt as error: raise SystemError('in a kernel') from error"""
+IN_A_CALLBACK = """ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()"""
 NONE = "raise SystemError('without a reason')"
 
 
@@ -31,7 +32,9 @@ def run(body):
     )
 
 
-@pytest.mark.parametrize('body', [LOST, WRAPPED], ids=['lost', 'wrapped'])
+@pytest.mark.parametrize(
+    'body', [LOST, WRAPPED, IN_A_CALLBACK], ids=['lost', 'wrapped', 'in a callback']
+)
 @pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143), ('SIGHUP', 129)])
 def test_a_signal_ends_the_command(body, name, code):
     done = run(body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException'))

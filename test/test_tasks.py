@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +64,42 @@ def test_a_worker_whose_parent_has_gone_ends_in_silence(task, capfd):
     worker.start()
     worker.join(60)
     assert (worker.exitcode, capfd.readouterr().err) == (0, '')
+
+
+@dataclass(frozen=True)
+class LosesSignals:
+    """Loses what the first raises, and takes longer to put away than until the third."""
+
+    folder: Path
+
+    def run(self):
+        (self.folder / 'begun').touch()
+        with suppress(SystemExit):
+            time.sleep(600)
+        try:
+            time.sleep(600)
+        finally:
+            with suppress(ValueError):
+                try:
+                    raise ValueError
+                finally:
+                    time.sleep(2)
+            (self.folder / 'put away').touch()
+
+
+@dataclass(frozen=True)
+class RaisesOnceBegun:
+    folder: Path
+
+    def run(self):
+        wait_for((self.folder / 'begun').exists)
+        raise KeyError('fault')
+
+
+def test_a_worker_that_loses_a_signal_is_told_again_but_not_while_it_puts_away(tmp_path):
+    with pytest.raises(KeyError, match='fault'):
+        list(attempt_all([LosesSignals(tmp_path), RaisesOnceBegun(tmp_path)], 2))
+    assert (tmp_path / 'put away').exists()
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):

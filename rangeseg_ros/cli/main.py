@@ -10,7 +10,7 @@ from typing import Any
 
 import click
 
-from rangeseg_ros.cli import interrupts
+from rangeseg_ros import interrupts
 from rangeseg_ros.cli.errors import in_words
 
 # A subcommand's module is imported when it runs: help need not wait for all of them.

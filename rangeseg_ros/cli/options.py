@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import click
 from tqdm import tqdm
 
-from rangeseg_ros.cli import interrupts
+from rangeseg_ros import interrupts
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.files import NotReplacedError, check_regular, clear_abandoned, replacing
 from rangeseg_ros.io.params import read_config

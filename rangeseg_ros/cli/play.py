@@ -11,7 +11,8 @@ import click
 from rosbags.interfaces import Connection
 from rosbags.rosbag2 import Reader
 
-from rangeseg_ros.cli import interrupts, options
+from rangeseg_ros import interrupts
+from rangeseg_ros.cli import options
 
 CLOCK = '/clock'
 CLOCK_PERIOD = 0.025

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 from types import FrameType
 
 _received = 0
@@ -16,9 +17,15 @@ def watch() -> None:
     """
     global _received
     _received = 0
+    silence_losses()
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _on_signal)
+
+
+def silence_losses() -> None:
+    """Have nothing printed of what a signal raises where it is lost, as in callbacks of LLVM."""
+    sys.unraisablehook = _on_loss
 
 
 def exit_code() -> int:
@@ -38,3 +45,8 @@ def _on_signal(number: int, stack: FrameType | None) -> None:
     global _received
     _received = number
     check()
+
+
+def _on_loss(lost: sys.UnraisableHookArgs) -> None:
+    if not isinstance(lost.exc_value, (KeyboardInterrupt, SystemExit)):
+        sys.__unraisablehook__(lost)
