@@ -1,18 +1,24 @@
 """The map of planes where things are not as they should be: stamps, sizes, cameras, hours."""
 
+import pickle
+
 import numpy as np
 import pytest
 import shapely
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.mapping.evidence import Evidence
 from rangeseg_ros.core.mapping.map_outlines import unite_outlines, widened
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
+from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.solids import box, half_space
 
 CONFIG = Config(min_pixels=150)
 ROOM = kinect_room(4)
@@ -91,6 +97,35 @@ def test_two_cameras_in_one_frame_have_maps_of_their_own_that_agree():
     assert one.map is not two.map
 
 
+@pytest.mark.parametrize('kind', ['returns', 'goes on'])
+def test_memory_is_bounded_however_long_one_walks(kind):
+    camera, random = kinect_camera(80, 60), np.random.default_rng(0)
+    solids = [half_space((0, 0, 1), (0, 0, 0)), half_space((0, 1, 0), (0, -1.6, 0))]
+    solids += [box((0.6, 0.4, 0.7), np.eye(3), (x, 0.9, 0.35)) for x in (3.0, 5.0, 7.0)]
+    along = np.concatenate([np.linspace(0, 4, 12), np.linspace(4, 0, 12)])
+    poses = [Pose.looking((x, 0, 1.2), 12 * np.sin(x), 22, 0) for x in along]
+    frames = []
+    for pose in poses:
+        view = simulate_kinect(Scene(tuple(solids), (pose,)), camera)
+        image = RangeImage.from_depth(view.depth, camera)
+        planes = fit_planes(view.labels, image, SensorModel.from_config(CONFIG))
+        frames.append((view.labels, [p for p in planes if p.count > 40], image))
+    plane_map, kept, sizes = PlaneMap(Config(map_planes=12)), [], []
+    for n in range(15 * len(frames)):
+        (labels, planes, image), pose = frames[n % len(frames)], poses[n % len(frames)]
+        # Where it goes on, each round is past the next three of a row of boxes.
+        shift = pose.position + random.normal(0, 0.005, 3)
+        shift[0] += 6 * (n // len(frames)) * (kind == 'goes on')
+        plane_map.add(labels, planes, image, Transform(pose.rotation, shift), (n + 1) * 10**8)
+        kept.append(len(plane_map))
+        if n % len(frames) == len(frames) - 1:
+            sizes.append(len(pickle.dumps(plane_map)))
+    assert kept[-1] > 5 and max(kept) <= 12
+    assert max(kept) > 9 or kind == 'returns'
+    # All that it holds: planes, their corners, their evidence.
+    assert max(sizes[10:]) < 1.1 * max(sizes[5:10])
+
+
 @pytest.mark.parametrize('kind', ['same wall', 'corridor'])
 def test_outlines_and_their_evidence_are_bounded_however_long_one_looks(kind):
     random, outline, evidence = np.random.default_rng(0), shapely.Polygon(), Evidence()
@@ -98,7 +133,7 @@ def test_outlines_and_their_evidence_are_bounded_however_long_one_looks(kind):
         at = random.uniform(-3, 3, 2) if kind == 'same wall' else np.array([0.2 * n, 0.0])
         corners = at + random.uniform(-1, 1, (12, 2))
         part = shapely.MultiPoint(corners).convex_hull
-        outline = unite_outlines(widened(outline, 0.025), part, 0.05)
+        outline, _ = unite_outlines(outline, part, 0.05)
         evidence.follow(outline)
         assert shapely.get_num_coordinates(outline) <= 400
         # Sides of cells are powers of two: up to four times as many, and those at borders.
@@ -124,4 +159,5 @@ def test_what_is_widened_can_be_united():
 
 def test_an_outline_of_details_alone_is_empty():
     speck = shapely.box(0, 0, 0.01, 0.01)
-    assert unite_outlines(widened(shapely.Polygon(), 0.025), speck, 0.05).is_empty
+    outline, _ = unite_outlines(shapely.Polygon(), speck, 0.05)
+    assert outline.is_empty

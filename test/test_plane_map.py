@@ -74,7 +74,8 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
             if filters is None:
                 filters = PlaneFilters.of(seen)
             else:
-                filters.update(np.array([0]), seen, np.array([0]))
+                first = np.array([0])
+                filters.update(filters.expected(first, seen, first), seen)
         error = np.append(filters.normal[0], filters.distance[0]) - truth
         values.append(
             error @ np.linalg.pinv(filters.plane_covariance(np.array([0]))[0], 1e-10) @ error / 3

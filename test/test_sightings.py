@@ -20,7 +20,7 @@ def test_whatever_rays_tell_of_lies_in_spheres_that_may_be_in_sight():
     within *= (radii * random.random(4000) / np.linalg.norm(within, axis=1))[:, None]
     points = centres + within
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
-    found = find_sightings(points, normals, np.full(4000, 0.01), image, SENSOR)
+    found = find_sightings(points, normals, np.full(4000, 1e-4), image, SENSOR)
     shown = may_be_in_sight(centres, radii, image)
     assert np.count_nonzero(found) > 200
     assert shown[found != 0].all()

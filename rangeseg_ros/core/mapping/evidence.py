@@ -35,10 +35,11 @@ class Evidence:
     """
 
     def __init__(self) -> None:
-        self.centres = np.zeros((0, 2))
+        # Of an outline that was not followed yet, the one place where the plane was found first.
+        self.centres = np.zeros((1, 2))
         self._side = 0.0
-        self._keys = np.zeros(0, np.int64)
-        self.odds = np.zeros(0)
+        self._keys = np.zeros(1, np.int64)
+        self.odds = np.full(1, _HIT)
         self.middle, self.reach = np.zeros(2), 0.0
 
     def follow(self, outline: Polygon | MultiPolygon) -> None:
@@ -49,25 +50,24 @@ class Evidence:
         left, low, right, high = outline.bounds if not outline.is_empty else (0, 0, -1, -1)
         column = np.arange(math.floor(left / side), math.floor(right / side) + 2)
         row = np.arange(math.floor(low / side), math.floor(high / side) + 2)
-        corner = shapely.contains_xy(outline, *np.meshgrid(column * side, row * side))
+        corner = shapely.contains_xy(outline, column[:, None] * side, row * side)
         # Borders are not as certain as what is within.
         whole = corner[:-1, :-1] & corner[1:, :-1] & corner[:-1, 1:] & corner[1:, 1:]
-        at = np.argwhere(whole)[:, ::-1]
-        cells = np.stack([column[at[:, 0]], row[at[:, 1]]], axis=1)
+        across, along = np.nonzero(whole)
+        cells = np.stack([column[across], row[along]], axis=1)
         if not len(cells) and not outline.is_empty:
             # A sliver between the corners of cells.
             point = outline.representative_point()
             cells = np.floor([[point.x / side, point.y / side]]).astype(np.int64)
+        # In ascending order, as the cells are.
         keys = cells[:, 0] * 2**32 + cells[:, 1]
-        order = np.argsort(keys)
-        keys = keys[order]
         odds = np.full(len(keys), _HIT)
         if len(self._keys):
             place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
             known = self._keys[place] == keys
             odds[known] = self.odds[place[known]]
         self._keys, self.odds = keys, odds
-        self.centres = (cells[order] + 0.5) * side
+        self.centres = (cells + 0.5) * side
         if len(cells):
             least, most = self.centres.min(axis=0), self.centres.max(axis=0)
             self.middle, self.reach = (least + most) / 2, math.dist(least, most) / 2
@@ -87,8 +87,19 @@ class Evidence:
         return areas(outline.intersection(around[0]).difference(around[1]))
 
 
-def see(evidence: Sequence[Evidence], found: NDArray[np.int8]) -> NDArray[np.intp]:
+def see(
+    evidence: Sequence[Evidence], owner: NDArray[np.intp], found: NDArray[np.int8]
+) -> NDArray[np.intp]:
     """Take in `sightings` of the cells of planes, one plane after the other.
+
+    Parameters
+    ----------
+    evidence : sequence of Evidence
+        Of M planes.
+    owner : (N,) int
+        Number of the plane of each cell.
+    found : (N,) int8
+        Of the cells.
 
     Returns
     -------
@@ -98,7 +109,9 @@ def see(evidence: Sequence[Evidence], found: NDArray[np.int8]) -> NDArray[np.int
     odds = np.concatenate([one.odds for one in evidence])
     odds += np.where(found > 0, _HIT, np.where(found < 0, _MISS, 0))
     np.clip(odds, _LEAST, _MOST, out=odds)
-    ends = np.cumsum([len(one.odds) for one in evidence])
-    for one, part in zip(evidence, np.split(odds, ends[:-1]), strict=True):
-        one.odds = part
-    return np.unique(np.searchsorted(ends, np.flatnonzero(odds < 0), side='right'))
+    begin = 0
+    for one in evidence:
+        end = begin + len(one.odds)
+        one.odds = odds[begin:end]
+        begin = end
+    return np.unique(owner[odds < 0])

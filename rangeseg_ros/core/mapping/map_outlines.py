@@ -64,27 +64,32 @@ def areas(shape: shapely.Geometry) -> Polygon | MultiPolygon:
 def widened(outline: shapely.Geometry, by: float) -> Polygon | MultiPolygon:
     """An outline and what is as near (metres); without its border where that is negative."""
     # Corners of narrow notches may cross (GEOS 3.14).
-    return valid(outline.buffer(by, join_style='mitre'))
+    return valid(shapely.buffer(outline, by, join_style='mitre'))
 
 
 def unite_outlines(
-    around: shapely.Geometry, seen: Polygon | MultiPolygon, resolution: float
-) -> Polygon | MultiPolygon:
+    outline: Polygon | MultiPolygon, seen: Polygon | MultiPolygon, resolution: float
+) -> tuple[Polygon | MultiPolygon, Polygon | MultiPolygon]:
     """Union of outlines without details smaller than `resolution` (metres).
 
-    Gaps narrower than that are closed and smaller holes and parts left out, and the
+    Gaps narrower than twice that are closed and smaller holes and parts left out, and the
     border is followed within a quarter of it; where it has many corners still, less closely.
 
     Parameters
     ----------
-    around : shapely geometry
-        The outline so far, `widened` by half of the resolution.
-    seen : shapely geometry
-        What is added.
+    outline, seen : shapely geometry
+        The outline so far and what is added.
     resolution : float
+
+    Returns
+    -------
+    shapely geometry
+        The union.
+    shapely geometry
+        The same with what is nearer than `resolution`.
     """
-    grown = around.union(widened(seen, resolution / 2))
-    return simplify(widened(grown, -resolution / 2), resolution)
+    margin = widened(outline.union(seen), resolution)
+    return simplify(widened(margin, -resolution), resolution), margin
 
 
 def simplify(outline: shapely.Geometry, resolution: float) -> Polygon | MultiPolygon:

@@ -52,7 +52,8 @@ class Record:
     `first` and `last` are stamps; `seen` and `united` are of the map's own time, which goes on
     where stamps do not: when it was seen last, and when its outline was looked at last.
     `surface` is that of the frame that saw it last. `margin` is the outline and what is so near
-    that it is no detail of the map.
+    that it is no detail of the map, once that was asked for. `evidence` is of the outline where
+    `followed`.
     """
 
     id: int
@@ -64,13 +65,14 @@ class Record:
     confidence: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
-    margin: shapely.Geometry = field(default_factory=shapely.Polygon)
+    margin: shapely.Geometry | None = None
     seen: int = 0
     surface: int = 0
     united: int = 0
     frames: int = 0
     looks: int = 0
     evidence: Evidence = field(default_factory=Evidence)
+    followed: bool = False
 
     @property
     def confirmed(self) -> bool:
@@ -86,6 +88,10 @@ class Record:
         self.squares += plane.count * plane.rms**2
         self.confidence += plane.count * plane.confidence
         self.roles[plane.role] += 1
+
+    def reshape(self, outline: shapely.Geometry, margin: shapely.Geometry | None = None) -> None:
+        """Have another outline."""
+        self.outline, self.margin, self.followed = outline, margin, False
 
     def absorb(self, other: Record) -> None:
         """Take in what is kept of a plane that turned out to be this one."""

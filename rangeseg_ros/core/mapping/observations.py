@@ -168,10 +168,11 @@ def views(
     coarse = labels[::step, ::step]
     side = max(int(2 * length / step), 1)
     rows, columns = (np.arange(size) // side for size in coarse.shape)
-    number = np.zeros(65536, np.intp)
-    number[[plane.label for plane in planes]] = np.arange(1, len(planes) + 1)
     count = int(rows[-1] + 1) * int(columns[-1] + 1)
-    place = number[coarse] * count + rows[:, None] * (columns[-1] + 1) + columns
+    listed = np.array([plane.label for plane in planes])
+    first = np.zeros(max(listed.max(), coarse.max()) + 1, np.intp)
+    first[listed] = count * np.arange(1, len(planes) + 1)
+    place = first[coarse] + (rows[:, None] * (columns[-1] + 1) + columns)
     pixels = np.bincount(place.ravel(), minlength=count * (len(planes) + 1))
     found = pixels.reshape(-1, count)[1:].astype(np.float64)
     norm: NDArray[np.float64] = np.linalg.norm(found, axis=1, keepdims=True)

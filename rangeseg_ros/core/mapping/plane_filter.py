@@ -87,24 +87,14 @@ class PlaneFilters:
         result = np.einsum('kai,ki->ka', self.axes[index], points - self.point[index])
         return result
 
-    def innovations(
-        self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
-    ) -> NDArray[np.float64]:
-        """Chi-squared (K,), of three degrees of freedom, of observations being of planes.
+    def innovations(self, step: Step, seen: Observations) -> NDArray[np.float64]:
+        """Chi-squared (K,), of three degrees of freedom, of observations being of planes."""
+        at = self.coordinates(step.plane, seen.centroid[step.observation])
+        return _chi_squared(step.gap, step.spread, at, seen.range[step.observation])
 
-        Parameters
-        ----------
-        index, which : (K,) int
-            Numbers of planes and observations.
-        seen : Observations
-        """
-        step = self._expected(index, seen, which)
-        at = self.coordinates(index, seen.centroid[which])
-        return _chi_squared(step.gap, step.spread, at, seen.range[which])
-
-    def update(self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]) -> None:
-        """Take in observations, each plane at most one."""
-        step = self._expected(index, seen, which)
+    def update(self, step: Step, seen: Observations) -> None:
+        """Take in observations, each plane at most one, that are `expected` as it is now."""
+        index, which = step.plane, step.observation
         state = step.own + step.before @ (step.before + step.lasting).transpose(0, 2, 1)
         solved = np.linalg.solve(step.spread, state.transpose(0, 2, 1))
         gain = np.asarray(solved.transpose(0, 2, 1), np.float64)
@@ -121,13 +111,18 @@ class PlaneFilters:
             self.view = np.zeros((len(self.view), cells))
 
     def alike(
-        self, k: int, camera: NDArray[np.float64], gate: float, widest: float, farthest: float
-    ) -> NDArray[np.intp]:
-        """Other planes that may be the plane `k` by what is known of both.
+        self,
+        some: NDArray[np.intp],
+        camera: NDArray[np.float64],
+        gate: float,
+        widest: float,
+        farthest: float,
+    ) -> list[tuple[int, int]]:
+        """Pairs of one of `some` planes and another that may be it by what is known of both.
 
         Parameters
         ----------
-        k : int
+        some : (K,) int
         camera : (3,) float64
             Where they are looked at from.
         gate : float
@@ -135,17 +130,20 @@ class PlaneFilters:
         widest, farthest : float
             Largest angle, radians, and offset as share of the distance from `camera`.
         """
-        offset = (self.point - self.point[k]) @ self.normal[k]
+        normal = self.normal[some]
+        offset = normal @ self.point.T + self.distance[some][:, None]
         away = np.linalg.norm(self.point - camera, axis=1)
-        close = self.normal @ self.normal[k] > np.cos(widest)
+        close = normal @ self.normal.T > np.cos(widest)
         close &= np.abs(offset) < farthest * away
-        close[k] = False
-        m = np.flatnonzero(close)
+        close[np.arange(len(some)), some] = False
+        number, m = np.nonzero(close)
         if not len(m):
-            return m
+            return []
+        k = some[number]
         gap, spread = self._apart(k, m)
-        at = self.coordinates(np.full(len(m), k), self.point[m])
-        return m[_chi_squared(gap, spread, at, away[m]) < gate]
+        at = self.coordinates(k, self.point[m])
+        fits = _chi_squared(gap, spread, at, away[m]) < gate
+        return list(zip(k[fits].tolist(), m[fits].tolist(), strict=True))
 
     def absorb(self, k: int, m: int) -> None:
         """Have the plane `k` take in what is known of the plane `m`.
@@ -153,7 +151,7 @@ class PlaneFilters:
         Both were seen by one sensor, and how their errors hang together is not known: covariance
         intersection (Julier and Uhlmann 1997), weighted as by Niehsen (2002).
         """
-        gap, _ = self._apart(k, np.array([m]))
+        gap, _ = self._apart(np.array([k]), np.array([m]))
         local = to_errors(self.axes[[k]], self.point[[k]])[0]
         other = local @ self.plane_covariance(np.array([m]))[0] @ local.T
         own = self._covariance(np.array([k]))[0]
@@ -170,23 +168,24 @@ class PlaneFilters:
         along: NDArray[np.float64] = np.einsum('ka,kai->ki', at, self.axes[index])
         return self.point[index] + along
 
-    def places(
-        self, index: NDArray[np.intp], at: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Points (K, 3) at coordinates (K, 2) of planes, and their standard deviations (K,)."""
-        points = self.points(index, at)
+    def variances(
+        self, index: NDArray[np.intp], which: NDArray[np.intp], at: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Variances (K,), across the planes, at coordinates (K, 2) of the planes index[which]."""
         lever = np.column_stack([at, np.ones(len(at))])
-        variance = np.einsum('ki,kij,kj->k', lever, self._covariance(index), lever)
-        return points, np.sqrt(variance)
+        covariance = self._covariance(index)
+        variance: NDArray[np.float64]
+        variance = np.einsum('ki,kij,kj->k', lever, covariance[which], lever)
+        return variance
 
     def _apart(
-        self, k: int, m: NDArray[np.intp]
+        self, k: NDArray[np.intp], m: NDArray[np.intp]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What planes `m` differ by from the plane `k`, (K, 3), and its covariance (K, 3, 3)."""
-        local = to_errors(self.axes[[k]], self.point[[k]])[0]
+        """What planes `m` differ by from planes `k`, (K, 3), and its covariance (K, 3, 3)."""
+        local = to_errors(self.axes[k], self.point[k])
         other = np.column_stack([self.normal[m], self.distance[m]])
-        spread = local @ self.plane_covariance(m) @ local.T + self._covariance(np.array([k]))
-        return other @ local.T, spread
+        spread = _turned(local, self.plane_covariance(m)) + self._covariance(k)
+        return (local @ other[..., None])[..., 0], spread
 
     def _covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
         """(K, 3, 3) of x."""
@@ -197,9 +196,10 @@ class PlaneFilters:
         moved = shifted(self.normal[index], self.point[index], self.axes[index], step)
         self.normal[index], self.point[index], self.axes[index] = moved
 
-    def _expected(
+    def expected(
         self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
-    ) -> _Step:
+    ) -> Step:
+        """What observations, of the numbers `which` (K,), are to planes `index` (K,)."""
         rho, new = persistence(self.view[index], seen.view[which])
         before = self.lasting[index]
         # What beta loses of what it was is on its own from now on.
@@ -210,14 +210,16 @@ class PlaneFilters:
         fresh = _turned(local, seen.fresh[which]) + new[:, None, None] * _squared(lasting)
         spread = own + _squared(before + lasting) + fresh
         gap = (local @ seen.plane[which][..., None])[..., 0]
-        return _Step(rho, own, before, lasting, fresh, spread, gap)
+        return Step(index, which, rho, own, before, lasting, fresh, spread, gap)
 
 
-class _Step(NamedTuple):
+class Step(NamedTuple):
     """Observations and what is known of their planes when they come.
 
     Attributes
     ----------
+    plane, observation : (K,) int
+        Their numbers.
     rho : (K,) float64
         Correlation of beta with what it was.
     own, before : (K, 3, 3) float64
@@ -230,6 +232,8 @@ class _Step(NamedTuple):
         z.
     """
 
+    plane: NDArray[np.intp]
+    observation: NDArray[np.intp]
     rho: NDArray[np.float64]
     own: NDArray[np.float64]
     before: NDArray[np.float64]
@@ -237,6 +241,10 @@ class _Step(NamedTuple):
     fresh: NDArray[np.float64]
     spread: NDArray[np.float64]
     gap: NDArray[np.float64]
+
+    def where(self, chosen: NDArray) -> Step:
+        """Some of them."""
+        return Step(*(part[chosen] for part in self))
 
 
 def _squared(root: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ from rangeseg_ros.core.mapping.observations import (
     observations,
     views,
 )
-from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
+from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
 from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -105,7 +105,9 @@ class PlaneMap:
             if self._filters is not None:
                 self._filters.follow_views(view.shape[1])
             seen = observations(planes, view, pose, noise)
-            match = self._associate(planes, seen)
+            match, step = self._associate(planes, seen)
+            if step:
+                self._update(planes, seen, step)
             self._fuse(planes, seen, match, pose, stamp)
             self._merge(pose.shift)
         self._contradict(image, pose, noise)
@@ -124,33 +126,55 @@ class PlaneMap:
         ]
         return sorted(found, key=lambda plane: plane.id)
 
-    def _associate(self, planes: Sequence[Plane], seen: Observations) -> NDArray[np.intp]:
-        """(M,) number of the plane of the map that each plane is, -1 for none."""
+    def _associate(
+        self, planes: Sequence[Plane], seen: Observations
+    ) -> tuple[NDArray[np.intp], Step | None]:
+        """Find out which planes of the map the planes of a frame are.
+
+        Returns
+        -------
+        (M,) int
+            Numbers of the planes of the map, -1 for none.
+        Step or None
+            Of those that are known.
+        """
         match = np.full(len(planes), -1)
         filters = self._filters
         if filters is None:
-            return match
+            return match, None
         gap = filters.normal @ seen.centroid.T + filters.distance[:, None]
         close = filters.normal @ seen.plane[:, :3].T > np.cos(SURE_TURN)
         close &= np.abs(gap) < _FARTHEST * seen.range
         index, which = np.nonzero(close)
         if not len(index):
-            return match
-        value = filters.innovations(index, seen, which)
-        reach = np.array([np.hypot(*plane.extents) / 2 for plane in planes])
+            return match, None
+        step = filters.expected(index, seen, which)
+        value = filters.innovations(step, seen)
+        fits = np.flatnonzero(value < _GATE)
+        index, which, value = index[fits], which[fits], value[fits]
+        reach = np.array([np.hypot(*planes[m].extents) / 2 for m in which.tolist()])
         at = filters.coordinates(index, seen.centroid[which])
-        outlines = np.array([self._records[k].outline for k in index], object)
+        outlines = np.array([self._records[k].outline for k in index.tolist()], object)
         away = shapely.distance(outlines, shapely.points(at))
-        fits = (value < _GATE) & (away <= 2 * reach[which])
         # The one it lies on, or else the likeliest.
         order = np.lexsort([value, away > 0])
         # What one frame finds on two surfaces is not one plane, however badly its pose is known.
         surface: dict[int, int] = {}
-        order = order[fits[order]]
-        for k, m in zip(index[order].tolist(), which[order].tolist(), strict=True):
+        taken = []
+        for n in order[away[order] <= 2 * reach[order]].tolist():
+            k, m = int(index[n]), int(which[n])
             if match[m] < 0 and surface.setdefault(k, planes[m].surface) == planes[m].surface:
                 match[m] = k
-        return match
+                taken.append(n)
+        return match, step.where(fits[taken]) if taken else None
+
+    def _update(self, planes: Sequence[Plane], seen: Observations, step: Step) -> None:
+        """Take in planes that are known: of parts of one plane, the largest decides on it."""
+        assert self._filters is not None
+        count = np.array([planes[m].count for m in step.observation.tolist()])
+        order = np.lexsort([step.observation, -count, step.plane])
+        largest = order[np.unique(step.plane[order], return_index=True)[1]]
+        self._filters.update(step.where(largest), seen)
 
     def _fuse(
         self,
@@ -160,13 +184,9 @@ class PlaneMap:
         pose: Transform,
         stamp: int,
     ) -> None:
-        """Take in the planes of a frame: of parts of one plane, the largest decides on it."""
+        """Keep what planes of a frame are known by and their outlines, and begin new ones."""
         count = np.array([plane.count for plane in planes])
-        order = np.lexsort([-count, match])
-        known = order[match[order] >= 0]
-        largest = known[np.unique(match[known], return_index=True)[1]]
-        if self._filters is not None and len(largest):
-            self._filters.update(match[largest], seen, largest)
+        order = np.argsort(-count, kind='stable')
         new = order[match[order] < 0]
         if len(new):
             match[new] = len(self._records) + np.arange(len(new))
@@ -203,15 +223,14 @@ class PlaneMap:
         assert filters is not None
         gone: list[int] = []
         grown = [k for k, record in enumerate(self._records) if record.united == self._time]
-        for k in grown:
-            for m in filters.alike(k, camera, _GATE, SURE_TURN, _FARTHEST).tolist():
-                if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
-                    continue
-                kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
-                filters.absorb(kept, lost)
-                self._records[kept].absorb(self._records[lost])
-                self._grow(kept, self._across(lost, kept))
-                gone.append(lost)
+        for k, m in filters.alike(np.array(grown), camera, _GATE, SURE_TURN, _FARTHEST):
+            if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
+                continue
+            kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
+            filters.absorb(kept, lost)
+            self._records[kept].absorb(self._records[lost])
+            self._grow(kept, self._across(lost, kept))
+            gone.append(lost)
         if gone:
             self._keep(np.isin(np.arange(len(self._records)), gone, invert=True))
 
@@ -241,21 +260,15 @@ class PlaneMap:
 
     def _grow(self, k: int, part: shapely.Geometry) -> None:
         record, resolution = self._records[k], self.config.map_resolution
-        # What reaches no farther is no detail of the map: most looks show nothing new.
-        inner = widened(part, -resolution / 2)
         if record.outline.is_empty:
-            record.outline = simplify(part, resolution)
-        elif inner.is_empty or shapely.covers(record.margin, inner):
+            record.reshape(simplify(part, resolution))
             return
-        else:
-            record.outline = unite_outlines(record.margin, part, resolution)
-        self._follow(record)
-
-    def _follow(self, record: Record) -> None:
-        """Have what goes with an outline follow it."""
-        record.evidence.follow(record.outline)
-        record.margin = widened(record.outline, self.config.map_resolution / 2)
+        if record.margin is None:
+            record.margin = widened(record.outline, resolution)
         shapely.prepare(record.margin)
+        # What reaches no farther is no detail of the map: most looks show nothing new.
+        if not record.margin.covers(part):
+            record.reshape(*unite_outlines(record.outline, part, resolution))
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         assert self._filters is not None
@@ -267,6 +280,11 @@ class PlaneMap:
         filters = self._filters
         if filters is None or not self._records:
             return
+        for record in self._records:
+            # What was found once is mostly not found again.
+            if not record.followed and record.frames > 1:
+                record.evidence.follow(record.outline)
+                record.followed = True
         middles = np.array([record.evidence.middle for record in self._records])
         reaches = np.array([record.evidence.reach for record in self._records])
         middles = filters.points(np.arange(len(middles)), middles)
@@ -290,22 +308,21 @@ class PlaneMap:
         which = np.repeat(np.arange(len(evidence)), [len(one.centres) for one in evidence])
         owner = shown[which]
         at = np.concatenate([one.centres for one in evidence])
-        points, sigma = filters.places(owner, at)
-        points = (points - pose.shift) @ pose.rotation
-        spread = noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
+        points = (filters.points(owner, at) - pose.shift) @ pose.rotation
+        variance = filters.variances(shown, which, at)
+        variance += noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
         found = find_sightings(
             points,
             (filters.normal @ pose.rotation)[owner],
-            np.sqrt(sigma**2 + spread),
+            variance,
             image,
             SensorModel.from_config(self.config),
         )
         there = np.bincount(which[found == THERE], minlength=len(evidence))
         for k in np.flatnonzero(2 * there > np.bincount(which, minlength=len(evidence))).tolist():
             records[k].looks += 1
-        for k in see(evidence, found).tolist():
-            records[k].outline = records[k].evidence.remaining(records[k].outline)
-            self._follow(records[k])
+        for k in see(evidence, which, found).tolist():
+            records[k].reshape(records[k].evidence.remaining(records[k].outline))
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, those not confirmed, and what is too much."""

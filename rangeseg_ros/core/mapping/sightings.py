@@ -52,7 +52,7 @@ def may_be_in_sight(
 def find_sightings(
     points: NDArray[np.float64],
     normals: NDArray[np.float64],
-    sigma: NDArray[np.float64],
+    variance: NDArray[np.float64],
     image: RangeImage,
     sensor: SensorModel,
 ) -> NDArray[np.int8]:
@@ -62,8 +62,8 @@ def find_sightings(
     ----------
     points, normals : (K, 3) float64
         Places and the normals of their planes, in the frame of the image.
-    sigma : (K,) float64
-        Standard deviation of the places along the normals, metres.
+    variance : (K,) float64
+        Of the places along the normals, square metres.
     image : RangeImage
         Of a camera: in a cloud, nobody knows which pixel looks where.
     sensor : SensorModel
@@ -87,10 +87,11 @@ def find_sightings(
     k = np.flatnonzero(inside)
     measured = image.inverse[row[k].astype(np.intp), column[k].astype(np.intp)].astype(np.float64)
     expected = 1 / depth[k]
-    variance = random_variance(sensor, expected**2) + systematic_variance(sensor, expected**2)
+    squared = expected**2
+    error = random_variance(sensor, squared) + systematic_variance(sensor, squared)
     # Along the ray, the inverse depth changes by 1 / z for every n . p.
-    variance += (sigma[k] * expected / slope[k]) ** 2
-    beyond = (expected - measured) / np.sqrt(variance)
+    error += variance[k] * squared / slope[k] ** 2
+    beyond = (expected - measured) / np.sqrt(error)
     seen = (measured > 0) & (beyond >= -OUTLIER)
     found[k[seen]] = np.where(beyond[seen] > OUTLIER, THROUGH, THERE)
     return found
