@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
 # Rows of an image whose cells are 1 x 4 pixels.
@@ -88,7 +89,7 @@ def cells_of(
     single, several = (np.empty((n, *shape), np.float32) for n in (2, 8))
     cells = Cells(several[:3], single[0], several[3:6], single[1], several[6:])
     axes = axes_of(up).astype(np.float32)
-    run_rows(_means, shape[0], image.inverse, image.rays, size, axes, sensor, cells)
+    run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, axes, sensor, cells)
     return cells
 
 
@@ -98,62 +99,110 @@ def _means(
     after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     size: CellSize,
     axes: NDArray[np.float32],
     sensor: SensorModel,
     cells: Cells,
 ) -> None:
+    """Rows first...after of cells.
+
+    Nine parameters, as a kernel cannot return what several threads write.
+    """
     width = inverse.shape[1]
     # Of the pixels of a column: the sum of their inverse ranges, and how many are measured.
     total, number = np.empty((2, cells.inverse.shape[1] * size.columns), np.float32)
     # Of the left and the right halves: sums of rays and inverse ranges, and their number.
     sums = np.empty((5, 2, cells.inverse.shape[1]), np.float32)
+    upper, lower = first_rays(rays, first * size.rows), first_rays(rays, first * size.rows)
+    # The same of rays as if all pixels were measured.
+    all_rays = np.empty((3, 2, cells.inverse.shape[1]), np.float32)
     for i in range(first, after):
         top, bottom = i * size.rows, min((i + 1) * size.rows, inverse.shape[0])
-        total[:], number[:], sums[:] = 0, 0, 0
+        total[:], number[:] = 0, 0
         for v in range(top, bottom):
             for j in range(width):
                 total[j] += inverse[v, j]
                 number[j] += np.float32(1) if inverse[v, j] > 0 else np.float32(0)
-        _add_halves(top, bottom, inverse, rays, size, total, number, sums)
+        next_rays(rays, pinhole, top, upper)
+        next_rays(rays, pinhole, bottom - 1, lower)
+        for k in range(3):
+            if k == 1 or not pinhole or i == first:
+                _add_rays(size, upper[k], lower[k], all_rays[k])
+        _add_halves(size, total, number, sums)
+        _add_single(top, bottom, inverse, rays, size, all_rays, sums)
         _divide(i, sums, size, axes, sensor, cells)
 
 
 @njit(cache=True, inline='always')
 def _add_halves(
-    top: int,
-    bottom: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
     size: CellSize,
     total: NDArray[np.float32],
     number: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> None:
-    """Sums of half cells between rows of the image, from those of its columns."""
+    """Sums of half cells from those of columns."""
     half = size.columns // 2
-    whole = np.float32(size.rows * half)
-    for side in range(2):
-        for u in range(half):
-            for c in range(sums.shape[2]):
-                sums[3, side, c] += total[c * size.columns + side * half + u]
-            for c in range(sums.shape[2]):
-                sums[4, side, c] += number[c * size.columns + side * half + u]
     for c in range(sums.shape[2]):
         for side in range(2):
             left = c * size.columns + side * half
-            right = min(left + half, inverse.shape[1])
-            if sums[4, side, c] == whole:
-                # Over so few pixels rays change evenly.
-                for k in range(3):
-                    corners = rays[top, left, k] + rays[bottom - 1, right - 1, k]
-                    sums[k, side, c] = corners * np.float32(0.5) * whole
+            value = count = np.float32(0)
+            for j in range(left, left + half):
+                value += total[j]
+                count += number[j]
+            sums[3, side, c], sums[4, side, c] = value, count
+
+
+@njit(cache=True, inline='always')
+def _add_rays(
+    size: CellSize,
+    upper: NDArray[np.float32],
+    lower: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Sums of one coordinate over half cells, from the first and the last row of the cells.
+
+    Over so few pixels rays change evenly.
+    """
+    half, last = size.columns // 2, len(upper) - 1
+    share = np.float32(0.5) * np.float32(size.rows * half)
+    for side in range(2):
+        for c in range(sums.shape[1]):
+            left = c * size.columns + side * half
+            ends = upper[min(left, last)] + lower[min(left + half - 1, last)]
+            sums[side, c] = ends * share
+
+
+@njit(cache=True, inline='always')
+def _add_single(
+    top: int,
+    bottom: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    size: CellSize,
+    all_rays: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Sums of the rays of half cells, one by one where not all or none are measured."""
+    half, width = size.columns // 2, inverse.shape[1]
+    whole, none = np.float32(size.rows * half), np.float32(0)
+    for k in range(3):
+        for side in range(2):
+            for c in range(sums.shape[2]):
+                sums[k, side, c] = all_rays[k, side, c] if sums[4, side, c] == whole else none
+    for c in range(sums.shape[2]):
+        for side in range(2):
+            if sums[4, side, c] == whole or sums[4, side, c] == none:
                 continue
+            left = c * size.columns + side * half
+            x = y = z = none
             for v in range(top, bottom):
-                for j in range(left, right):
+                for j in range(left, min(left + half, width)):
                     if inverse[v, j] > 0:
-                        for k in range(3):
-                            sums[k, side, c] += rays[v, j, k]
+                        x += rays[v, j, 0]
+                        y += rays[v, j, 1]
+                        z += rays[v, j, 2]
+            sums[0, side, c], sums[1, side, c], sums[2, side, c] = x, y, z
 
 
 @njit(cache=True, inline='always')

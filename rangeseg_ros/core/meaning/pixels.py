@@ -13,6 +13,7 @@ from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE
 from rangeseg_ros.core.meaning.ground_field import GroundField, planes_of_row, spread_planes
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 
 
 class Said(NamedTuple):
@@ -63,8 +64,8 @@ def pixels_of(
     """
     classes = np.empty(image.shape, np.uint8)
     heights = np.empty(image.shape, np.float32)
-    run_rows(_classify, len(said.kind), image.inverse, image.rays, field, size, said, bounds,
-           classes, heights)  # fmt: skip
+    run_rows(_classify, len(said.kind), image.inverse, image.rays, image.pinhole, field, size,
+             said, bounds, classes, heights)  # fmt: skip
     return classes, heights
 
 
@@ -74,6 +75,7 @@ def _classify(
     after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     field: GroundField,
     size: CellSize,
     said: Said,
@@ -83,7 +85,7 @@ def _classify(
 ) -> None:
     """Of rows first...after of cells.
 
-    Ten parameters, as a kernel cannot return what several threads write. The inner loops do the
+    Eleven parameters, as a kernel cannot return what several threads write. The inner loops do the
     same for every pixel, so that the compiler makes them vector instructions.
     """
     width = inverse.shape[1]
@@ -91,20 +93,17 @@ def _classify(
     # Heights between which a pixel is ground, and beyond which it is a drop or an obstacle.
     limits = np.empty((4, width), np.float32)
     planes = np.empty((4, width), np.float32)
-    along = np.empty(width, np.float32)
+    ray = first_rays(rays, first * size.rows)
     for i in range(first, after):
         planes_of_row(spread, ((i + 0.5) * size.rows) / field.rows - 0.5, planes)
         _bound(said, i, size.columns, bounds, limits)
         for v in range(i * size.rows, min((i + 1) * size.rows, len(inverse))):
-            for j in range(width):
-                along[j] = (
-                    planes[0, j] * rays[v, j, 0]
-                    + planes[1, j] * rays[v, j, 1]
-                    + planes[2, j] * rays[v, j, 2]
-                )
+            next_rays(rays, pinhole, v, ray)
             for j in range(width):
                 value = inverse[v, j]
-                height = (along[j] - value) / (value * planes[3, j])
+                along = planes[0, j] * ray[0, j] + planes[1, j] * ray[1, j]
+                along += planes[2, j] * ray[2, j]
+                height = (along - value) / (value * planes[3, j])
                 heights[v, j] = height if value > 0 else np.float32(np.nan)
             for j in range(width):
                 height = heights[v, j]

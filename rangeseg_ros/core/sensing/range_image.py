@@ -193,6 +193,11 @@ class RangeImage:
         height, width = self.inverse.shape
         return height, width
 
+    @property
+    def pinhole(self) -> bool:
+        """Whether rays differ along the rows in x alone, and along the columns in y alone."""
+        return self.camera is not None and self.camera.pinhole
+
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """(H, W) True where there is a measurement; the rest is shadow (thesis 6.7)."""
