@@ -8,17 +8,18 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.plane_energy import (
+    CAP,
     LEAST_GAIN,
     NO_PLANE,
     Models,
     Problem,
     data_cost,
-    shifted_cost,
+    plane_cost,
+    shifted_plane,
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at
-from rangeseg_ros.core.graphcut.sites import are_alike
+from rangeseg_ros.core.graphcut.sites import unlike_sites
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
-from rangeseg_ros.core.sensing.grid import CHUNK
 
 REACH = 2
 """Blocks from a surface in which its label may win pixels."""
@@ -28,13 +29,16 @@ def descended(
     problem: Problem, surfaces: NDArray[np.int32], models: Models
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
-    labels = np.zeros(len(problem.inverse), np.int32)
-    cost = np.zeros(len(labels), np.float32)
+    labels = np.empty(len(problem.inverse), np.int32)
+    cost = np.empty(len(labels), np.float32)
     window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
     exact = surfaces.astype(np.float32)
-    least = cv2.erode(exact, window)
-    settled = (least > 0) & (least == cv2.dilate(exact, window))
-    run_rows(_take_nearest, len(surfaces), surfaces, settled, problem, models, labels, cost)
+    # The lowest and the highest label around each block, and whether there is none but them.
+    highest = cv2.dilate(exact, window)
+    lowest = cv2.erode(np.where(exact > 0, exact, np.float32(np.inf)), window)
+    settled = (cv2.erode(exact, window) == highest) & (highest > 0)
+    around = lowest, highest, settled
+    run_rows(_take_nearest, len(surfaces), surfaces, *around, problem, models, labels, cost)
     run_halves(_descend, len(labels) // problem.width, labels, cost, problem, models)
     return labels, cost
 
@@ -44,6 +48,8 @@ def _take_nearest(
     first: int,
     after: int,
     surfaces: NDArray[np.int32],
+    lowest: NDArray[np.float32],
+    highest: NDArray[np.float32],
     settled: NDArray[np.bool_],
     problem: Problem,
     models: Models,
@@ -54,44 +60,97 @@ def _take_nearest(
 
     Costs in `settled` blocks, where no label competes, stay 0.
     """
-    rows, columns = surfaces.shape
+    columns, most = surfaces.shape[1], (2 * REACH + 1) ** 2
     width, block = problem.width, problem.block
     height = len(labels) // width
-    side = 2 * REACH + 1
-    candidates, scale = np.empty(side * side, np.int32), np.empty(side * side)
+    # Of each block in a row of blocks: its candidates with their shifts, and how many they are.
+    candidates, shifts = np.empty((columns, most), np.int32), np.empty((columns, most))
+    count = np.empty(columns, np.intp)
+    # The first of them, for each column of pixels.
+    label, planes = np.empty(width, np.int32), np.empty((5, width))
     for bi in range(first, after):
         top, bottom = bi * block, min((bi + 1) * block, height)
         for bj in range(columns):
-            left, right = bj * block, min((bj + 1) * block, width)
+            # A plane at infinity explains nothing; one of no price explains all.
+            plane = 0.0, 0.0, 0.0, 0.0, np.inf
+            candidates[bj, 0] = np.int32(highest[bi, bj])
+            count[bj] = candidates[bj, 0] > 0
             if settled[bi, bj]:
+                plane = 0.0, 0.0, 0.0, 0.0, 0.0
+            elif count[bj] > 0:
+                if lowest[bi, bj] < highest[bi, bj]:
+                    own = candidates[bj], shifts[bj]
+                    count[bj] = _find_candidates(bi, bj, surfaces, models, *own)
+                else:
+                    shifts[bj, 0] = shift_at(models.shifts, candidates[bj, 0], bi, bj)
+                plane = shifted_plane(candidates[bj, 0], shifts[bj, 0], models)
+            for j in range(bj * block, min((bj + 1) * block, width)):
+                label[j] = candidates[bj, 0]
+                for entry in range(5):
+                    planes[entry, j] = plane[entry]
+        for i in range(top, bottom):
+            here = slice(i * width, (i + 1) * width)
+            row = problem.inverse[here], problem.rays[here].reshape(-1), problem.weight[here]
+            _take_first(label, planes, *row, labels[here], cost[here])
+        for bj in range(columns):
+            for k in range(1, count[bj]):
+                plane = shifted_plane(candidates[bj, k], shifts[bj, k], models)
                 for i in range(top, bottom):
-                    for p in range(i * width + left, i * width + right):
-                        labels[p] = surfaces[bi, bj] if problem.weight[p] > 0 else 0
+                    for j in range(bj * block, min((bj + 1) * block, width)):
+                        p = i * width + j
+                        value = np.float32(plane_cost(plane, p, problem))
+                        if value < cost[p]:
+                            labels[p], cost[p] = candidates[bj, k], value
+
+
+@njit(cache=True, nogil=True)
+def _find_candidates(
+    row: int,
+    column: int,
+    surfaces: NDArray[np.int32],
+    models: Models,
+    candidates: NDArray[np.int32],
+    shifts: NDArray[np.float64],
+) -> int:
+    """Labels of the blocks around one and the shifts of their planes there; how many."""
+    rows, columns = surfaces.shape
+    count, last = 0, np.int32(0)
+    for i in range(max(row - REACH, 0), min(row + REACH + 1, rows)):
+        for j in range(max(column - REACH, 0), min(column + REACH + 1, columns)):
+            label = surfaces[i, j]
+            if label in (np.int32(0), last):
                 continue
-            count, last = 0, np.int32(0)
-            for i in range(max(bi - REACH, 0), min(bi + REACH + 1, rows)):
-                for j in range(max(bj - REACH, 0), min(bj + REACH + 1, columns)):
-                    label = surfaces[i, j]
-                    if label in (np.int32(0), last):
-                        continue
-                    last, known = label, False
-                    for k in range(count):
-                        known |= candidates[k] == label
-                    if not known:
-                        candidates[count] = label
-                        scale[count] = 1 + shift_at(models.shifts, label, bi, bj)
-                        count += 1
-            for i in range(top, bottom):
-                for p in range(i * width + left, i * width + right):
-                    if problem.weight[p] == 0:
-                        continue
-                    best, least = np.int32(0), np.float32(NO_PLANE)
-                    for k in range(count):
-                        label = candidates[k]
-                        value = np.float32(shifted_cost(label, p, scale[k], problem, models))
-                        if value < least:
-                            best, least = label, value
-                    labels[p], cost[p] = best, least
+            last, known = label, False
+            for k in range(count):
+                known |= candidates[k] == label
+            if not known:
+                candidates[count] = label
+                shifts[count] = shift_at(models.shifts, label, row, column)
+                count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _take_first(
+    label: NDArray[np.int32],
+    planes: NDArray[np.float64],
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    labels: NDArray[np.int32],
+    cost: NDArray[np.float32],
+) -> None:
+    """Give each pixel of a row its first candidate, or none where that costs more."""
+    a, b, c, scale, price = planes[0], planes[1], planes[2], planes[3], planes[4]
+    # Without branches, and the rays' components in one row, so that the compiler takes many pixels
+    # at a time.
+    for j in range(len(labels)):
+        level = a[j] * rays[3 * j] + b[j] * rays[3 * j + 1] + c[j] * rays[3 * j + 2]
+        residual = inverse[j] - scale[j] * level
+        value = np.float32(min(price[j] * weight[j] * residual * residual, CAP))
+        measured, better = weight[j] > 0, value < np.float32(NO_PLANE)
+        labels[j] = label[j] if measured & better else np.int32(0)
+        cost[j] = (value if better else np.float32(NO_PLANE)) if measured else np.float32(0)
 
 
 @njit(cache=True, nogil=True)
@@ -108,8 +167,9 @@ def _descend(
     energy in a poor local minimum, but one from which the cuts have only the boundaries left to
     move.
     """
-    begin, end = rows[0] * problem.width, rows[1] * problem.width
-    offsets = np.array([1, problem.width, -1, -problem.width])
+    width = problem.width
+    begin, end = rows[0] * width, rows[1] * width
+    offsets = np.array([1, width, -1, -width])
     links = problem.links
     around = np.zeros(4, np.int32)
     link = np.zeros(4)
@@ -117,11 +177,10 @@ def _descend(
     queue = np.empty(max(end - begin, 1), np.int32)
     queued = np.zeros(end - begin, np.bool_)
     waiting = 0
-    for chunk in range(max(begin - problem.width, 0), end, CHUNK):
-        stop = min(chunk + CHUNK, end)
-        if are_alike(labels, chunk, stop, problem.width):
-            continue
-        for p in range(chunk, stop):
+    marks, unlike = np.zeros((width + 7) // 8 * 8, np.uint8), np.empty(width, np.intp)
+    for row in range(max(rows[0] - 1, 0), rows[1]):
+        for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
+            p = unlike[s]
             for k in range(2):
                 q = p + offsets[k]
                 if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:

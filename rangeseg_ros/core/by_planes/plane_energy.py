@@ -34,8 +34,8 @@ NO_PLANE = 6.0
 """Data cost of label 0."""
 LEAST_GAIN = 1e-6
 """An improvement of the energy by less is rounding."""
-# That of an outlier, minus the logarithm of a likelihood.
-_CAP = OUTLIER**2 / 2
+CAP = OUTLIER**2 / 2
+"""The largest data cost: that of an outlier, minus the logarithm of a likelihood."""
 
 
 class Problem(NamedTuple):
@@ -131,22 +131,29 @@ def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float
 @njit(cache=True)
 def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     """What a label costs a measured pixel."""
+    if label == 0:
+        return NO_PLANE
     row, column = p // problem.width // problem.block, p % problem.width // problem.block
-    shift = shift_at(models.shifts, label, row, column)
-    return shifted_cost(label, p, 1 + shift, problem, models)
+    plane = shifted_plane(label, shift_at(models.shifts, label, row, column), models)
+    return plane_cost(plane, p, problem)
 
 
 @njit(cache=True)
-def shifted_cost(label: int, p: int, scale: float, problem: Problem, models: Models) -> float:
-    """The same where 1 + s of the plane is known."""
-    if label == 0:
-        return NO_PLANE
-    theta, rays = models.theta, problem.rays
-    level = (
-        theta[label, 0] * rays[p, 0] + theta[label, 1] * rays[p, 1] + theta[label, 2] * rays[p, 2]
-    )
-    residual = problem.inverse[p] - scale * level
-    return min(models.price[label] * problem.weight[p] * residual * residual, _CAP)
+def shifted_plane(
+    label: int, shift: float, models: Models
+) -> tuple[float, float, float, float, float]:
+    """A plane for `plane_cost`: theta, 1 + shift and the price, read once for many pixels."""
+    theta = models.theta
+    return theta[label, 0], theta[label, 1], theta[label, 2], 1 + shift, models.price[label]
+
+
+@njit(cache=True)
+def plane_cost(plane: tuple[float, float, float, float, float], p: int, problem: Problem) -> float:
+    """What a plane costs a pixel; 0 where nothing was measured."""
+    a, b, c, scale, price = plane
+    rays = problem.rays
+    residual = problem.inverse[p] - scale * (a * rays[p, 0] + b * rays[p, 1] + c * rays[p, 2])
+    return min(price * problem.weight[p] * residual * residual, CAP)
 
 
 @njit(cache=True)

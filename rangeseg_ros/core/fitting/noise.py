@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.fitting.alike import median
 from rangeseg_ros.core.fitting.errors import BOTH, Errors, explaining, turning, variances
 from rangeseg_ros.core.fitting.quantisation import quantisation
-from rangeseg_ros.core.fitting.scale import QUANTILE, Scale
+from rangeseg_ros.core.fitting.scale import ENOUGH, MOST, QUANTILE, Scale
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -61,7 +61,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     used = 2 * count >= count.max(initial=0)
     if np.count_nonzero(used) < SAMPLES:
         return prior
-    scale = Scale.of(coarse, used, BOTH)
+    scale = Scale.of(coarse, used, BOTH, MOST)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
@@ -75,7 +75,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope(way)))
     if not flat.any():
         return prior
-    scale = Scale.of(blocks, flat, way)
+    scale = Scale.of(blocks, flat, way, ENOUGH)
     within = [scale.mean(scale.variance_ratio(blocks, level), QUANTILE)]
     between = filled = 1.0
     distortion = none
@@ -91,7 +91,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         parts = (
             coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
         )
-        scale = Scale.of(parts, whole, way)
+        scale = Scale.of(parts, whole, way, ENOUGH)
         excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
         bending = explaining(scale, excess.ravel()[scale.place], 0.5, in_range, none, shown)
         within.append(scale.mean(scale.variance_ratio(parts, level), QUANTILE))

@@ -6,6 +6,7 @@ from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
@@ -15,10 +16,13 @@ from rangeseg_ros.core.sensing.moments import COUNT, SIZE
 
 QUANTILE = 0.4
 """Most blocks lie on planes, but edges and curvature only ever add to the residuals."""
-# Blocks of a scale that are looked at, about: a quantile of two hundred in each of `alike`'s sets
-# is off by 3 % of a standard deviation. With half of them clutter decides, in one image of five,
-# whether a sensor errs in disparity or in range; with 3000 in none of ten.
-_MOST = 4800
+MOST = 4800
+"""Blocks of a scale that tell the kind of the noise, about: a quantile of two hundred in each of
+`alike`'s sets is off by 3 % of a standard deviation. With half of them clutter decides, in one
+image of five, whether a sensor errs in disparity or in range; with 3000 in none of ten."""
+ENOUGH = 2400
+"""Blocks that tell how much noise of a known kind there is: a quantile of a hundred in each of the
+sets, and a mean over these."""
 
 
 class Scale(NamedTuple):
@@ -40,12 +44,11 @@ class Scale(NamedTuple):
     sets: Sets
 
     @classmethod
-    def of(cls, blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float]) -> Scale:
-        place = np.flatnonzero(used)
-        # A copy, as the layout of a slice follows the size, and kernels are compiled for layouts.
-        place = place[:: max(len(place) // _MOST, 1)].copy()
-        squared, slope = blocks.squared.ravel()[place], blocks.slope(way).ravel()[place]
-        return cls(place, squared, slope, alike(squared, slope))
+    def of(
+        cls, blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], most: int
+    ) -> Scale:
+        """Of the blocks `used` (rows, columns), every n-th: about as many as `most`."""
+        return cls(*_chosen(blocks.squared, blocks.across, blocks.down, used, way, most))
 
     def pixels(self, blocks: Blocks) -> NDArray[np.float64]:
         """Measured pixels (N,) of each."""
@@ -64,6 +67,39 @@ class Scale(NamedTuple):
     def mean(self, ratio: NDArray[np.float64], quantile: float) -> float:
         """Mean over the sets of a quantile of what their blocks show of what was expected."""
         return float(np.mean(quantiles(ratio, self.sets, quantile)))
+
+
+@njit(cache=True)
+def _chosen(
+    squared: NDArray[np.float64],
+    across: NDArray[np.float64],
+    down: NDArray[np.float64],
+    used: NDArray[np.bool_],
+    way: tuple[float, float],
+    most: int,
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64], Sets]:
+    """The attributes of a `Scale`."""
+    rows, columns = used.shape
+    count = 0
+    for i in range(rows):
+        for j in range(columns):
+            count += used[i, j]
+    # Odd, as rows of blocks are rarely odd: not the same columns of every row.
+    stride = max(count // most, 1) | 1
+    count = (count + stride - 1) // stride
+    place = np.empty(count, np.intp)
+    levels, slopes = np.empty(count), np.empty(count)
+    seen = k = 0
+    for i in range(rows):
+        for j in range(columns):
+            if not used[i, j]:
+                continue
+            if seen % stride == 0:
+                place[k], levels[k] = i * columns + j, squared[i, j]
+                slopes[k] = way[0] * across[i, j] + way[1] * down[i, j]
+                k += 1
+            seen += 1
+    return place, levels, slopes, alike(levels, slopes)
 
 
 @cache

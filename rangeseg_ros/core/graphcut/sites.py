@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.grid import CHUNK
-
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
@@ -76,11 +74,10 @@ def fronts(
     room = 4 * (after - first)
     beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
     found = 0
-    for chunk in range(max(first - width, 0), after, CHUNK):
-        stop = min(chunk + CHUNK, after)
-        if are_alike(labels, chunk, stop, width):
-            continue
-        for p in range(chunk, stop):
+    marks, unlike = np.zeros((width + 7) // 8 * 8, np.uint8), np.empty(width, np.intp)
+    for row in range(max(rows[0] - 1, 0), rows[1]):
+        for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
+            p = unlike[s]
             here = labels[p]
             for k in range(2):
                 q = p + (1 if k == 0 else width)
@@ -95,18 +92,46 @@ def fronts(
 
 
 @njit(cache=True, nogil=True)
-def are_alike(labels: NDArray[np.int32], first: int, after: int, width: int) -> bool:
-    """Whether sites from `first` to before `after` have the labels of those right of and below
-    them, where there are any; `width` sites are in a row."""
+def unlike_sites(
+    labels: NDArray[np.int32],
+    first: int,
+    width: int,
+    marks: NDArray[np.uint8],
+    sites: NDArray[np.intp],
+) -> int:
+    """Sites of a row, which begins at `first`, whose right or lower neighbour has another label.
+
+    Parameters
+    ----------
+    labels : (n,) int32
+    first, width : int
+    marks : (m,) uint8
+        Scratch: zeros, m the next multiple of eight from `width` on.
+    sites : (width,) int
+        Receives them.
+
+    Returns
+    -------
+    int
+        How many there are.
+    """
     # As views of their own, whose places are known not to be negative, many are compared at once.
-    here = labels[first:after]
-    right, below = labels[first + 1 : after + 1], labels[first + width : after + width]
-    unlike = here[0] ^ here[0]
-    for p in range(len(right)):
-        unlike |= here[p] ^ right[p]
-    for p in range(len(below)):
-        unlike |= here[p] ^ below[p]
-    return bool(unlike == 0)
+    here, right = labels[first : first + width], labels[first + 1 : first + width]
+    below = labels[first + width : first + 2 * width]
+    marks[width - 1] = 0
+    for j in range(len(right)):
+        marks[j] = here[j] != right[j]
+    for j in range(len(below)):
+        marks[j] |= here[j] != below[j]
+    eight = marks.view(np.uint64)
+    count = 0
+    for k in range(len(eight)):
+        if eight[k] != 0:
+            for j in range(8 * k, 8 * k + 8):
+                if marks[j]:
+                    sites[count] = first + j
+                    count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)
