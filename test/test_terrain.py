@@ -120,6 +120,19 @@ def test_a_whole_object_is_an_obstacle_and_has_its_height():
     assert not np.isfinite(result.height[frame.depth == 0]).any()
 
 
+def test_a_curb_is_an_obstacle_as_a_whole_though_its_side_fades_with_distance():
+    """Seen along it, a side of 6 cm is lost in what the ground may rise by between neighbours."""
+    terrain, sensor = terrain_scene('curb', 930024), Kinect()
+    frame = simulate_terrain(terrain, sensor, seed=930024)
+    up, height = stated(terrain, 930024)
+    config = Config(
+        **dict(zip(('up_x', 'up_y', 'up_z'), map(float, up), strict=True)), sensor_height=height
+    )
+    result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera))
+    assert share(result, frame, OBSTACLE, OBSTACLE) > 0.95
+    assert share(result, frame, GROUND, GROUND) > 0.99
+
+
 @pytest.mark.parametrize(('degrees', 'class_'), [(9, GROUND), (20, OBSTACLE)])
 def test_ramps_are_ground_as_long_as_they_are_not_steep(degrees, class_):
     top = 2 * np.tan(np.radians(degrees))

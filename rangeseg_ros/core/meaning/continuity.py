@@ -125,7 +125,7 @@ def surfaces_of(
     # Noise hides parts of a step.
     closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     steep = closed.view(np.bool_)
-    return *join_cells(cells, steps, steep, broken), steep, broken
+    return *join_cells(cells, steps, (~steep).view(np.uint8), broken), steep, broken
 
 
 @njit(cache=True, nogil=True)
@@ -206,9 +206,9 @@ def _is_step(
 
 @njit(cache=True, nogil=True)
 def join_cells(
-    cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[np.bool_]
+    cells: Cells, steps: Steps, part: NDArray[np.uint8], broken: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], int]:
-    """Surfaces of the cells that are not steep, along links that are not broken; their number."""
+    """Surfaces of the cells of each part but 0, along links that are not broken; their number."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
     slope, up, down = np.float32(steps.slope), np.float32(steps.least), np.float32(steps.beside)
@@ -226,18 +226,19 @@ def join_cells(
         for c in range(columns - 2):
             across[c] = _is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
         for c in range(columns):
-            if steep[i, c] or np.isnan(place[0, i, c]):
+            own = part[i, c]
+            if own == 0 or np.isnan(place[0, i, c]):
                 continue
             # The next measured cell below.
             k = i + 1 if i + 1 < rows and not np.isnan(place[0, i + 1, c]) else i + 2
-            if k < rows and not (broken[i, c] or steep[i + 1, c] or steep[k, c]):
+            if k < rows and part[i + 1, c] == own and part[k, c] == own and not broken[i, c]:
                 apart = below[c]
                 if k > i + 1:
                     apart = _is_step(place, error, factors[0], slope, up, down, i, c, k, c)
                 if not (apart or np.isnan(place[0, k, c])):
                     _join(parent, i * columns + c, k * columns + c)
             # The one to the right, where the next but one agrees on either side.
-            if c + 1 < columns and not steep[i, c + 1] and not np.isnan(place[0, i, c + 1]):
+            if c + 1 < columns and part[i, c + 1] == own and not np.isnan(place[0, i, c + 1]):
                 apart = beside[c] or (c + 2 < columns and across[c]) or (c > 0 and across[c - 1])
                 if not apart:
                     _join(parent, i * columns + c, i * columns + c + 1)
@@ -245,7 +246,7 @@ def join_cells(
     count = 0
     for i in range(rows):
         for c in range(columns):
-            if steep[i, c] or np.isnan(place[0, i, c]):
+            if part[i, c] == 0 or np.isnan(place[0, i, c]):
                 continue
             # The root is the first of its surface.
             root = _find(parent, i * columns + c)

@@ -13,8 +13,9 @@ from rangeseg_ros.core.meaning.continuity import Steps
 
 # Cells along a column whose mean tells a level.
 _MEAN = 4
-# Columns most of which must agree: wider than the correlation of a stereo camera's noise.
-_BESIDE = 7
+# Columns most of which must agree: wider than the correlation of a stereo camera's noise, so that
+# none of its patches does; and several times as wide, so that no few of them together do.
+_BESIDE = (7, 21)
 
 
 def below_edges(
@@ -24,6 +25,7 @@ def below_edges(
     steep: NDArray[np.bool_],
     broken: NDArray[np.bool_],
     turned: bool,
+    rise: bool = False,
 ) -> NDArray[np.bool_]:
     """Cells beyond an edge that the ground falls from, up to where it comes back by another one.
 
@@ -40,10 +42,15 @@ def below_edges(
         See `surfaces_of`.
     turned : bool
         Whether up is down along the columns.
+    rise : bool
+        The same where the ground rises.
     """
-    fallen = _fallen(height, cells.place, steps, steep, broken, turned)
-    most = cv2.boxFilter(fallen.view(np.uint8) * np.uint8(_BESIDE), -1, (_BESIDE, 1))
-    result: NDArray[np.bool_] = 2 * most > _BESIDE
+    fallen = _fallen(-height if rise else height, cells.place, steps, steep, broken, turned, rise)
+    result = np.zeros(fallen.shape, np.bool_)
+    for width in _BESIDE:
+        result |= (
+            2 * cv2.boxFilter(fallen.view(np.uint8) * np.uint8(width), -1, (width, 1)) > width
+        )
     return result
 
 
@@ -55,14 +62,19 @@ def _fallen(
     steep: NDArray[np.bool_],
     broken: NDArray[np.bool_],
     turned: bool,
+    rise: bool,
 ) -> NDArray[np.bool_]:
-    """The same of each column by itself."""
+    """The same of each column by itself, of heights that fall; `rise` if they are those of a rise.
+
+    How far the mean of the ground before lags behind counts for a ramp up alone: one down is a
+    drop in doubt.
+    """
     rows, columns = height.shape
     result = np.zeros((rows, columns), np.bool_)
     total = np.empty((2, 4))
     for c in range(columns):
         near = np.nan  # mean height of the ground before
-        x = y = 0.0  # where its last cell is
+        x = y = 0.0  # where that is, or its last cell
         edge = fallen = False
         for m in range(rows):  # outwards
             i = m if turned else rows - 1 - m
@@ -98,8 +110,10 @@ def _fallen(
                 edge = False
             result[i, c] = fallen
             if not fallen:
+                share = 1.0 if np.isnan(near) or not rise else 1.0 / _MEAN
                 near = height[i, c] if np.isnan(near) else near + (height[i, c] - near) / _MEAN
-                x, y = place[1, i, c], place[2, i, c]
+                x += (place[1, i, c] - x) * share
+                y += (place[2, i, c] - y) * share
     return result
 
 

@@ -170,18 +170,21 @@ def _terrain(
     start = nearest_part(height, cells.place, surface, under.surface, steps.least)
     own = surface == under.surface
     fallen = below_edges(height, cells, steps, steep, broken, turned) & own
-    own &= ~fallen
+    # The top of a step may hang together with the ground beside it just as well.
+    risen = below_edges(height, cells, steps, steep, broken, turned, rise=True) & own & ~fallen
+    own &= ~(fallen | risen)
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
     field = GroundField.of(ground_field(cells, ground, under.theta), size, up)
     height = cell_heights(cells, field, size)
-    surface, count = join_cells(cells, steps, steep | ground | fallen, broken)
-    others, more = join_cells(cells, steps, steep | ground | ~fallen, broken)
-    surface = np.where(others > 0, others + np.int32(count), surface)
-    beyond = np.arange(count + more + 1) > count
+    part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
+    part[steep | ground] = 0
+    surface, count = join_cells(cells, steps, part, broken)
+    beyond = np.zeros(count + 1, np.bool_)
+    beyond[surface[fallen]] = True
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
-    sizes, side, blur = sides_of(height, unsure, surface, around(ground), count + more)
+    sizes, side, blur = sides_of(height, unsure, surface, around(ground), count)
     large = sizes >= FEWEST
     # Beyond an edge, where the noise would hide a drop, it is not known what is level.
     hidden = beyond & (blur > limits.drop - steps.least)
