@@ -241,7 +241,7 @@ class Segmenter:
             kept = np.zeros(int(regions.max()) + 1, np.uint16)
             kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
             regions = kept[regions]
-        labels = np.where(image.valid, regions, np.uint16(0))
+        labels = regions * image.valid
         watch.lap('planes')
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)

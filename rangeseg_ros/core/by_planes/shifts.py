@@ -15,6 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
 
 # Blocks around a place that tell the shift, seven in a row: less than the width of a Kinect's
@@ -76,7 +77,7 @@ def shifts(
     area = box[:, 2] * box[:, 3]
     values = np.zeros(area.sum(), np.float32)
     local = Shifts(box, np.cumsum(area) - area, values)
-    _find_shifts(local, _inner(surfaces), blocks, theta, agreement)
+    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, agreement)
     return local
 
 
@@ -122,14 +123,16 @@ def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
 
 @njit(cache=True, nogil=True)
 def _find_shifts(
+    first: int,
+    after: int,
     local: Shifts,
     inner: NDArray[np.int32],
     blocks: NDArray[np.float64],
     theta: NDArray[np.float64],
     agreement: float,
 ) -> None:
-    """Shifts of all planes in their boxes."""
-    for k in range(1, len(theta)):
+    """Shifts of some planes in their boxes."""
+    for k in range(max(first, 1), after):
         rows, columns = local.box[k, 2], local.box[k, 3]
         own = local.values[local.start[k] : local.start[k] + rows * columns]
         own = own.reshape(rows, columns)

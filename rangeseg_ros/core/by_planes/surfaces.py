@@ -61,17 +61,35 @@ def join_surfaces(
         Of the surfaces; zeros for 0.
     """
     shape = moments.shape[:2]
-    blocks = moments.reshape(-1, SIZE)
     # No patch reaches over the middle, but neither does any reach across a large surface.
     # Not even in a small image is one smaller than four blocks.
     largest = max(enlarged * _PATCH_LARGEST, 4.0 * block**2)
-    roots = map_halves(grow_patches, shape[0], moments, *links, largest)
-    patch, moments = _renumber(np.concatenate(roots), blocks, _BLOCKS_OF_PATCH * block**2)
+    smallest = float(_BLOCKS_OF_PATCH * block**2)
+    halves = map_halves(_patches, shape[0], moments, *links, largest, smallest)
+    (patch, moments), (lower, beneath) = halves
+    patch = np.concatenate([patch, np.where(lower > 0, lower + len(moments) - 1, 0)])
+    moments = np.concatenate([moments, beneath[1:]])
     border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumber(
-        _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, least
+        _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, float(least)
     )
     return surface[patch].reshape(shape), moments
+
+
+@njit(cache=True, nogil=True)
+def _patches(
+    first: int,
+    after: int,
+    moments: NDArray[np.float64],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    largest: float,
+    least: float,
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Patches of at least so many pixels in some rows of blocks, 1...P, and their moments."""
+    begin, end = first * moments.shape[1], after * moments.shape[1]
+    roots = grow_patches(first, after, moments, right, below, largest) - begin
+    return _renumber(roots, moments.reshape(-1, SIZE)[begin:end], least)
 
 
 @njit(cache=True)

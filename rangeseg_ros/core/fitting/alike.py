@@ -31,7 +31,7 @@ class Sets(NamedTuple):
     slopes: int
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def alike(squared: NDArray[np.float64], slope: NDArray[np.float64]) -> Sets:
     """Sets of N blocks by their squared inverse range, and of a range by their slope (N,).
 
@@ -124,7 +124,7 @@ def _precedes(a: int, b: int, key: NDArray[np.float64], second: NDArray[np.float
     return a < b
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def quantiles(values: NDArray[np.float64], sets: Sets, quantile: float) -> NDArray[np.float64]:
     """Quantile (S,) of the values (N,) of the blocks of each set."""
     result = np.empty(len(sets.start) - 1)
@@ -139,7 +139,7 @@ def ranked(values: NDArray[np.float64], quantile: float) -> float:
     return _ranked(values, int(quantile * (len(values) - 1)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def median(values: NDArray[np.float64]) -> float:
     """Median of N values."""
     values = values.copy()

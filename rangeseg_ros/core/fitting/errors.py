@@ -42,6 +42,18 @@ class Errors(NamedTuple):
         return Errors(factor * self.constant, factor * self.quartic, factor * self.tilt)
 
 
+class ByTurn(NamedTuple):
+    """Of sets of blocks (S,) that slope alike more down the columns than along the rows.
+
+    The medians of the squared inverse ranges and slopes, and a quantile of the variances.
+    """
+
+    squared: NDArray[np.float64]
+    across: NDArray[np.float64]
+    down: NDArray[np.float64]
+    variance: NDArray[np.float64]
+
+
 @register_jitable
 def variances(
     errors: Errors, squared: NDArray[np.float64], slope: NDArray[np.float64]
@@ -50,7 +62,7 @@ def variances(
     return FLOOR + errors.constant + errors.quartic * squared**2 + errors.tilt * slope
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def explaining(
     scale: Scale,
     variance: NDArray[np.float64],
@@ -87,26 +99,38 @@ def explaining(
     return Errors(constant, quartic, straight)
 
 
-@njit(cache=True)
-def turning(
+@njit(cache=True, nogil=True)
+def by_turn(
     squared: NDArray[np.float64],
     across: NDArray[np.float64],
     down: NDArray[np.float64],
     variance: NDArray[np.float64],
     quantile: float,
-    noise: Errors,
-    least: Errors,
-) -> tuple[float, tuple[float, float]]:
-    """Tilt of the `noise`, and the way in which directions err: BOTH, or certainly one alone.
+) -> ByTurn:
+    """What tells the way in which directions err.
 
     Of N blocks of these squared inverse ranges, and slopes along the row and down the column.
     """
     sets = alike(squared, down - across)
-    squared, across = quantiles(squared, sets, 0.5), quantiles(across, sets, 0.5)
-    down = quantiles(down, sets, 0.5)
-    shown = np.maximum(quantiles(variance, sets, quantile), variances(least, squared, across))
+    medians = (
+        quantiles(squared, sets, 0.5),
+        quantiles(across, sets, 0.5),
+        quantiles(down, sets, 0.5),
+    )
+    return ByTurn(*medians, quantiles(variance, sets, quantile))
+
+
+@njit(cache=True)
+def turning(
+    sets: ByTurn, blocks: float, noise: Errors, least: Errors
+) -> tuple[float, tuple[float, float]]:
+    """Tilt of the `noise`, and the way in which directions err: BOTH, or certainly one alone.
+
+    Of sets of so many blocks.
+    """
+    squared, across, down = sets.squared, sets.across, sets.down
+    shown = np.maximum(sets.variance, variances(least, squared, across))
     there = variances(Errors(noise.constant, noise.quartic, 0.0), squared, across)
-    blocks = len(variance) / len(shown)
     _, cameras = _likeliest(across + down, shown, there, blocks)
     rows, along = _likeliest(across, shown, there, blocks)
     columns, below = _likeliest(down, shown, there, blocks)

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import median
-from rangeseg_ros.core.fitting.errors import BOTH, Errors, explaining, turning, variances
+from rangeseg_ros.core.fitting.errors import BOTH, Errors, by_turn, explaining, turning, variances
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.scale import ENOUGH, MOST, QUANTILE, Scale
 from rangeseg_ros.core.runtime.threads import submit
@@ -62,25 +62,25 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if np.count_nonzero(used) < SAMPLES:
         return prior
     scale = Scale.of(coarse, used, BOTH, MOST)
+    variance = scale.variance_ratio(coarse, 1.0)
+    slopes = coarse.across.ravel()[scale.place], coarse.down.ravel()[scale.place]
+    sets = submit(by_turn, scale.squared, *slopes, variance, QUANTILE)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
     none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
-    variance = scale.variance_ratio(coarse, 1.0)
     noise = explaining(scale, variance, QUANTILE, True, rounded, none)
-    slopes = coarse.across.ravel()[scale.place], coarse.down.ravel()[scale.place]
-    tilt, way = turning(scale.squared, *slopes, variance, QUANTILE, noise, rounded)
+    each = len(variance) / len(sets.result().variance)
+    tilt, way = turning(sets.result(), each, noise, rounded)
     noise = noise._replace(tilt=tilt)
     level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope(way)))
     if not flat.any():
         return prior
-    scale = Scale.of(blocks, flat, way, ENOUGH)
-    within = [scale.mean(scale.variance_ratio(blocks, level), QUANTILE)]
+    smallest = submit(_within, blocks, flat, way, level)
+    within: list[float] = []
     between = filled = 1.0
     distortion = none
-    # What is new in every pixel shows in the smallest blocks.
-    shown = noise.times(within[0])
     # Lasers err in range alone.
     in_range = noise.quartic > 0
     side, parts = BLOCK, blocks
@@ -92,6 +92,10 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
             coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
         )
         scale = Scale.of(parts, whole, way, ENOUGH)
+        if side == BLOCK:
+            # What is new in every pixel shows in the smallest blocks.
+            within.append(smallest.result())
+            shown = noise.times(within[0])
         excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
         bending = explaining(scale, excess.ravel()[scale.place], 0.5, in_range, none, shown)
         within.append(scale.mean(scale.variance_ratio(parts, level), QUANTILE))
@@ -113,7 +117,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         if typical[1] > typical[0]:
             distortion = smooth
         side = 2 * side
-    if len(within) == 1:
+    if not within:
         return prior
     total, white, width = _random(within, between, filled)
     # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
@@ -132,6 +136,14 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         quantum=quantum,
         range_quantum=range_quantum,
     )
+
+
+def _within(
+    blocks: Blocks, flat: NDArray[np.bool_], way: tuple[float, float], level: NDArray[np.float64]
+) -> float:
+    """What the flat ones of the smallest blocks show of the variances `level`."""
+    scale = Scale.of(blocks, flat, way, ENOUGH)
+    return scale.mean(scale.variance_ratio(blocks, level), QUANTILE)
 
 
 @njit(cache=True)

@@ -69,7 +69,7 @@ class Scale(NamedTuple):
         return float(np.mean(quantiles(ratio, self.sets, quantile)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _chosen(
     squared: NDArray[np.float64],
     across: NDArray[np.float64],
