@@ -10,7 +10,7 @@ from rangeseg_ros.core.calibration.calibrate import CalibrationError, calibrate
 from rangeseg_ros.core.calibration.field import solve
 from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
-from rangeseg_ros.core.calibration.validation import without_plane
+from rangeseg_ros.core.calibration.validation import _splits, without_plane
 from rangeseg_ros.simulation.fields import smooth_field
 
 
@@ -68,7 +68,7 @@ def test_second_coefficient_where_the_range_is_offset():
 
     result = calibrate(seen(40, range_offset), CAMERA.shape)
     distortion = result.distortion
-    assert distortion.slope is not None
+    assert distortion.slope is not None and len(result.smoothness) == 1
     assert rms(distortion.slope.mean()) < 1e-6
     v, u = np.indices(CAMERA.shape)
     terms = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
@@ -81,6 +81,23 @@ def test_second_coefficient_where_the_range_is_offset():
         off = without_plane(error - truth, known)
         # A slope that is the same everywhere scales all planes and stays free.
         assert rms(off) < 0.35 * rms(truth)
+
+
+def test_slope_that_is_no_error_of_the_range_is_learned():
+    slope = 0.006 * smooth_field(CAMERA.shape, (20.0, 20.0), np.random.default_rng(3))
+    cells = seen(40, lambda inverse: true_map(0.001) + slope * (inverse - 0.6))
+    result = calibrate(cells, CAMERA.shape)
+    assert result.distortion.slope is not None and len(result.smoothness) == 2
+    assert np.corrcoef(result.distortion.slope.ravel(), slope.ravel())[0, 1] > 0.6
+
+
+def test_frames_left_out_do_not_weigh_the_others():
+    cells = seen(12, true_map())
+    first = cells.frame[cells.plane()] < 6
+    other = cells._replace(inverse=np.where(first, 2 * cells.inverse**2, cells.inverse))
+    one, two = (_splits(each, CAMERA.shape, 2) for each in (cells, other))
+    assert np.array_equal(one[0].weight, two[0].weight)
+    assert not np.array_equal(one[1].weight, two[1].weight)
 
 
 def test_near_planes_that_are_much_noisier_do_not_outvote_the_others():

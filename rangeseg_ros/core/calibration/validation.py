@@ -2,12 +2,15 @@
 
 The frames are cut into blocks of consecutive ones, as neighbours in time see almost the same. Each
 block is left out once, and the field of the others is tried on it. With two blocks, of which each
-sees much that the other does not, this decides how smooth the field is, and whether it depends on
-the distance. With more blocks, whose fields are almost that of all frames, it tells how much of
-the residual is explained, by how much the field is scaled down where little of it holds, and its
-uncertainty (delete-a-group jackknife, to which the difference to a less smooth field is added).
+sees much that the other does not, this decides how smooth the field is, and how it depends on the
+distance (`kinds.py`). With more blocks, whose fields are almost that of all frames, it tells how
+much of the residual is explained, by how much the field is scaled down where little of it holds,
+and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth field is
+added).
 
-Cells count by their weights, as in the solution: a few wrong regions would outvote the field.
+Cells count by robust weights, as in the solution: a few wrong regions would outvote the field.
+Each field has weights of its own: with those of all frames a block that is left out has its say,
+and the fields differ by a quarter less than they should.
 """
 
 from __future__ import annotations
@@ -22,17 +25,21 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.bands import column_profile
 from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
+from rangeseg_ros.core.calibration.kinds import Kind, kinds
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
 
 BLOCKS = 5
 """Parts of the recording that are left out in turn."""
 # Tried from the smoothest on, in sightings of a cell, a factor of 4 apart.
 _SMOOTHNESS = (64.0, 16.0, 4.0)
-# Times the variance explained that a second coefficient must explain. Sensors without it stay
-# below 1.00 and a Kinect below 1.15; with it, readers of page 1 alone are left without a map.
+# Times the variance explained by a field fixed in inverse depth that one of another kind must
+# explain. Fixed in range, it explains 0.1 to 0.99 on sensors that are not (simulated, and a
+# Kinect), 1.2 to 1.6 on those that are; with a slope 1.00, and on a Kinect up to 1.15. Then it is
+# left out, as with a second coefficient readers of page 1 alone are left without a map.
 _WORTH = 1.2
-# Cells over which the uncertainty is averaged: four degrees of freedom are few.
-_AVERAGED = 2.0
+# Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
+# is low by chance would be trusted most.
+_AVERAGED = 5.0
 
 
 class Fold(NamedTuple):
@@ -42,8 +49,10 @@ class Fold(NamedTuple):
     ----------
     frames : (first, last) int
         The block.
-    error : (K, G) float64
-        Field of the other frames, with the bands, 1/m.
+    field : (K, G) float64
+        Of the other frames, without the bands, 1/m.
+    bands : (G,) float64
+        Of the other frames, 1/m.
     before, after : float
         Root mean square residual of the cells of the block, without and with the field, 1/m.
     weight : float
@@ -53,7 +62,8 @@ class Fold(NamedTuple):
     """
 
     frames: tuple[int, int]
-    error: NDArray[np.float64]
+    field: NDArray[np.float64]
+    bands: NDArray[np.float64]
     before: float
     after: float
     weight: float
@@ -66,7 +76,7 @@ class Learned(NamedTuple):
     Attributes
     ----------
     field : (K, G) float64
-        Without the bands, 1/m: offset, and with K = 2 slope, of every cell.
+        Without the bands, 1/m: offset at `reference`, and with K = 2 slope, of every cell.
     profile : (W,) float64
         Bands, 1/m.
     deviation : (G,) float64
@@ -99,87 +109,123 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
         Of the images.
     """
     reference = float(np.median(seen.inverse))
-    spread = max(1.4826 * float(np.median(np.abs(seen.inverse - reference))), 1e-6)
-    # Of the planes, not of the measurements: a slope that is the same everywhere is then free, as
-    # it only scales the planes, and cannot explain the noise away.
-    slope = (seen.inverse - residuals(seen, seen.inverse) - reference) / spread
-    one = np.ones((1, len(seen.inverse)))
-    grid = cell_grid(shape)
-    # Two rounds of weights: the first are those of residuals without any field.
-    weight = robust_weights(seen, np.zeros(len(seen.inverse)))
-    first = solve(seen, one, weight, grid, _SMOOTHNESS[1:2])
-    weight = robust_weights(seen, first[0, seen.cell])
-
+    fixed, ranged, sloped = kinds(seen, reference)
     # Of two halves each sees much that the other does not, as later recordings will.
-    tried: list[tuple[float, ...]] = [(value,) for value in _SMOOTHNESS]
-    explained = [_explained(folds) for folds in _leave_out(seen, one, weight, shape, 2, tried)]
-    basis, smoothness = one, tried[int(np.argmax(explained))]
-    two, least = np.stack([one[0], slope]), _WORTH * max(*explained, 0.0)
+    halves, grid = _splits(seen, shape, 2), cell_grid(shape)
+
+    def tried(kind: Kind, choices: list[tuple[float, ...]]) -> tuple[float, tuple[float, ...]]:
+        found = _leave_out(halves, kind.basis, grid, choices)
+        return max(zip([_explained(folds) for folds in found], choices, strict=True))
+
+    alone: list[tuple[float, ...]] = [(value,) for value in _SMOOTHNESS]
+    explained, smoothness = tried(fixed, alone)
+    kind, least = fixed, _WORTH * max(explained, 0.0)
     # The second coefficient is known worse, as distances differ little.
-    tried = [(*smoothness, smoothness[0] * factor) for factor in _SMOOTHNESS]
-    explained = [_explained(folds) for folds in _leave_out(seen, two, weight, shape, 2, tried)]
-    if max(explained) > least:
-        basis, smoothness = two, tried[int(np.argmax(explained))]
-    (folds,) = _leave_out(seen, basis, weight, shape, BLOCKS, [smoothness])
+    pairs = [(*smoothness, smoothness[0] * factor) for factor in _SMOOTHNESS]
+    for other, choices in ((ranged, alone), (sloped, pairs)):
+        explained, chosen = tried(other, choices)
+        if explained > least:
+            kind, smoothness, least = other, chosen, explained
+    (folds,) = _leave_out(_splits(seen, shape, BLOCKS), kind.basis, grid, [smoothness])
+    weight, _ = _settled_weights(seen, grid)
     profile = column_profile(seen)
     banded = seen._replace(inverse=seen.inverse - _in_cells(profile, shape)[seen.cell])
-    field = solve(banded, basis, weight, grid, smoothness)
+    field = solve(banded, kind.basis, weight, grid, smoothness)
     along, square = np.sum([fold.projection for fold in folds], axis=0)
     gain = float(np.clip(along / square, 0, 1)) if square > 0 else 0.0
     # What smoothing costs shows in a field that is less smooth.
-    rougher = solve(banded, basis, weight, grid, [value / 4 for value in smoothness], field)
+    rougher = solve(banded, kind.basis, weight, grid, [value / 4 for value in smoothness], field)
     # What was scaled off may be true.
-    biases = [gain * (rougher[0] - field[0]), (1 - gain) * field[0]]
-    deviation = _deviation([gain * fold.error[0] for fold in folds], biases, seen, grid)
-    field[1:] /= spread
-    return Learned(gain * field, gain * profile, deviation, reference, smoothness, gain, folds)
+    offset, rough = (kind.linear[0] @ each for each in (field, rougher))
+    biases = [gain * (rough - offset), (1 - gain) * offset]
+    others = [gain * (kind.linear[0] @ fold.field + fold.bands) for fold in folds]
+    deviation = _deviation(others, biases, seen, grid)
+    field = gain * kind.linear @ field
+    return Learned(field, gain * profile, deviation, reference, smoothness, gain, folds)
+
+
+class _Split(NamedTuple):
+    """A block of frames, and all others.
+
+    Attributes
+    ----------
+    block : (first, last) int
+    out : (N,) bool
+        Cells of the others.
+    train, test : Sightings
+        The others, without their bands, and the block.
+    weight, counts : (number of cells of train, of test) float64
+        Weights for the solution, and in sums of squares.
+    bands : (G,) float64
+        Of the others, 1/m.
+    """
+
+    block: tuple[int, int]
+    out: NDArray[np.bool_]
+    train: Sightings
+    test: Sightings
+    weight: NDArray[np.float64]
+    counts: NDArray[np.float64]
+    bands: NDArray[np.float64]
+
+
+def _splits(seen: Sightings, shape: tuple[int, int], count: int) -> list[_Split]:
+    """Each of `count` blocks of frames, and the others."""
+
+    def split(block: NDArray[np.intp]) -> _Split:
+        frames = np.arange(len(seen.jumps))
+        outside = (frames < block[0]) | (frames > block[-1])
+        train, test = seen.of_frames(outside), seen.of_frames(~outside)
+        weight, first = _settled_weights(train, cell_grid(shape))
+        bands = _in_cells(column_profile(train), shape)
+        train = train._replace(inverse=train.inverse - bands[train.cell])
+        ends, out = (int(block[0]), int(block[-1])), outside[seen.frame][seen.plane()]
+        counts = robust_weights(test, first[test.cell])
+        return _Split(ends, out, train, test, weight, counts, bands)
+
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(split, np.array_split(np.unique(seen.frame), count)))
+
+
+def _settled_weights(
+    seen: Sightings, grid: tuple[int, int]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Weights (N,) by what a field leaves whose own weights know of none, and that field (G,)."""
+    weight = robust_weights(seen, np.zeros(len(seen.inverse)))
+    (field,) = solve(seen, np.ones((1, len(weight))), weight, grid, _SMOOTHNESS[1:2])
+    return robust_weights(seen, field[seen.cell]), field
 
 
 def _leave_out(
-    seen: Sightings,
+    splits: list[_Split],
     basis: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    shape: tuple[int, int],
-    count: int,
+    grid: tuple[int, int],
     tried: Sequence[Sequence[float]],
 ) -> list[list[Fold]]:
-    """For each smoothness that is tried, a `Fold` of each of `count` blocks of frames."""
-    blocks = [
-        (int(block[0]), int(block[-1])) for block in np.array_split(np.unique(seen.frame), count)
-    ]
+    """For each smoothness that is tried, a `Fold` of each block."""
     with ThreadPoolExecutor() as pool:
-        tasks = [pool.submit(_folds, seen, basis, weight, shape, block, tried) for block in blocks]
-        found = [task.result() for task in tasks]
+        found = list(pool.map(lambda split: _folds(split, basis, grid, tried), splits))
     return [list(folds) for folds in zip(*found, strict=True)]
 
 
 def _folds(
-    seen: Sightings,
+    split: _Split,
     basis: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    shape: tuple[int, int],
-    block: tuple[int, int],
+    grid: tuple[int, int],
     tried: Sequence[Sequence[float]],
 ) -> list[Fold]:
-    """A `Fold` for each smoothness, of the frames from the first to the last of the block."""
-    frames = np.arange(len(seen.jumps))
-    outside = (frames < block[0]) | (frames > block[1])
-    train, test = seen.of_frames(outside), seen.of_frames(~outside)
-    out = outside[seen.frame][seen.plane()]
-    bands = _in_cells(column_profile(train), shape)
-    train = train._replace(inverse=train.inverse - bands[train.cell])
-    before, counts = residuals(test, test.inverse), weight[~out]
+    """A `Fold` for each smoothness."""
+    block, out, train, test, weight, counts, bands = split
+    before, total = residuals(test, test.inverse), float(counts.sum())
     field, result = None, []
     for smoothness in tried:
-        field = solve(train, basis[:, out], weight[out], cell_grid(shape), smoothness, field)
-        error = field.copy()
-        error[0] += bands
-        share = residuals(test, (basis[:, ~out] * error[:, test.cell]).sum(axis=0))
+        field = solve(train, basis[:, out], weight, grid, smoothness, field)
+        error = bands[test.cell] + (basis[:, ~out] * field[:, test.cell]).sum(axis=0)
+        share = residuals(test, error)
         squares = [float(counts @ part**2) for part in (before, before - share)]
         projection = float(counts @ (before * share)), float(counts @ share**2)
-        total = float(counts.sum())
         rms = np.sqrt(np.array(squares) / total)
-        result.append(Fold(block, error, rms[0], rms[1], total, projection))
+        result.append(Fold(block, field, bands, rms[0], rms[1], total, projection))
     return result
 
 
