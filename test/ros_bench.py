@@ -197,8 +197,11 @@ class Bench:
     def spin(self, seconds):
         self.until(lambda: False, seconds, required=False)
 
-    def until(self, condition, timeout=180.0, required=True):
-        """Spin until the condition holds; its value."""
+    def until(self, condition, timeout=500.0, required=True):
+        """Spin until the condition holds; its value.
+
+        For nearly as long as a test may take: a loaded machine compiles the kernels for minutes.
+        """
         end = time.monotonic() + timeout
         while not (value := condition()) and time.monotonic() < end:
             assert self.process.poll() is None, f'the node has ended: {self.complaints()}'
