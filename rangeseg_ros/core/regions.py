@@ -155,7 +155,7 @@ def _unite(a: int, b: int, parent: NDArray[np.int32]) -> None:
     parent[max(a, b)] = min(a, b)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _unite_halves(
     labels: NDArray[np.integer],
     grid: Grid,

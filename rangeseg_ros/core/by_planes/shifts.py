@@ -91,7 +91,7 @@ def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
     return local.values[local.start[label] + i * box[3] + j]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _boxes(surfaces: NDArray[np.int32], count: int, reach: int) -> NDArray[np.intp]:
     """Bounding boxes of the surfaces and so many blocks around them, see `Shifts`."""
     rows, columns = surfaces.shape

@@ -92,7 +92,7 @@ def _patches(
     return _renumber(roots, moments.reshape(-1, SIZE)[begin:end], least)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _renumber(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
@@ -116,7 +116,7 @@ def _renumber(
     return labels, total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _borders(
     patch: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
 ) -> NDArray[np.float64]:
@@ -138,7 +138,7 @@ def _borders(
     return border
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _join(
     moments: NDArray[np.float64], border: NDArray[np.float64], granted: float, enlarged: float
 ) -> NDArray[np.intp]:

@@ -193,7 +193,7 @@ def _groups(order: NDArray[np.intp], fits: Fits) -> NDArray[np.intp]:
     return surface
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _groups_of_touching(
     order: NDArray[np.intp], fits: Fits, edges: NDArray[np.intp], around: NDArray[np.intp]
 ) -> NDArray[np.intp]:

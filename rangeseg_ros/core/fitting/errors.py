@@ -120,7 +120,7 @@ def by_turn(
     return ByTurn(*medians, quantiles(variance, sets, quantile))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def turning(
     sets: ByTurn, blocks: float, noise: Errors, least: Errors
 ) -> tuple[float, tuple[float, float]]:

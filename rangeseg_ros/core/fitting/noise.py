@@ -146,7 +146,7 @@ def _within(
     return scale.mean(scale.variance_ratio(blocks, level), QUANTILE)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _flat_blocks(
     blocks: Blocks, variance: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
@@ -163,7 +163,7 @@ def _flat_blocks(
     return level, flat
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _of_four(
     flat: NDArray[np.bool_], residual: NDArray[np.float64], level: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
