@@ -37,7 +37,9 @@ def verdict(inverse, regions, distortion=0.0, seed=0):
     bent = smooth_field(CAMERA.shape, (13.0, 22.0), random)
     inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    return find_curved(regions.astype(np.uint16), image, Blocks.of(image), SENSOR)
+    return find_curved(
+        regions.astype(np.uint16), image, Blocks.of(image), SENSOR, Config().flatness
+    )
 
 
 def test_planes_are_not_curved():

@@ -1,5 +1,6 @@
 """What the documents say of the code is so."""
 
+import ast
 import re
 from pathlib import Path
 
@@ -61,3 +62,17 @@ def test_every_page_is_in_the_site():
     order = (ROOT / 'mkdocs.yml').read_text()
     for path in (ROOT / 'docs').glob('*.md'):
         assert f'{path.name}\n' in order, path.name
+
+
+def test_functions_of_more_than_seven_parameters_say_why():
+    """Compiled kernels take arrays, not objects, and commands their options: both are many."""
+    for path in PACKAGE.rglob('*.py'):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.FunctionDef):
+                continue
+            arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+            count = sum(argument.arg not in ('self', 'cls') for argument in arguments)
+            decorated = ' '.join(map(ast.unparse, node.decorator_list))
+            if count > 7 and not re.search(r'njit|register_jitable|\bcommand\(', decorated):
+                told = ast.get_docstring(node) or ''
+                assert 'More than seven parameters' in told, f'{path.name}: {node.name}'

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planes_of_labels import fit_planes
 from recordings import Recording
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
 from rangeseg_ros.core.options import ConfigError
@@ -43,7 +43,7 @@ def planes_of(scene, k, seed):
 
 def followed(scene, frames, seed=0):
     """Motions of the camera, and its true poses in the frame of the odometry."""
-    odometry, first = PlaneOdometry('odom'), scene.poses[frames[0]]
+    odometry, first = PlaneOdometry(), scene.poses[frames[0]]
     motions, truths = [], []
     for k in frames:
         labels, planes = planes_of(scene, k, seed)
@@ -113,7 +113,7 @@ def test_other_planes_under_known_ids_do_not_make_it_jump():
             ids = ids[1:] + ids[:1]
         named = [replace(p, id=i + 100 * (k == 12)) for p, i in zip(planes, ids, strict=True)]
         shown = 0 if 16 <= k < 20 else len(named)
-        odometry = odometry or PlaneOdometry('odom')
+        odometry = odometry or PlaneOdometry()
         motion = odometry.add(named[:shown], view[:shown], 10**9 + k * 10**9 // 30, (0, -1, 0))
         if k == 20:
             assert motion.held == 0
@@ -127,7 +127,7 @@ def test_other_planes_under_known_ids_do_not_make_it_jump():
 
 def test_z_is_up_and_x_forward_whatever_the_camera_sees():
     for up in ((0, -1, 0), (0, -0.8, -0.6), (0.1, 0.7, 0.2), (0, 0, 1), (0, 0, -1)):
-        motion = PlaneOdometry('odom').add([], np.zeros((0, 4)), 0, up)
+        motion = PlaneOdometry().add([], np.zeros((0, 4)), 0, up)
         turn = motion.pose.rotation
         np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
         np.testing.assert_allclose(turn @ up / np.linalg.norm(up), (0, 0, 1), atol=1e-12)
@@ -137,7 +137,7 @@ def test_z_is_up_and_x_forward_whatever_the_camera_sees():
 def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
     scene = Scene(kinect_room(2).solids, kinect_room(2).poses)
     labels, planes = planes_of(scene, 0, 2)
-    view, odometry = views(labels, planes, CONFIG.distortion_length), PlaneOdometry('odom')
+    view, odometry = views(labels, planes, CONFIG.distortion_length), PlaneOdometry()
     for stamp in (0, 0, 10**9, 10**9, 5 * 10**8, 10**12, 10**18, -5):
         motion = odometry.add(planes, view, stamp, (0, -1, 0))
         assert np.linalg.norm(motion.pose.shift) < 0.01
@@ -148,7 +148,7 @@ def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
 def test_the_message_has_pose_and_twist_in_their_frames():
     labels, planes = planes_of(Scene(kinect_room(2).solids, kinect_room(2).poses), 0, 2)
     view = views(labels, planes, CONFIG.distortion_length)
-    motion = PlaneOdometry('odom').add(planes, view, 10**9, (0, -1, 0))
+    motion = PlaneOdometry().add(planes, view, 10**9, (0, -1, 0))
     stamp = make_rosbags('builtin_interfaces/msg/Time', sec=1, nanosec=2)
     header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id='camera')
     message = odometry_message(make_rosbags, header, motion)

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.mapping.placement import find_placement, moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sensing.camera import Camera

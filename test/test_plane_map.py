@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import shapely
+from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.mapping.observations import LASTING, RESIDUE, PoseNoise, observations
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters

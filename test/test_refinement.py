@@ -27,6 +27,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 NOISE = 0.002
 BLOCK = 4
+LAMBDA = Config().plane_smoothness
 SENSOR = SensorModel.from_config(Config(noise=NOISE, distortion=0.003))
 
 
@@ -52,7 +53,7 @@ def random_case(seed, height, width, count=3):
     shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
     models = Models(theta, price, Shifts(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
-    return Problem.of(image, SENSOR, edges, BLOCK), models, labels.astype(np.int32)
+    return Problem.of(image, SENSOR, edges, BLOCK, LAMBDA), models, labels.astype(np.int32)
 
 
 def unary(problem, models):
@@ -67,7 +68,7 @@ def unary(problem, models):
         level[label] *= 1 + shift[row // BLOCK, column // BLOCK]
     residual = problem.inverse - level
     cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0)
-    cost[0] = 6.0
+    cost[0] = 10.8276 / 2  # chi-squared of one degree of freedom, quantile 0.999
     return np.where(problem.weight > 0, cost, 0).reshape(len(cost), -1, problem.width)
 
 
@@ -154,7 +155,8 @@ def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     white = SENSOR._replace(correlation=0.0)
     links, of_white = (
-        Problem.of(image, sensor, weights(image), BLOCK).links for sensor in (SENSOR, white)
+        Problem.of(image, sensor, weights(image), BLOCK, LAMBDA).links
+        for sensor in (SENSOR, white)
     )
     assert SENSOR.patch > 2 and white.patch == 1
     np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
@@ -243,7 +245,7 @@ def small_room(seed=900):
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
     found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK)
-    return Problem.of(image, sensor, edges, BLOCK), (found[0], blocks, found[1]), sensor
+    return Problem.of(image, sensor, edges, BLOCK, LAMBDA), (found[0], blocks, found[1]), sensor
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):

@@ -8,7 +8,6 @@ from scipy.sparse.csgraph import connected_components as graph_components
 from rangeseg_ros.core.regions import (
     connected_components,
     drop_regions,
-    is_noise,
     merge,
     plane_regions,
 )
@@ -42,12 +41,9 @@ def test_noise_is_less_than_two_pixels_per_pixel_of_perimeter():
     regions = np.ones((7, 13), np.int32)
     regions[:, 7:] = 3
     regions[:6, 7:] = 2
-    noise = is_noise(regions)
-    assert noise.tolist() == [False, False, True, True]
-
-
-def test_no_region_is_never_noise():
-    assert not is_noise(np.zeros((3, 3), np.int32))[0]
+    everywhere = np.ones(regions.shape, np.bool_)
+    found = plane_regions(regions, everywhere, uncut(regions.shape), 'identify', 1)
+    assert np.array_equal(found, np.where(regions == 1, 1, 0))
 
 
 def test_merge_erodes_towards_the_majority():

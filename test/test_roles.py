@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.meaning.roles import ROLES, RolesError, roles
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera

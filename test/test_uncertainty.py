@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from planes_of_labels import fit_planes
 
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, theta_covariances
 from rangeseg_ros.core.sensing.camera import Camera

@@ -88,6 +88,21 @@ class Config:
         low=0.0,
         high=10000.0,
     )
+    plane_smoothness: float = option(
+        1.2,
+        'method planes: lambda of eq. 5.3, weight of the Potts prior against half the squares of '
+        'residuals in standard deviations, for each pixel whose noise agrees',
+        low=0.0,
+        high=10000.0,
+    )
+    flatness: float = option(
+        0.007,
+        'method planes: a bend of less than this share of its width, root mean square, is a '
+        'plane; of hand-annotated planes none bent by more than 0.5 %, while a sphere in pieces '
+        'of a third of its radius bends by 3 %, a cylinder in strips as wide as its radius by 2 %',
+        low=0.0,
+        high=1.0,
+    )
     moves: str = option(
         'expansion',
         'method normals with exact: alpha-expansion or alpha-beta-swap; swap is refused elsewhere',
@@ -239,6 +254,19 @@ class Config:
         low=0.0,
         high=1000.0,
     )
+    # How the camera moves where planes and tf leave it open: by default like a quick hand.
+    camera_turn: float = option(
+        60.0,
+        'standard deviation of how fast the camera turns, degrees per second',
+        low=0.1,
+        high=3600.0,
+    )
+    camera_speed: float = option(
+        0.9,
+        'standard deviation of how fast the camera moves, metres per second',
+        low=0.001,
+        high=100.0,
+    )
     # The world: frames, the map of planes.
     fixed_frame: str = option(
         '',
@@ -302,6 +330,15 @@ class Config:
         12.0,
         'steepest ground, against the ground under the robot, degrees',
         low=0.0,
+        high=45.0,
+    )
+    sensor_height_noise: float = option(
+        0.015, 'standard deviation of sensor_height, metres', low=0.001, high=10.0
+    )
+    up_noise: float = option(
+        1.5,
+        'standard deviation of the direction that is up, however it is told, degrees',
+        low=0.01,
         high=45.0,
     )
     obstacle_height: float = option(

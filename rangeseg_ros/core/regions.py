@@ -194,23 +194,8 @@ def _renumber(first: int, after: int, found: NDArray[np.int32], number: NDArray[
             found[i, j] = number[found[i, j]]
 
 
-def is_noise(regions: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """Small or thin regions: fewer than two pixels per pixel of the perimeter (thesis eq. 6.3).
-
-    Parameters
-    ----------
-    regions : (H, W) int32
-        0...N.
-
-    Returns
-    -------
-    (N + 1,) bool
-        Whether region k is noise; never for region 0.
-    """
-    return _thin(*_measures(regions))
-
-
 def _thin(area: NDArray[np.int64], perimeter: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Regions of fewer than two pixels per pixel of the perimeter (thesis eq. 6.3); never 0."""
     noise = area < 2 * perimeter
     noise[0] = False
     return noise

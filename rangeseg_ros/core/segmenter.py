@@ -265,7 +265,7 @@ class Segmenter:
         labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
         regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-        regions = by_planes.drop_curved(regions, image, blocks, sensor)
+        regions = by_planes.drop_curved(regions, image, blocks, sensor, config.flatness)
         watch.lap('regions')
         return regions, labelling
 

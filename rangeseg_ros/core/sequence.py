@@ -46,7 +46,7 @@ class SequenceSegmenter:
         self.map = PlaneMap(config)
         self.pose: Transform | None = None
         self.motion: Motion | None = None
-        self._odometry = PlaneOdometry(self.config.odometry_frame)
+        self._odometry = PlaneOdometry(self.config)
         self._ground = GroundMemory(self.config.track_time)
         self._stamp = 0
         self._pose: Transform | None = None
@@ -65,7 +65,8 @@ class SequenceSegmenter:
             self.map.clear('its frame has changed')
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
-            self._odometry, self.motion = PlaneOdometry(config.odometry_frame), None
+            self._odometry, self.motion = PlaneOdometry(config), None
+        self._odometry.config = config
         self.map.config = config
         self._ground.patience = config.track_time
 

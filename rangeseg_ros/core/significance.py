@@ -10,6 +10,8 @@ OUTLIER = 4.0
 """Standard deviations from which an error is none of the noise: one of 16 000 by chance."""
 CERTAIN = 6.0
 """The same for what is asked once of an image or a recording, and changes all of it if so."""
+CLEARLY = 2.0
+"""How many times more must speak for one of two things than for the other."""
 SAMPLES = 12
 """Samples that tell three parameters, those of a plane, or a quantile: four for each."""
 

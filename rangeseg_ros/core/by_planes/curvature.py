@@ -10,23 +10,25 @@ from rangeseg_ros.core.fitting.interior import fill
 from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit_all, squares_left
+from rangeseg_ros.core.sensing.moments import (
+    CHI2,
+    COUNT,
+    RATIO,
+    SIZE,
+    add_pixel,
+    fit_all,
+    squares_left,
+)
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
-from rangeseg_ros.core.significance import OUTLIER
+from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
 # 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
 # within two and a half times that, and the distortion is measured to within a tenth.
 _SHARE, _PIXELS, _EXPONENT = 1.7**2, 1e4, 0.78
-# A bend of less than 0.7 % of its width, root mean square, is a plane to most who ask: a bulging
-# box; of hand-annotated planes whose bend was to be seen, none bent by more than 0.5 %. A sphere
-# cut to pieces of a third of its radius bends by 3 %, a cylinder cut to strips as wide as its
-# radius and three times as high by 2 %.
-_FLATNESS = 0.007
-# Nine agreeing pixels count as one; the chi-squared of three terms of curvature stays below four
-# times its mean.
-_NOISE = 9.0 * 3.0 * 4.0
+# Chi-squared of three terms of curvature, for pixels of whose noise nine agree.
+_NOISE = 9 * chi2_quantile(3, 0.99)
 # Rows and columns from one pixel that is looked at to the next.
 _STRIDE = 2
 # Exponents of x and y in the terms of a quadratic, in the powers of x and y up to the fourth, and
@@ -37,7 +39,11 @@ _PRODUCTS = np.array([[_POWERS.index((a + c, b + d)) for c, d in _TERMS] for a, 
 
 
 def find_curved(
-    regions: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
+    regions: NDArray[np.uint16],
+    image: RangeImage,
+    blocks: Blocks,
+    sensor: SensorModel,
+    flatness: float,
 ) -> NDArray[np.bool_]:
     """Test the second-order part of each region's residuals.
 
@@ -53,6 +59,8 @@ def find_curved(
     blocks : Blocks
         Of the image.
     sensor : SensorModel
+    flatness : float
+        A bend of less than this share of its width, root mean square, is a plane.
 
     Returns
     -------
@@ -79,7 +87,7 @@ def find_curved(
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
     noise = np.maximum((square - whole) / size, 1)
     visible = bending > distortion + _NOISE * noise / size
-    result = visible & (bending * (scale / size) ** 2 > _FLATNESS**2 * area)
+    result = visible & (bending * (scale / size) ** 2 > flatness**2 * area)
     result[0] = False
     return result
 
@@ -125,15 +133,9 @@ def _sum_moments(
                     if label == 0 or y == 0:
                         continue
                     weight = _STRIDE**2 / random_variance(sensor, y * y)
-                    entry = 0
-                    for m in range(3):
-                        for n in range(m, 3):
-                            total[label, entry] += weight * rays[i, j, m] * rays[i, j, n]
-                            entry += 1
-                        total[label, 6 + m] += weight * rays[i, j, m] * y
-                    total[label, CHI2] += weight * y * y
+                    ratio = weight * systematic_variance(sensor, y * y)
+                    add_pixel(total[label], rays[i, j], y, weight, ratio)
                     total[label, COUNT] += _STRIDE**2
-                    total[label, RATIO] += weight * systematic_variance(sensor, y * y)
     return total
 
 

@@ -83,7 +83,7 @@ def segment(
     sensor : SensorModel
         Errors of the image.
     config : Config
-        `min_pixels`, `exact`, `refits` and `work_budget` are read.
+        `plane_smoothness`, `min_pixels`, `exact`, `refits` and `work_budget` are read.
     lap : callable
         Told the name of every stage that ends.
     """
@@ -97,7 +97,7 @@ def segment(
     whole = whole_blocks(image.inverse, grid, size)
     whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)
     lap('blocks')
-    pending = submit(Problem.of, image, sensor, grid, size)
+    pending = submit(Problem.of, image, sensor, grid, size, config.plane_smoothness)
     # A region may gain as much again from pixels that no block could take.
     least = max(least_pixels(config.min_pixels, image.shape) // 2, 1)
     enlarged = image.inverse.size / VGA
@@ -114,10 +114,14 @@ def segment(
 
 
 def drop_curved(
-    regions: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
+    regions: NDArray[np.uint16],
+    image: RangeImage,
+    blocks: Blocks,
+    sensor: SensorModel,
+    flatness: float,
 ) -> NDArray[np.uint16]:
     """Regions (H, W) without those that bend, numbered anew; see `find_curved`."""
-    return drop_regions(regions, find_curved(regions, image, blocks, sensor))
+    return drop_regions(regions, find_curved(regions, image, blocks, sensor, flatness))
 
 
 def unite_regions(

@@ -7,17 +7,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
+from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# Quantile 0.999 of chi-squared with the three degrees of freedom of a plane, for pixels of
-# whose noise four agree.
-_NOISE = 16.0 * 4.0
+# Chi-squared of the three degrees of freedom of a plane, for pixels of whose noise four agree.
+_NOISE = 4 * chi2_quantile(3)
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
-# are merged at once.
+# are merged at once: quantile 0.996.
 _CLEAR = 24.0
 WITHIN_PATCH = 2.0
 """Systematic variances granted between blocks of a patch: that of a difference is twice one."""
 # Residuals of a block, in variances, beyond which it is no part of a plane.
-_ROUGH = 10.0
+_ROUGH = OUTLIER**2
 # Steps of a variance by which patches are told to be flatter: the mean residual of the largest
 # patch scatters by 0.04, and less than a step is often rounding.
 _PER_VARIANCE = 256

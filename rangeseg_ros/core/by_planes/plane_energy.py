@@ -19,19 +19,17 @@ from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, fit_all
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     random_variance,
     systematic_variance,
 )
-from rangeseg_ros.core.significance import OUTLIER
+from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# For each pixel that has to agree with its neighbour to count as one measurement.
-_SMOOTHNESS = 1.2
-NO_PLANE = 6.0
-"""Data cost of label 0."""
+NO_PLANE = chi2_quantile(1) / 2
+"""Data cost of label 0: that of a residual which is no chance."""
 LEAST_GAIN = 1e-6
 """An improvement of the energy by less is rounding."""
 CAP = OUTLIER**2 / 2
@@ -72,11 +70,16 @@ class Problem(NamedTuple):
         sensor: SensorModel,
         grid: Grid,
         block: int,
+        smoothness: float,
     ) -> Problem:
-        """Weigh the pixels of an image by the noise of its sensor."""
+        """Weigh the pixels of an image by the noise of its sensor.
+
+        The prior is `smoothness` for each pixel that counts as one measurement with its
+        neighbours.
+        """
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor)
-        prior = link_costs(grid, _SMOOTHNESS * sensor.patch)
+        prior = link_costs(grid, smoothness * sensor.patch)
         enlarged = len(inverse) / VGA
         return cls(inverse, rays, weight, prior, image.shape[1], block, enlarged)
 
@@ -211,30 +214,11 @@ def _sum_moments(
     sensor: SensorModel,
 ) -> NDArray[np.float64]:
     total = np.zeros((count, SIZE))
-    width = labels.shape[1]
     for i in range(first, after):
-        j = 0
-        while j < width:
-            label = labels[i, j]
-            if label == 0:
-                j += 1
-                continue
-            # In variables of their own: sums in an array go through memory for every pixel.
-            a = b = c = d = e = f = p = q = r = square = pixels = ratio = 0.0
-            while j < width and labels[i, j] == label:
-                y, w = np.float64(inverse[i, j]), np.float64(weight[i, j])
-                x0 = np.float64(rays[i, j, 0])
-                x1 = np.float64(rays[i, j, 1])
-                x2 = np.float64(rays[i, j, 2])
-                wx0, wx1, wx2, wy = w * x0, w * x1, w * x2, w * y
-                a, b, c = a + wx0 * x0, b + wx0 * x1, c + wx0 * x2
-                d, e, f = d + wx1 * x1, e + wx1 * x2, f + wx2 * x2
-                p, q, r = p + x0 * wy, q + x1 * wy, r + x2 * wy
-                square += wy * y
-                pixels += 1
-                ratio += w * systematic_variance(sensor, y * y)
-                j += 1
-            sums = (a, b, c, d, e, f, p, q, r, square, pixels, ratio)
-            for entry, value in enumerate(sums):
-                total[label, entry] += value
+        for j in range(labels.shape[1]):
+            label, y, w = labels[i, j], np.float64(inverse[i, j]), np.float64(weight[i, j])
+            if label > 0:
+                ratio = w * systematic_variance(sensor, y * y)
+                add_pixel(total[label], rays[i, j], y, w, ratio)
+                total[label, COUNT] += 1
     return total

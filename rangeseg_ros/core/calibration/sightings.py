@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.significance import SAMPLES
 
 # Cells across the image: 8 pixels of a VGA image, a fraction of the length of any distortion.
 _ACROSS = 80
-# Cells that a plane must cover: its own three parameters would explain much of fewer.
-_FEWEST = 20
 # Pixels from another region up to which a pixel may be its neighbour's.
 _RIM = 2
 # Standard deviations beyond which a pixel is not the plane's.
@@ -96,14 +95,14 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     found = []
     for label in range(1, int(labels.max(initial=0)) + 1):
         mask = inner & (labels == label)
-        if np.count_nonzero(mask) < _FEWEST * size * size:
+        if np.count_nonzero(mask) < SAMPLES * size * size:
             continue
         error = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
         mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
         count = np.bincount(cells[mask], minlength=rows * columns)
         # Where half of a cell is the plane's, its mean stands for the cell.
         kept = np.flatnonzero(2 * count >= size * size)
-        if len(kept) < _FEWEST:
+        if len(kept) < SAMPLES:
             continue
         own, y, ray = cells[mask], inverse[mask], rays[mask]
         residual[mask] = y - ray @ fit_plane(ray, y)

@@ -17,7 +17,6 @@ from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
-    SensorModel,
     random_variance,
     systematic_variance,
 )
@@ -114,11 +113,6 @@ class Plane:
     def holes(self) -> list[NDArray[np.float64]]:
         """Outlines (N, 3) of the holes in the hull, clockwise seen from the sensor."""
         return self.outline.holes
-
-
-def fit_planes(labels: NDArray[np.uint16], image: RangeImage, sensor: SensorModel) -> list[Plane]:
-    """Plane of every region, as `describe_regions`, fitted as by `Fits.of`."""
-    return describe_regions(labels, image, Fits.of(labels, image, sensor))
 
 
 def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:

@@ -13,6 +13,7 @@ from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_variance
+from rangeseg_ros.core.significance import chi2_quantile
 
 # Pairs of regions and how much links them, see `find_borders`.
 Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -25,17 +26,16 @@ rooms (median 2.9).
 """
 # Of 725 pairs of different faces that meet, one was within the quantile alone, and 14 are with the
 # residue.
-_LIMIT = RESIDUE * 11.34
+_LIMIT = RESIDUE * chi2_quantile(3, 0.99)
 # The same for regions that touch where no jump is. These are rarely parts of a face, but faces
 # that meet there meet in a crease: of 2300 pairs in simulated and real frames, 11 of parts were
 # apart by 0 to 56 (others, of bent or ragged parts, by more), those of faces by 119 at least.
 _TOUCHING = 6.0
-_TOUCHING_LIMIT = _TOUCHING * 11.34
+_TOUCHING_LIMIT = _TOUCHING * chi2_quantile(3, 0.99)
 # Share of its outline along which a region lies in another. Two planes meet along a line, and a
 # line is never more than half of an outline.
 _ENCLOSED = 0.6
-# Quantile 0.99 of chi-squared with one degree of freedom.
-_LEVEL = 6.63
+_LEVEL = chi2_quantile(1, 0.99)
 
 
 def common_surfaces(fits: Fits) -> NDArray[np.intp]:

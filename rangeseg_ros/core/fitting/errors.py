@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.fitting.alike import alike, quantiles
 from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.sensing.sensor import FLOOR
-from rangeseg_ros.core.significance import CERTAIN
+from rangeseg_ros.core.significance import CERTAIN, chi2_quantile, f_quantile
 
 # Rounds of least squares that settle the weights.
 _ROUNDS = 5
-# Half of the likelihood ratio that is no chance, for one block: quantile 0.999 of chi-squared with
-# one degree of freedom times the relative variance of a median of chi-squared with nine.
-_CHANCE = 10.83 / 2 * (np.pi / 2) * (2 / 9)
-# Quantile 0.999 of F with one and 22 degrees of freedom, those of the 24 sets of an image of VGA:
-# slopes that explain more are no chance. The few sets of small images would ask for more.
-_SIGNIFICANT = 14.4
+# Half of the likelihood ratio that is no chance, for one block: chi-squared with one degree of
+# freedom times the relative variance of a median of chi-squared with nine.
+_CHANCE = chi2_quantile(1) / 2 * (np.pi / 2) * (2 / 9)
+# F with one and 22 degrees of freedom, those of the 24 sets of an image of VGA: slopes that
+# explain more are no chance. The few sets of small images would ask for more.
+_SIGNIFICANT = f_quantile(1, 22)
 # Directions that err one way alone, as those of scanners that turn: cameras show four standard
 # deviations at most.
 _CERTAIN = CERTAIN**2

@@ -26,18 +26,17 @@ from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
-from rangeseg_ros.core.significance import SAMPLES
+from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
-ROUGH = 2.7
-"""Chi-squared of 13 degrees of freedom over its mean, quantile 0.999: what is rougher is no part
-of a plane."""
+ROUGH = chi2_quantile(13) / 13
+"""Chi-squared of 13 degrees of freedom over its mean: what is rougher is no part of a plane."""
 # The same with 9 degrees of freedom, of what one plane through four blocks leaves.
-_BENT = 3.1
+_BENT = chi2_quantile(9) / 9
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
 # Median of chi-squared of 9 degrees of freedom over its mean.
-_MEDIAN = 0.927
+_MEDIAN = chi2_quantile(9, 0.5) / 9
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 

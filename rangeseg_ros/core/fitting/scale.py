@@ -8,11 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 from rangeseg_ros.core.fitting.alike import Sets, alike, median, quantiles
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE
+from rangeseg_ros.core.significance import chi2_quantile
 
 QUANTILE = 0.4
 """Most blocks lie on planes, but edges and curvature only ever add to the residuals."""
@@ -105,4 +105,4 @@ def _chosen(
 @cache
 def _share(freedom: float) -> float:
     """Quantile of chi-squared of so many degrees of freedom over its mean."""
-    return 2 * float(gammaincinv(freedom / 2, QUANTILE)) / freedom
+    return chi2_quantile(freedom, QUANTILE) / freedom

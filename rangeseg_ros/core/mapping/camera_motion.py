@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.tracking.tracker import PERSISTENCE, SHIFT, TURN
+from rangeseg_ros.core.tracking.tracker import PERSISTENCE
 
 
 class Prediction(NamedTuple):
@@ -35,7 +35,12 @@ class Prediction(NamedTuple):
     noise: NDArray[np.float64]
 
 
-def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> Prediction:
+def predict(
+    pose: Transform,
+    velocity: NDArray[np.float64],
+    spread: tuple[float, float],
+    elapsed: float,
+) -> Prediction:
     """Go on with a velocity, which fades.
 
     Parameters
@@ -44,6 +49,8 @@ def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> P
         From the frame of the image.
     velocity : (6,) float64
         In that frame: radians per second, then metres per second.
+    spread : (float, float)
+        Standard deviations of the velocity: radians per second, metres per second.
     elapsed : float
         Seconds.
     """
@@ -61,9 +68,10 @@ def predict(pose: Transform, velocity: NDArray[np.float64], elapsed: float) -> P
     # counts.
     path = PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
     both, speed = PERSISTENCE * (1 - kept) ** 2, 1 - kept**2
-    variance = np.diag(np.repeat([TURN**2, SHIFT**2], 3))
+    turning, going = np.square(spread)
+    variance = np.diag(np.repeat([turning, going], 3))
     across = np.zeros((6, 6))
-    across[:3, :3], across[3:, 3:] = TURN**2 * np.eye(3), SHIFT**2 * turn
+    across[:3, :3], across[3:, 3:] = turning * np.eye(3), going * turn
     noise = np.block([[path * variance, both * across], [both * across.T, speed * variance]])
     moved = turn @ (reach * velocity[3:]) + shift
     return Prediction(Transform(turn @ turned, moved), kept * velocity, change, noise)

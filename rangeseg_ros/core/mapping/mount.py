@@ -11,12 +11,10 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.transforms import quaternion
-from rangeseg_ros.core.significance import OUTLIER
+from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Largest angle between up and -y of the camera, so that no wall is taken for the floor.
 _STEEPEST = np.radians(60.0)
-# Share of the area of the floor from which another plane may be the floor as well.
-_RIVAL = 0.5
 
 
 class Mount(NamedTuple):
@@ -95,7 +93,7 @@ def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount
     doubts = []
     if 2 * floor.observations < frames:
         doubts.append(f'it was found in {floor.observations} of {frames} frames')
-    if len(order) > 1 and weight[order[1]] > _RIVAL * weight[order[0]]:
+    if len(order) > 1 and CLEARLY * weight[order[1]] > weight[order[0]]:
         other = facing[order[1]]
         doubts.append(f'a plane {other.distance:.2f} m below the camera may be the floor as well')
     if OUTLIER * sigma[:2].max() > np.radians(tolerance):

@@ -23,9 +23,6 @@ from rangeseg_ros.core.mapping.transforms import Transform
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
 # frames of a sequence, and 80 % is one in the simulated sensor.
 LASTING = 0.8
-# Overlap in the image from which two observations are of the same pixels, so that small motions to
-# and fro do not count as new looks. From 0.5 to 0.85 the map is as good and as sure of itself.
-ANOTHER = 0.7
 # Samples along a side of a cell of the image, see `views`.
 _SAMPLES = 16
 
@@ -144,7 +141,8 @@ def persistence(
         Share of the variance that is new in this frame all the same.
     """
     alike = np.clip((before * now).sum(axis=1), 0, 1)
-    same = alike >= ANOTHER
+    # Most of them are: small motions to and fro do not count as new looks.
+    same = alike >= 0.5
     return np.where(same, 1.0, alike), np.where(same, 1 - alike**2, 0.0)
 
 

@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.camera_motion import predict
 from rangeseg_ros.core.mapping.observations import (
@@ -40,14 +41,15 @@ from rangeseg_ros.core.mapping.observations import (
 )
 from rangeseg_ros.core.mapping.plane_errors import shifted, tangents, to_errors
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.tracking.tracker import NOMINAL, SHIFT, TURN
+from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.tracking.tracker import NOMINAL
 
 # Planes that count, the largest in the image: with 16 the motion is no better, and less is known
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
-# Quantile 0.999 of chi-squared with three degrees of freedom: what is farther off counts less, and
-# is another plane from then on.
-_GATE = 16.27
+# Chi-squared with three degrees of freedom: what is farther off counts less, and is another plane
+# from then on.
+_GATE = chi2_quantile(3)
 _ROUNDS = 3
 # Errors of the pose and of the velocity come first in the state, then six of each plane.
 _CAMERA, _OWN = 12, 6
@@ -85,17 +87,17 @@ class PlaneOdometry:
 
     Parameters
     ----------
-    frame : str
-        Name of the frame of the odometry.
+    config : Config, optional
+        `odometry_frame`, `camera_turn` and `camera_speed`.
 
     Examples
     --------
-    >>> odometry = PlaneOdometry('odom')
+    >>> odometry = PlaneOdometry(config)
     >>> motion = odometry.add(planes, views(labels, planes, length), stamp, up)
     """
 
-    def __init__(self, frame: str) -> None:
-        self._frame = frame
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
         self._stamp = 0
         self._pose: Transform | None = None
         self._velocity = np.zeros(6)
@@ -103,8 +105,12 @@ class PlaneOdometry:
         self._normal = self._point = np.zeros((0, 3))
         self._axes = np.zeros((0, 2, 3))
         self._view = np.zeros((0, 0))
-        spread = np.repeat([0.0, 0.0, TURN**2, SHIFT**2], 3)
-        self._covariance = np.diag(spread)
+        self._covariance = np.diag(np.repeat([0.0, 0.0, *np.square(self._spread)], 3))
+
+    @property
+    def _spread(self) -> tuple[float, float]:
+        """Of the velocity, see `predict`."""
+        return float(np.radians(self.config.camera_turn)), self.config.camera_speed
 
     def add(
         self,
@@ -152,7 +158,7 @@ class PlaneOdometry:
         # Velocities: turning and going change places only.
         places = np.r_[9:12, 6:9]
         return Motion(
-            self._frame,
+            self.config.odometry_frame,
             self._pose,
             swap @ self._covariance[:6, :6] @ swap.T,
             np.roll(self._velocity, 3),
@@ -163,7 +169,9 @@ class PlaneOdometry:
     def _predict(self, elapsed: float) -> None:
         """Go on with the velocity."""
         assert self._pose is not None
-        self._pose, self._velocity, change, noise = predict(self._pose, self._velocity, elapsed)
+        self._pose, self._velocity, change, noise = predict(
+            self._pose, self._velocity, self._spread, elapsed
+        )
         self._covariance[:_CAMERA] = change @ self._covariance[:_CAMERA]
         self._covariance[:, :_CAMERA] = self._covariance[:, :_CAMERA] @ change.T
         self._covariance[:_CAMERA, :_CAMERA] += noise

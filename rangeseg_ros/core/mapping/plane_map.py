@@ -31,13 +31,12 @@ from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.tracking.tracker import NOMINAL, SURE_TURN
+from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.tracking.tracker import NOMINAL
+from rangeseg_ros.core.tracking.tracks import FARTHEST, SURE_TURN
 
-# Quantile 0.999 of chi-squared with the three degrees of freedom of a plane.
-_GATE = 16.27
-# Largest offset, as share of the range, of what may be one plane: beyond is no error of the sensor
-# but another plane, however uncertain both are; so it is beyond `SURE_TURN`.
-_FARTHEST = 0.1
+# Chi-squared with the three degrees of freedom of a plane.
+_GATE = chi2_quantile(3)
 # Share of the planes in sight whose outlines a frame adds to: at 30 Hz each has its turn four
 # times a second, and the work in a frame is bounded.
 _LOOKED_AT = 1 / 8
@@ -144,7 +143,7 @@ class PlaneMap:
             return match, None
         gap = filters.normal @ seen.centroid.T + filters.distance[:, None]
         close = filters.normal @ seen.plane[:, :3].T > np.cos(SURE_TURN)
-        close &= np.abs(gap) < _FARTHEST * seen.range
+        close &= np.abs(gap) < FARTHEST * seen.range
         index, which = np.nonzero(close)
         if not len(index):
             return match, None
@@ -223,7 +222,7 @@ class PlaneMap:
         assert filters is not None
         gone: list[int] = []
         grown = [k for k, record in enumerate(self._records) if record.united == self._time]
-        for k, m in filters.alike(np.array(grown), camera, _GATE, SURE_TURN, _FARTHEST):
+        for k, m in filters.alike(np.array(grown), camera, _GATE, SURE_TURN, FARTHEST):
             if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
                 continue
             kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)

@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.under_robot import FEWEST
+from rangeseg_ros.core.significance import SAMPLES
 
 
 def around(where: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -38,14 +38,14 @@ def sides_of(
     # Cells in the order of their surfaces.
     start = np.zeros(count + 2, np.int64)
     for k in range(count + 1):
-        start[k + 1] = start[k] + (sizes[k] if sizes[k] >= FEWEST else 0)
+        start[k + 1] = start[k] + (sizes[k] if sizes[k] >= SAMPLES else 0)
     heights = np.empty(start[-1], np.float32)
     noises = np.empty(start[-1], np.float32)
     filled = np.zeros(count + 1, np.int64)
     for i in range(surface.shape[0]):
         for c in range(surface.shape[1]):
             k = surface[i, c]
-            if sizes[k] >= FEWEST and (near[i, c] or beside[k] < FEWEST):
+            if sizes[k] >= SAMPLES and (near[i, c] or beside[k] < SAMPLES):
                 heights[start[k] + filled[k]] = height[i, c]
                 noises[start[k] + filled[k]] = unsure[i, c]
                 filled[k] += 1

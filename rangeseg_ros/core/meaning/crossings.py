@@ -18,8 +18,6 @@ from rangeseg_ros.core.sensing.rays import completed_rays
 
 # Pixels that an outline may differ from the border of the ground.
 _TOLERANCE = 2.0
-# Shorter outlines are holes of single pixels.
-_SHORTEST = 24
 
 
 def find_crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> NDArray:
@@ -85,8 +83,8 @@ def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
     run_rows(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
     lines = []
     for ring in rings:
-        if len(ring) >= _SHORTEST:
-            columns, rows = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0].T
+        columns, rows = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0].T
+        if len(rows) > 2:  # holes of single pixels have no outline
             values = inverse[rows, columns]
             ahead = values > 0
             lines.append(image.rays[rows, columns][ahead] / values[ahead, None])

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.beside import around, sides_of
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, cells_of
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
@@ -23,9 +24,10 @@ from rangeseg_ros.core.meaning.ground_field import (
 )
 from rangeseg_ros.core.meaning.growth import grown, nearest_part
 from rangeseg_ros.core.meaning.pixels import Said, pixels_of
-from rangeseg_ros.core.meaning.under_robot import FEWEST, TILT, Stand, stand
+from rangeseg_ros.core.meaning.under_robot import Stand, stand
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.significance import SAMPLES
 
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
@@ -44,11 +46,14 @@ class Limits(NamedTuple):
         What stands so high is an obstacle, metres.
     drop : float
         What lies so deep is a drop, metres.
+    tilt : float
+        Standard deviation of the direction that is up, radians.
     """
 
     slope: float
     obstacle: float
     drop: float
+    tilt: float = float(np.radians(Config().up_noise))
 
 
 class CellTerrain(NamedTuple):
@@ -159,10 +164,10 @@ def _terrain(
     cells = cells_of(image, size, up, sensor)
     noise = noise_of(cells, sensor)
     least = min(limits.obstacle, limits.drop)
-    slope = float(np.tan(limits.slope + TILT))
+    slope = float(np.tan(limits.slope + limits.tilt))
     steps = Steps.of(slope, least, noise, sensor.correlation / size.rows)
     surface, count, steep, broken = surfaces_of(cells, steps)
-    under = stand(cells, surface, count, up, sensor, known, limits.slope)
+    under = stand(cells, surface, count, up, sensor, known, limits.slope, limits.tilt)
     if under.surface == 0:
         return _without_ground(image, cells, size, steep, up, known, limits)
     flat = GroundField.of(under.theta[None, None], size, up)
@@ -185,7 +190,7 @@ def _terrain(
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
     sizes, side, blur = sides_of(height, unsure, surface, around(ground), count)
-    large = sizes >= FEWEST
+    large = sizes >= SAMPLES
     # Beyond an edge, where the noise would hide a drop, it is not known what is level.
     hidden = beyond & (blur > limits.drop - steps.least)
     level = large & (np.abs(side) <= steps.least) & ~hidden
@@ -233,7 +238,7 @@ def _without_ground(
     height, doubt = known
     if height > 0:
         reach = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + _CERTAIN * (doubt + TILT * reach)
+        bound = limits.obstacle + _CERTAIN * (doubt + limits.tilt * reach)
         obstacle |= cells.place[0] + height > bound
     wide = obstacle.repeat(size.rows, axis=0).repeat(size.columns, axis=1)
     wide = wide[: image.shape[0], : image.shape[1]]

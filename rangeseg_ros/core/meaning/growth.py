@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
 from rangeseg_ros.core.meaning.continuity import BROAD, Steps
-from rangeseg_ros.core.meaning.under_robot import solve_plane
+from rangeseg_ros.core.meaning.under_robot import NEAR, solve_plane
+from rangeseg_ros.core.significance import CERTAIN
 
 ROWS, COLUMNS = 2, 2
 """Cells of a tile, along columns and rows."""
@@ -24,12 +25,8 @@ _BESIDE = (2, 1)
 _HIGH = 4
 # Cells that make a prediction: as many as two tiles have.
 _ENOUGH = 8
-# Metres of the ground, from where it comes into view, that it is grown from.
-_START = 0.25
 # Cells that tell its plane.
 _PLENTY = 300
-# Spread of the ground's slope that a prediction starts from: that of undulation.
-_SLOPE = 0.05
 
 
 @njit(cache=True, nogil=True)
@@ -47,7 +44,8 @@ def nearest_part(
         for c in range(columns):
             if surface[i, c] == chosen:
                 nearest = min(nearest, place[1, i, c] ** 2 + place[2, i, c] ** 2)
-    reach = (np.sqrt(nearest) + _START) ** 2
+    # It is grown from what is near to where it comes into view.
+    reach = (np.sqrt(nearest) + NEAR) ** 2
     near = np.zeros((rows, columns), np.bool_)
     count = 0
     for i in range(rows):
@@ -174,7 +172,8 @@ def _grow_tile(
     w = total[0]
     x, y, h = total[1] / w, total[2] / w, total[6] / w
     # The weights are those of the sensor model, which the image shows to err by a factor.
-    prior = (steps.noise[BROAD] / _SLOPE) ** 2
+    # It starts from level: steeper than the steepest ground is certainly none.
+    prior = (steps.noise[BROAD] * CERTAIN / steps.slope) ** 2
     xx, xy, yy = (
         total[3] - w * x * x + prior,
         total[4] - w * x * y,

@@ -11,8 +11,6 @@ from collections.abc import Callable
 
 from rangeseg_ros.core.meaning.ground import Terrain
 
-# How well the height is remembered, metres: a robot nods, and a floor undulates.
-_DOUBT = 0.05
 # From this confidence on a height is worth remembering: most of the half that remains of it for a
 # surface which fills the view.
 _SURE = 0.4
@@ -39,7 +37,9 @@ class GroundMemory:
         self._height = 0.0
         self._doubted: int | None = None
 
-    def terrain(self, find: Callable[[tuple[float, float]], Terrain], stamp: int) -> Terrain:
+    def terrain(
+        self, find: Callable[[tuple[float, float]], Terrain], doubt: float, stamp: int
+    ) -> Terrain:
         """Terrain of the next image, found with what is remembered, which it then adds to.
 
         Parameters
@@ -47,16 +47,18 @@ class GroundMemory:
         find : callable
             Finds it: gets the height of the camera and its standard deviation, metres; 0, 0 when
             nothing is known.
+        doubt : float
+            How well the height is remembered, metres.
         stamp : int
             Of the image, nanoseconds.
         """
         if not self._height:
             return self._remembered(find((0.0, 0.0)))
-        found = find((self._height, _DOUBT))
+        found = find((self._height, doubt))
         if found.stand.surface:
             return self._remembered(found)
         other = find((0.0, 0.0))
-        deeper = other.stand.height(other.field.up) > self._height + 2 * _DOUBT
+        deeper = other.stand.height(other.field.up) > self._height + 2 * doubt
         if not deeper or other.stand.confidence < _SURE:
             self._doubted = None
         elif self._doubted is None:

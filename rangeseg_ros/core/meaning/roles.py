@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.meaning.stairs import RISE
-from rangeseg_ros.core.meaning.under_robot import TILT
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
@@ -79,7 +78,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         found[upward & (offset < -config.role_height)] = 'lower'
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
-        ramp = (slope > np.degrees(2 * TILT)) & (slope <= config.ground_slope)
+        ramp = (slope > 2 * config.up_noise) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
             foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
             if foot <= config.role_height:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.cells import axes_of
 from rangeseg_ros.core.meaning.classes import GROUND
 from rangeseg_ros.core.meaning.ground import CellTerrain, Terrain
-from rangeseg_ros.core.meaning.under_robot import FEWEST
+from rangeseg_ros.core.significance import SAMPLES
 
 RISE, _RUN = (0.08, 0.25), (0.2, 0.42)
 """Rise and run of stairs, metres: what people climb, with a margin.
@@ -28,10 +28,9 @@ ISO 21542 asks for 0.15 to 0.18 and 0.26 to 0.30.
 """
 # Tangents of the flattest and the steepest stairs: what is flatter is level.
 _FLATTEST, _STEEPEST = RISE[0] / _RUN[1], RISE[1] / _RUN[0]
-# Narrowest staircase, metres.
-_NARROWEST = 0.4
-# Treads and noses are within so much of a rise and a run of where they should be.
-_UNEVEN = 0.25
+# Treads and noses are within so much of a rise and a run of where they should be: nearer to that
+# than to the middle between two.
+_UNEVEN = 1 / 4
 # The histogram of heights: width of a bin, and its end, metres.
 _BIN, _HIGHEST = 0.005, 2.5
 
@@ -146,7 +145,7 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
 def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
     """The period of a histogram of heights, and how many periods there are from its start.
 
-    A tread has at least `FEWEST` cells, twice as many in the half of a period around its height
+    A tread has at least `SAMPLES` cells, twice as many in the half of a period around its height
     as in the other half, and is the better the nearer they are to it.
     """
     rise, count, most = 0.0, 0, 0.0
@@ -164,7 +163,7 @@ def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
                     apart += far * sums[b]
                 else:
                     off += sums[b]
-            if on < FEWEST or on < 2 * off:
+            if on < SAMPLES or on < 2 * off:
                 break
             treads += 1
             score += 1 - apart / on / (_UNEVEN * period)
@@ -231,7 +230,7 @@ def _staircase(
     seen = _Noses(number, place)
     first = int(sign > 0)
     # Treads that follow each other, each with a nose but the landing at the foot of stairs down.
-    enough = np.bincount(number, minlength=count + 1) >= FEWEST
+    enough = np.bincount(number, minlength=count + 1) >= SAMPLES
     last = first
     while last <= count and enough[last]:
         last += 1
@@ -248,7 +247,7 @@ def _staircase(
     sides = []
     for k in range(first, last):
         here = fits & (seen.number == k)
-        if here.sum() < FEWEST:
+        if here.sum() < SAMPLES:
             return None
         sides.append(np.quantile(seen.place[here] @ across, (0.02, 0.98)))
     # Boxes of several heights stand side by side, treads one behind the other.
@@ -259,7 +258,7 @@ def _staircase(
     if sign < 0:  # columns of cells that leave the stairs at their side see no nose there
         ends = np.quantile(across @ cells.place[1:, tread == 1], (0.02, 0.98))
     width = float(ends[1] - ends[0])
-    if width < _NARROWEST:
+    if width < run:  # treads are wider than deep
         return None
     treads = last - first  # going down, there is one beyond each nose
     levels = np.array([np.median(level[tread == k]) for k in range(1, treads + 1)])

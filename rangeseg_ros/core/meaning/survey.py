@@ -11,7 +11,6 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
 from rangeseg_ros.core.meaning.memory import GroundMemory
 from rangeseg_ros.core.meaning.roles import unit
-from rangeseg_ros.core.meaning.under_robot import HEIGHT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -28,6 +27,8 @@ class Survey:
         Unit vector in the frame of the image.
     sensor_height : float
         Above the ground below the sensor, metres; 0 = unknown.
+    height_noise : float
+        Its standard deviation, metres.
     limits : Limits
     memory : GroundMemory, optional
         Of the images before, for a height that is unknown.
@@ -39,6 +40,7 @@ class Survey:
     sensor: SensorModel
     up: NDArray[np.float64]
     sensor_height: float
+    height_noise: float
     limits: Limits
     memory: GroundMemory | None = None
     stamp: int = 0
@@ -49,18 +51,24 @@ class Survey:
     ) -> Survey:
         """With the parameters of `config`, and its direction `up` when none is given."""
         limits = Limits(
-            float(np.radians(config.ground_slope)), config.obstacle_height, config.drop_height
+            float(np.radians(config.ground_slope)),
+            config.obstacle_height,
+            config.drop_height,
+            float(np.radians(config.up_noise)),
         )
         direction = unit((config.up_x, config.up_y, config.up_z) if up is None else up)
-        return cls(image, sensor, direction, config.sensor_height, limits)
+        height = config.sensor_height, config.sensor_height_noise
+        return cls(image, sensor, direction, *height, limits)
 
     def terrain(self) -> Terrain:
         """Find it."""
         if self.sensor_height > 0:
-            return self._found((self.sensor_height, HEIGHT))
+            return self._found((self.sensor_height, self.height_noise))
         if self.memory is None:
             return self._found((0.0, 0.0))
-        return self.memory.terrain(self._found, self.stamp)
+        # A robot nods and a floor undulates, by less than an obstacle is high.
+        doubt = min(self.limits.obstacle, self.limits.drop)
+        return self.memory.terrain(self._found, doubt, self.stamp)
 
     def _found(self, known: tuple[float, float]) -> Terrain:
         return terrain_of(self.image, self.sensor, self.up, known, self.limits)

@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.significance import CLEARLY
 
-# Largest tilt that is looked for, degrees: beyond 45, a floor is nearer to a wall.
-_LARGEST = 40.0
-# How many times more pixels must speak for the planes' direction alone than for the stated one.
-_CLEARLY = 1.5
+# Largest tilt that is looked for, degrees: beyond, a floor is nearer to a wall.
+_LARGEST = 45.0
 
 
 class Tilt(NamedTuple):
@@ -77,7 +76,7 @@ def tilt_of(
         alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()
         whole = 2 * pixels[seen].sum() >= pixels.sum()  # most of what is seen
         # The area last: it is worked out when asked for.
-        if whole and alone[0] > _CLEARLY * alone[1] and planes[k].area >= area:
+        if whole and alone[0] > CLEARLY * alone[1] and planes[k].area >= area:
             found.append((float(alone[0]), k))
     if not found:
         return None

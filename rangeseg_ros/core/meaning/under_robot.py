@@ -16,16 +16,13 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.cells import Cells, axes_of
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.significance import SAMPLES
 
-HEIGHT, TILT = 0.015, float(np.radians(1.5))
-"""How well a robot knows its camera: standard deviations of height, metres, and tilt, radians."""
-FEWEST = 12
-"""Cells that can be a ground: less is the foot of something."""
 # Metres of a surface, from where it begins, that tell its plane under the robot; fewer when the
 # ground begins with a ramp.
 _WAYS = (0.7, 0.2)
-# What makes a surface less probable by a factor e: that much farther away, metres.
-_FARTHER = 0.25
+NEAR = 0.25
+"""Metres that are near: a surface so much farther away is less probable by a factor e."""
 # How probable it is that the robot stands on a ramp, or a ramp begins before the ground is seen.
 _RAMP = 0.02
 # The squared deviation, in variances, from which what is known and what is seen contradict.
@@ -65,8 +62,11 @@ def stand(
     sensor: SensorModel,
     known: tuple[float, float],
     slope: float,
+    tilt: float,
 ) -> Stand:
     """Find the surface under the robot.
+
+    More than seven parameters: the last four are what is known beforehand, each by itself.
 
     The probability of a surface is its size, times how well what is known agrees with it, and
     less for what is farther away than others. Without a height, it is the surface that reaches
@@ -86,26 +86,28 @@ def stand(
         when nothing is known.
     slope : float
         Steepest ground, radians.
+    tilt : float
+        Standard deviation of `up`, radians.
     """
     height, doubt = known
     sizes, reach, steepest = _reaches(cells, surface, count + 1)
     order = np.argsort(-sizes, kind='stable')[:_MOST]
-    order = order[sizes[order] >= FEWEST]
+    order = order[sizes[order] >= SAMPLES]
     if not len(order):
         return Stand(0, np.zeros(3), 0.0)
     rank = np.full(len(sizes), -1)
     rank[order] = np.arange(len(order))
     sums = _sums(cells, surface, rank, reach, sensor, height)
-    base = np.log(sizes[order]) - (reach[order] - reach[order].min()) / _FARTHER
+    base = np.log(sizes[order]) - (reach[order] - reach[order].min()) / NEAR
     if height == 0:
         # A metre farther from below the sensor, for each metre of its height.
-        base -= steepest[order] / _FARTHER
-    scores, planes = _scores(sums, base, height, doubt or 1e3, slope)
+        base -= steepest[order] / NEAR
+    scores, planes = _scores(sums, base, height, doubt or 1e3, slope, tilt)
     winner = int(np.argmax(scores))
     if scores[winner] == -np.inf:
         return Stand(0, np.zeros(3), 0.0)
-    below, *tilt = planes[winner]
-    theta = -(up - np.array(tilt) @ axes_of(up)[1:]) / (height - below)
+    below, *lean = planes[winner]
+    theta = -(up - np.array(lean) @ axes_of(up)[1:]) / (height - below)
     share = np.exp(scores - scores[winner])
     return Stand(int(order[winner]), theta, float(1 / share.sum()))
 
@@ -179,6 +181,7 @@ def _scores(
     height: float,
     doubt: float,
     slope: float,
+    tilt: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Logarithms of the probabilities of surfaces, and what each errs by if it is the ground.
 
@@ -190,8 +193,8 @@ def _scores(
         Logarithms of the probabilities but for what is known.
     height, doubt : float
         Of the sensor, and its standard deviation, metres.
-    slope : float
-        Steepest ground, radians.
+    slope, tilt : float
+        Steepest ground, and the standard deviation of up, radians.
 
     Returns
     -------
@@ -204,8 +207,8 @@ def _scores(
     planes = np.zeros((len(base), 3))
     for k in range(len(base)):
         # Level ground, a ramp, and a ramp that is left soon.
-        for way, tilt, rarity in ((0, TILT, 1.0), (0, slope, _RAMP), (1, TILT, _RAMP)):
-            a, b, c, misfit = _solved(sums[k, way], doubt, tilt)
+        for way, lean, rarity in ((0, tilt, 1.0), (0, slope, _RAMP), (1, tilt, _RAMP)):
+            a, b, c, misfit = _solved(sums[k, way], doubt, lean)
             score = base[k] - misfit / 2 + np.log(rarity)
             # Nothing less than 2 cm below is a ground.
             if misfit < _MISFIT and height - a > 0.02 and score > scores[k]:

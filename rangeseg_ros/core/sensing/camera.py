@@ -110,6 +110,8 @@ class Camera:
     ) -> Camera:
         """Camera of an image described by a CameraInfo message, whose fields the parameters are.
 
+        More than seven parameters, as the message has as many that describe a camera.
+
         Rectified images are described by P, raw ones by K and the lens. A lens that distorts,
         beside the P of rectified images, is left out with a `CameraWarning`.
 

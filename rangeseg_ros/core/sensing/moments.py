@@ -34,6 +34,39 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
     return aa, bb, cc, dd, ee, ff, a * aa + b * bb + c * cc
 
 
+@njit(cache=True, inline='always')
+def add_pixel(
+    moments: NDArray[np.float64],
+    ray: NDArray[np.float32],
+    inverse: float,
+    weight: float,
+    ratio: float,
+) -> None:
+    """Add a pixel to a moment vector (13,).
+
+    Sums of all pixels of an image, in blocks and cells, are kept in variables of their own: in an
+    array they would go through memory for every pixel.
+
+    Parameters
+    ----------
+    ray : (3,) float32
+    inverse : float
+        Inverse range, 1/m.
+    weight : float
+        1 / random variance of that, times the pixels that it stands for.
+    ratio : float
+        Of the systematic to the random variance, times these.
+    """
+    entry = 0
+    for m in range(3):
+        for n in range(m, 3):
+            moments[entry] += weight * ray[m] * ray[n]
+            entry += 1
+        moments[6 + m] += weight * ray[m] * inverse
+    moments[CHI2] += weight * inverse * inverse
+    moments[RATIO] += ratio
+
+
 @njit(cache=True)
 def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     """Least-squares plane of a moment vector.

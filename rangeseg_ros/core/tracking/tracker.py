@@ -19,6 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.tracking.tracks import (
+    SURE_TURN,
     Tracks,
     are_near,
     distances,
@@ -37,16 +38,15 @@ _GATE = 20.0
 _UNSEEN_OVERLAP = 0.1
 # Seconds in which a plane must have been seen to be as good as older ones, and what it counts
 # with until then: what looks like a new plane at first may be a part of one that is about to go.
-_TRIAL, _ON_TRIAL = 0.32, 0.05
-# Standard deviations of the camera's motion, in radians and metres per second: of a hand as quick
-# as can be while depth is still measured. They count only where planes leave the motion open.
-TURN, SHIFT = np.radians(60.0), 0.9
+# It counts less than an older one out of sight.
+_TRIAL, _ON_TRIAL = 0.32, _UNSEEN_OVERLAP / 2
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# Least intersection over union, and largest changes, of planes the motion is estimated from: the
-# equations are linear in it, and larger changes are rather another plane.
-_SURE_OVERLAP, SURE_TURN, _SURE_SHIFT = 0.3, np.radians(15.0), 0.2
+# Least intersection over union of planes the motion is estimated from. The equations are linear in
+# it, and larger changes than a turn of `SURE_TURN`, and a shift in the time of such a turn, are
+# rather another plane.
+_SURE_OVERLAP = 0.3
 _MOTION_ROUNDS = 3
 
 
@@ -69,7 +69,7 @@ class Tracker:
     Parameters
     ----------
     config : Config, optional
-        `track_time`.
+        `track_time`, `camera_turn` and `camera_speed`.
 
     Attributes
     ----------
@@ -129,15 +129,19 @@ class Tracker:
         samples = samples_of(labels, planes)
         seen, known = Tracks.of(planes, samples, elapsed), self._tracks
         shared = shared_samples(known, samples, len(planes))
+        speed = np.array([np.radians(self.config.camera_turn), self.config.camera_speed])
         if motion:
             # Where the frames that tell the motion jump, the planes know better: most of those
             # that stay where they were without it.
             moved = known.moved(*motion)
-            sure = [int(_sure_pairs(tracks, seen, shared).sum()) for tracks in (moved, known)]
+            sure = [
+                int(_sure_pairs(tracks, seen, shared, speed).sum()) for tracks in (moved, known)
+            ]
             self.contradicted = 2 * sure[0] < sure[1]
             if not self.contradicted:
                 known = moved
-        known = known.moved(*_camera_motion(known, seen, shared, elapsed))
+        reach = min(max(elapsed, NOMINAL), PERSISTENCE)
+        known = known.moved(*_camera_motion(known, seen, shared, speed, reach))
         distance = distances(known, seen)
         match = _assign(known, seen, shared, distance)
         seen.id[:] = _oldest(known, match, shared, distance)
@@ -189,22 +193,26 @@ def _groups(planes: Sequence[Plane]) -> list[list[int]]:
 
 
 def _camera_motion(
-    known: Tracks, seen: Tracks, shared: NDArray[np.intp], elapsed: float
+    known: Tracks,
+    seen: Tracks,
+    shared: NDArray[np.intp],
+    speed: NDArray[np.float64],
+    reach: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation and shift that take points of the last frame, `elapsed` seconds ago, to this one.
+    """Rotation and shift that take points of the last frame to this one.
 
     With a small rotation w and a shift v, a plane's normal n changes by w x n and the centroid c
     of the plane that is seen comes to lie n.c + d + w.(n x c) - n.v off it: linear least squares
     over the planes that overlap most with each other, weighted by their variances, and those
     that fit badly (things that move by themselves) less. Directions in which the planes leave
-    the motion open are held by a prior of zero.
+    the motion open are held by a prior of zero, with standard deviations of `reach` seconds at
+    `speed`, radians and metres per second.
     """
-    t, s = np.nonzero(_sure_pairs(known, seen, shared))
+    t, s = np.nonzero(_sure_pairs(known, seen, shared, speed))
     angle, offset = (variance[t, s] for variance in variances(known, seen))
     start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
-    reach = min(max(elapsed, NOMINAL), PERSISTENCE)
-    prior = np.diag(np.repeat([(reach * TURN) ** -2, (reach * SHIFT) ** -2], 3))
+    prior = np.diag(np.repeat((reach * speed) ** -2.0, 3))
     for _ in range(_MOTION_ROUNDS):
         n = start @ rotation.T
         turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
@@ -223,13 +231,16 @@ def _camera_motion(
     return rotation, shift
 
 
-def _sure_pairs(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.bool_]:
+def _sure_pairs(
+    known: Tracks, seen: Tracks, shared: NDArray[np.intp], speed: NDArray[np.float64]
+) -> NDArray[np.bool_]:
     """(T, N) whether planes overlap most with each other and agree."""
     overlap = overlaps(known, seen, shared) * (known.unseen == 0)[:, None]
     best = overlap == np.maximum(
         overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
     )
-    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < _SURE_SHIFT)
+    shift = SURE_TURN / speed[0] * speed[1]
+    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < shift)
     result: NDArray[np.bool_] = sure & (known.normal @ seen.normal.T > np.cos(SURE_TURN))
     return result
 

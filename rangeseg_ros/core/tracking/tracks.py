@@ -19,8 +19,13 @@ _SAMPLES = 60
 # distortion of a Kinect is there), and an angle, at least and for an offset over the plane's
 # radius.
 OFFSET, ANGLE = 0.007, np.radians(1.0)
+SURE_TURN, FARTHEST = np.radians(15.0), 0.1
+"""Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
+
+Beyond is no error of the sensor but another plane, however uncertain both are.
+"""
 # Larger standard deviations do not count: what is known of such planes fits anything.
-_LARGEST_OFFSET, _LARGEST_ANGLE = 0.03, np.radians(5.0)
+_LARGEST_OFFSET, _LARGEST_ANGLE = FARTHEST / 3, SURE_TURN / 3
 # Area in square metres that a plane counts with at least, so that its radius is not 0.
 _SMALLEST = 1e-4
 
