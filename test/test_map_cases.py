@@ -5,9 +5,9 @@ import pickle
 import numpy as np
 import pytest
 import shapely
+from planes_of_labels import fit_planes
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import fit_planes
 from rangeseg_ros.core.mapping.evidence import Evidence
 from rangeseg_ros.core.mapping.map_outlines import unite_outlines, widened
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
