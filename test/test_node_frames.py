@@ -255,6 +255,8 @@ def robot(tf_messages):
 def send(robot, x, before=0.02, after=0.02, lag=0.0):
     """An image between two transforms, which may come late; planes and header of the answer."""
     bench = robot.bench
+    if lag:
+        bench.spin(2 * after)  # beyond the transforms of the image before
     image = bench.image(floor_depth(bench.camera))
     stamp = image.header.stamp
     bench.camera_info.publish(bench.info())

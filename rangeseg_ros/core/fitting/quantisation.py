@@ -7,7 +7,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import ranked
-from rangeseg_ros.core.significance import LEVEL
 
 # Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
 # one.
@@ -16,6 +15,10 @@ _ROWS, _SMALLEST = 40, 0.1
 _PAIRS = 40
 # Steps of one quantum for each that is neither one nor two.
 _CLEAR = 4.0
+# Steps that are no jump, as share of the range: that of a Kinect is 2 % at 8 m.
+_COARSEST = 0.05
+# Pairs of neighbours that rounding makes the same, for each that it does not, at least.
+_SAME = 0.05
 
 
 @njit(cache=True, nogil=True)
@@ -44,12 +47,12 @@ def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
                 continue
             if here == there:
                 same += 1
-            else:
+            elif abs(here - there) < np.float32(_COARSEST) * here:
                 step[unlike] = abs(np.float64(here) - np.float64(there))
                 in_range[unlike] = step[unlike] / (np.float64(here) * np.float64(there))
                 unlike += 1
-    # Without rounding neighbours are the same by chance alone.
-    if unlike < _PAIRS or same < (1 - LEVEL) * unlike:
+    # Without rounding neighbours are hardly ever the same.
+    if unlike < _PAIRS or same < _SAME * unlike:
         return 0.0, 0.0
     quantum, clear = _common_step(step[:unlike])
     range_quantum, range_clear = _common_step(in_range[:unlike])
