@@ -16,8 +16,10 @@ from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.discovery import Kernel
 from rangeseg_ros.compilation.preparation import needs, prepare
 from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
+from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.simulation.kinect import kinect_camera
+from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
 
 WORKER = [sys.executable, '-m', 'rangeseg_ros.compilation.worker']
 
@@ -56,6 +58,17 @@ def test_frames_need_nothing_more(method, shape):
     with preparation._nothing_compiled():
         for each in (image, RangeImage.from_points(image.points)):
             SequenceSegmenter(config).segment(each, 0)
+
+
+@pytest.mark.parametrize('budget', STEPS[1:])
+def test_less_of_the_work_needs_nothing_more(budget):
+    """Budgets change while frames come."""
+    prepare(Config(), report=silent)
+    camera = kinect_camera(161, 121)
+    image = RangeImage.from_depth(simulate_kinect(kinect_room(2), camera, seed=2).depth, camera)
+    with preparation._nothing_compiled():
+        for each in (image, RangeImage.from_points(image.points)):
+            SequenceSegmenter(Config(work_budget=budget)).segment(each, 0)
 
 
 def test_what_is_found_is_what_a_run_compiles(worker):

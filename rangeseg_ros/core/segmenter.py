@@ -85,6 +85,8 @@ class Segmentation:
         How the ground is found, or what was found.
     upright : tuple of 3 float
         Tolerance, smallest area and slope of `tilt_of`.
+    work_budget : float
+        Share of the full work that the image was given: with the same, its labels are the same.
     """
 
     labels: NDArray[np.uint16]
@@ -96,6 +98,7 @@ class Segmentation:
     jumps: GridEdges | None = field(default=None, repr=False)
     survey: Survey | Terrain | None = field(default=None, repr=False)
     upright: tuple[float, float, float] | None = None
+    work_budget: float = 1.0
 
     @cached_property
     def tilt(self) -> Tilt | None:
@@ -247,9 +250,8 @@ class Segmenter:
         survey = Survey.of(image, sensor, config)
         laps = watch.laps
         upright = config.role_tolerance, config.role_area, config.ground_slope
-        return Segmentation(
-            labels, planes, laps, reason, sensor, labelling, jumps, survey, upright
-        )
+        found = jumps, survey, upright, config.work_budget
+        return Segmentation(labels, planes, laps, reason, sensor, labelling, *found)
 
     def _by_planes(
         self,

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 # Makes a message from the name of its type and all its fields, e.g.
-# make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=1.0); octets are given as uint8 arrays.
+# make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=1.0); octets are given as uint8 arrays, and a
+# single one as np.uint8.
 Make = Callable[..., Any]
 
 
@@ -26,6 +27,8 @@ def make_rclpy(kind: str, **fields: Any) -> Any:
         if isinstance(value, np.ndarray) and value.dtype == np.uint8:
             fields[name] = array('B')
             fields[name].frombytes(np.ascontiguousarray(value))
+        elif isinstance(value, np.uint8):
+            fields[name] = bytes([value])
     return message_class(kind)(**fields)
 
 

@@ -22,6 +22,7 @@ from rangeseg_ros.messages.clouds import planes_message, points_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
 from rangeseg_ros.messages.markers import markers_message, outline_message, stairs_message
+from rangeseg_ros.messages.status import status_message
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,10 @@ def _stairs(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
     return stairs_message(make, header, result.stairs)
 
 
+def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return status_message(make, header, result)
+
+
 OUTPUTS = {
     'labels': Output('sensor_msgs/msg/Image', _labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
@@ -128,6 +133,7 @@ OUTPUTS = {
     'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': Output('visualization_msgs/msg/MarkerArray', _outline),
     'stairs': Output('visualization_msgs/msg/MarkerArray', _stairs),
+    'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
 }
 
 IN_TARGET = frozenset({'planes', 'markers'})

@@ -108,6 +108,8 @@ class FrameStatistics:
         Why there is none.
     sensor : str
         Errors of the sensor as the last frame shows them.
+    work_budget : float
+        Share of the work that the last frame was given.
     tilt : str
         Where the planes of the last frame say that up is; empty when they agree with it.
     ground, stairs : str
@@ -129,6 +131,7 @@ class FrameStatistics:
         self.planes = 0
         self.reason = ''
         self.sensor = ''
+        self.work_budget = 1.0
         self.tilt = ''
         self.ground = ''
         self.stairs = ''
@@ -178,6 +181,7 @@ class FrameStatistics:
             'planes': str(self.planes),
             'reason for no planes': self.reason,
             'sensor': self.sensor,
+            'work_budget': f'{self.work_budget:g}',
             'ground': self.ground,
             'stairs': self.stairs,
         }

@@ -39,6 +39,13 @@ class NodeConfig(Config):
         'take up from the accelerometer on the topic imu, in the frame of the images or one that '
         'tf leads from, where gravity_frame does not tell, instead of up_x, up_y, up_z',
     )
+    target_rate: float = option(
+        0.0,
+        'method planes: frames per second to be held by doing less of the work, down from '
+        'work_budget; 0 = off. ~/status tells with which share of the work each frame was made',
+        low=0.0,
+        high=1000.0,
+    )
     stall_timeout: float = option(
         2.0,
         'seconds without a depth image while somebody listens, or with images and without an '
@@ -46,6 +53,11 @@ class NodeConfig(Config):
         low=0.1,
         high=3600.0,
     )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.target_rate > 0 and (self.method != 'planes' or self.exact):
+            raise ConfigError('parameter target_rate is for method planes, without exact')
 
 
 def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:

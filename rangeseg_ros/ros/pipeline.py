@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Mapping
+from dataclasses import replace
 from itertools import pairwise
 from threading import Thread
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.runtime.memory import give_back_memory
+from rangeseg_ros.core.runtime.pace import Pace
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -112,16 +114,22 @@ class Pipeline:
     def _segment_all(self) -> None:
         if (config := self._settings.in_use()) is None:
             return
+        given = config
         sequence = SequenceSegmenter(config)
+        pace = Pace(config.target_rate, config.work_budget)
         while taken := self._frames.take():
+            began = time.perf_counter()
             frame, dropped = taken
             if dropped:
                 self._statistics.dropped.add(dropped)
             # Here and not where parameters change, so that one frame is of one configuration.
             if (config := self._settings.in_use()) is None:
                 return
-            if config is not sequence.config:
-                sequence.config = config
+            if (config.target_rate, config.work_budget) != (pace.rate, pace.most):
+                pace = Pace(config.target_rate, config.work_budget)
+            if config is not given or pace.budget != sequence.config.work_budget:
+                given = config
+                sequence.config = replace(config, work_budget=pace.budget)
             try:
                 result = self._segment(sequence, frame)
                 self._statistics.problem = ''
@@ -132,6 +140,8 @@ class Pipeline:
                 self._fail(error)
             else:
                 self._results.put(result)
+                refining = sum(result.segmentation.timings.values()) / 1000
+                pace.add(refining, time.perf_counter() - began - refining)
                 # What the next frame needs memory for.
                 del result
 
@@ -225,6 +235,7 @@ class Pipeline:
         statistics.planes = len(found.planes)
         statistics.reason = found.reason
         statistics.sensor = str(found.sensor)
+        statistics.work_budget = found.work_budget
         statistics.tilt = str(found.tilt or '')
         # Only what was worked out for a listener.
         known = vars(found)

@@ -60,7 +60,7 @@ class Settings:
     def want(self, config: NodeConfig) -> None:
         """Ask for another configuration."""
         self._wanted = config
-        if needs(config) in self._prepared:
+        if _needs(config) in self._prepared:
             self._use(config)
         else:
             self._jobs.put(config)
@@ -86,18 +86,27 @@ class Settings:
 
     def _work(self) -> None:
         while config := self._jobs.take():
-            kind = 'points' if config.input == 'points' else 'image'
             self.busy = True
             # What cannot be compiled will be reported by the frame that needs it.
             try:
-                prepare(_of_core(config), (kind,), self._report)
+                prepare(_of_core(config), (_kind(config),), self._report)
             except Exception as error:
                 self._report(f'not compiled ahead: {error}')
-            self._prepared.add(needs(config))
+            self._prepared.add(_needs(config))
             self._report('')
             self.busy = False
             if config is self._wanted:
                 self._use(config)
+
+
+def _needs(config: NodeConfig) -> tuple[object, ...]:
+    """What decides which kernels run."""
+    return *needs(_of_core(config)), _kind(config)
+
+
+def _kind(config: NodeConfig) -> str:
+    """Of `rehearsal.KINDS`."""
+    return 'points' if config.input == 'points' else 'image'
 
 
 def _of_core(config: NodeConfig) -> Config:

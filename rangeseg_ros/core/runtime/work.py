@@ -8,6 +8,9 @@ from typing import NamedTuple
 # and of every second row and column; and that of these with cuts.
 _UNCUT, _COARSE, _COARSE_UNCUT = 0.9, 0.5, 0.46
 
+STEPS = (1.0, (1.0 + _UNCUT) / 2, _UNCUT, _COARSE, _COARSE_UNCUT)
+"""Budgets that make a difference, falling: those of which docs/benchmark.md tells the accuracy."""
+
 
 class Work(NamedTuple):
     """What is done of what refines a segmentation.

@@ -1,0 +1,104 @@
+"""A frame rate held by doing less of the work."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from statistics import median
+
+from rangeseg_ros.core.runtime.work import STEPS, Work
+
+# Seconds over which times are smoothed: a single slow frame is not followed, and a change of scene
+# is (95 % after three times as long) within the five seconds over which rates are counted.
+_TIME_CONSTANT = 1.0
+# The 95th percentile of the times of frames, to their median (docs/benchmark.md): so many are in
+# time where the median frame takes this much less than it may.
+_HEADROOM = 1.15
+# What more work will take is foreseen no better than this: of the shares that `Work` states and
+# those measured (docs/benchmark.md), and of the times of frames after one time constant.
+_DOUBT = 1.1
+# Seconds for which more work must seem possible before it is tried: then 95 % of what is known is
+# of the work that is done. After a trial that fails, twice as long, up to a minute: the time
+# constant that a failure takes is then a share of 2 %.
+_PATIENCE, _MOST_PATIENCE = 3 * _TIME_CONSTANT, 60 * _TIME_CONSTANT
+
+
+class Pace:
+    """Chooses `work_budget` by how long frames take.
+
+    A frame that has taken r seconds with the share b of the work, and o seconds with what is done
+    all the same, would just have lasted the period P with the share b (P - o) / r. Its logarithm,
+    as a median of three and through a low-pass filter of first order, is what the share is told
+    from: the largest of a few steps that is enough at once where that is less, one step more when
+    it has been well possible for some time. The share that was foreseen does not depend on the
+    step that is taken, so that nothing winds up where none is small enough. That patience grows
+    with trials that fail is how wireless links choose their rate (Lacage, Manshaei and Turletti,
+    IEEE 802.11 rate adaptation: a practical approach, MSWiM 2004).
+
+    Parameters
+    ----------
+    rate : float
+        To be held, Hz; 0 leaves `most`.
+    most : float
+        Largest share of the work, 0...1.
+    """
+
+    def __init__(self, rate: float, most: float) -> None:
+        self.rate, self.most = rate, most
+        less = [step for step in STEPS if step < most and Work.within(step) != Work.within(most)]
+        self._steps = [most, *less]
+        self._step = 0
+        self._period = 1 / (_HEADROOM * rate) if rate else math.inf
+        # A share that is further off than twice says no more.
+        self._bounds = _share(self._steps[-1]) / 2, 2 * _share(most)
+        self._latest: deque[float] = deque(maxlen=3)
+        self._enough = self._bounds[1]
+        self._patience = _PATIENCE
+        # Seconds for which more work has seemed possible, and for which it is on trial.
+        self._possible = 0.0
+        self._trial: float | None = None
+
+    @property
+    def budget(self) -> float:
+        """Share of the work for the next frame."""
+        return self._steps[self._step]
+
+    def add(self, refining: float, other: float) -> None:
+        """Take up the seconds of a frame: of what `budget` is a share of, and of the rest."""
+        share = _share(self.budget) * (self._period - other) / max(refining, 1e-6)
+        least, most = self._bounds
+        self._latest.append(min(max(share, least), most))
+        # A frame stands for the time that it took, or was to take.
+        seconds = max(refining + other, self._period)
+        kept = math.exp(-seconds / _TIME_CONSTANT)
+        self._enough = self._enough**kept * median(self._latest) ** (1 - kept)
+        if self._enough < _share(self.budget):
+            self._do_less()
+        else:
+            self._do_more(seconds)
+
+    def _do_less(self) -> None:
+        """Take the largest step that is small enough, or the smallest."""
+        if self._trial is not None:
+            self._patience = min(2 * self._patience, _MOST_PATIENCE)
+        while self._step + 1 < len(self._steps) and self._enough < _share(self.budget):
+            self._step += 1
+        self._possible, self._trial = 0.0, None
+
+    def _do_more(self, seconds: float) -> None:
+        """Try the next step once it has seemed possible for long; what lasts so long works."""
+        if self._trial is not None:
+            self._trial += seconds
+            if self._trial > self._patience:
+                self._patience, self._trial = _PATIENCE, None
+        above = _share(self._steps[max(self._step - 1, 0)])
+        possible = self._step > 0 and self._enough > _DOUBT * above
+        self._possible = self._possible + seconds if possible else 0.0
+        if self._possible > self._patience:
+            self._step -= 1
+            self._possible, self._trial = 0.0, 0.0
+
+
+def _share(budget: float) -> float:
+    """What `budget` leaves of the work: less than the smallest of `STEPS` leaves no less."""
+    return max(budget, STEPS[-1])

@@ -1,0 +1,39 @@
+"""What a frame was segmented with, and what came of it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.messages.make import Make
+
+OK, WARN = np.uint8(0), np.uint8(1)
+"""diagnostic_msgs/DiagnosticStatus: levels."""
+
+
+def status_message(make: Make, header: Any, result: Segmentation) -> Any:
+    """diagnostic_msgs/DiagnosticArray of one frame, under its header.
+
+    One status with the values `work_budget`, as many digits of it as give the same labels again,
+    `planes`, their number, `reason` why there is none, and `sensor`, as `/diagnostics` has them.
+    """
+    values = {
+        'work_budget': repr(result.work_budget),
+        'planes': str(len(result.planes)),
+        'reason': result.reason,
+        'sensor': str(result.sensor),
+    }
+    status = make(
+        'diagnostic_msgs/msg/DiagnosticStatus',
+        level=WARN if result.reason else OK,
+        name='segmentation of a frame',
+        message=result.reason or f'{len(result.planes)} planes',
+        hardware_id='',
+        values=[
+            make('diagnostic_msgs/msg/KeyValue', key=key, value=value)
+            for key, value in values.items()
+        ],
+    )
+    return make('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])
