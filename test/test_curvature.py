@@ -83,6 +83,29 @@ def test_a_bend_counts_across_the_plane_however_obliquely_it_is_seen(bend, expec
     assert verdict(inverse, seen).tolist() == [False, expected]
 
 
+@pytest.mark.parametrize(('distortion', 'flatness'), [(0.005, 0.0), (0.0, 0.02)])
+def test_holes_make_no_region_smaller(distortion, flatness):
+    """Of a sheet that bends more and more, the same bend is too much with a third missing."""
+    sensor = SENSOR._replace(noise=0.005, distortion=distortion)
+    seen = np.zeros(CAMERA.shape, bool)
+    seen[60:180, 80:240] = True
+    barrel = CAMERA.rays[..., 0].astype(float) ** 2
+    least = []
+    for holes in (0.0, 0.33):
+        measured = seen & (np.random.default_rng(1).random(CAMERA.shape) >= holes)
+        for bend in np.geomspace(0.01, 2.0, 150):
+            inverse = np.where(measured, 0.8 + bend * barrel, 0).astype(np.float32)
+            image = RangeImage(CAMERA.rays, inverse, CAMERA)
+            blocks = Blocks.of(image)
+            # What is missing is bridged.
+            image = RangeImage(CAMERA.rays, (0.8 + bend * barrel).astype(np.float32), CAMERA)
+            if find_curved(seen.astype(np.uint16), image, blocks, sensor, flatness)[1]:
+                break
+        least.append(bend)
+    assert 0.01 < least[0] < 1
+    assert least[1] == pytest.approx(least[0], rel=0.08)
+
+
 def test_only_the_curved_region_is():
     inverse = cylinder(0.25)
     regions = np.where(inverse > 0, 2, 1)

@@ -129,6 +129,21 @@ def test_correlated_noise_is_told_with_its_length(width):
     assert sensor.white < 0.2
 
 
+@pytest.mark.parametrize('width', [1.4, 2.8])
+def test_holes_change_no_length(width):
+    """Fewer pixels of a block agree, and over more of them: neither noise nor length grows."""
+    random = np.random.default_rng(6)
+    inverse = three_planes() + 0.001 * smooth_field(CAMERA.shape, (width, width), random)
+    inverse += random.normal(0, 0.0006, CAMERA.shape)
+    whole = sensor_of(inverse)
+    columns = np.arange(640) % 4 == 3
+    for holes in (random.random(CAMERA.shape) < 0.35, np.broadcast_to(columns, CAMERA.shape)):
+        sensor = sensor_of(np.where(holes, 0, inverse))
+        assert sensor.correlation == whole.correlation
+        assert sensor.noise == pytest.approx(whole.noise, rel=0.08)
+        assert sensor.white == pytest.approx(whole.white, abs=0.08)
+
+
 @pytest.mark.parametrize('bend', [0.002, 0.006])
 def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
     """Not its overall size, but what it moves parts of planes by, to within half."""

@@ -72,7 +72,8 @@ def find_curved(
     arrays = regions, filled, image.inverse, image.rays, blocks, sensor
     moments = np.add(*map_halves(_sum_moments, len(filled), *arrays, count))
     theta, _ = fit_all(moments)
-    ratio = moments[:, RATIO] / np.maximum(moments[:, COUNT], 1)
+    covered = np.maximum(moments[:, COUNT], 1)
+    ratio = moments[:, RATIO] / covered
     # A residual is the region's up to noise and twice the distortion.
     limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
@@ -83,11 +84,11 @@ def find_curved(
     # What the quadratic explains more than its constant and linear terms do.
     whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
     bending = (whole - flat) / size
-    distortion = _SHARE * ratio * (size / (regions.size / VGA * _PIXELS)) ** _EXPONENT
+    distortion = _SHARE * ratio * (covered / (regions.size / VGA * _PIXELS)) ** _EXPONENT
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
     noise = np.maximum((square - whole) / size, 1)
     visible = bending > distortion + _NOISE * noise / size
-    result = visible & (bending * (scale / size) ** 2 > flatness**2 * area)
+    result = visible & (bending * (scale / size) ** 2 > flatness**2 * area * covered / size)
     result[0] = False
     return result
 
@@ -112,7 +113,10 @@ def _sum_moments(
     sensor: SensorModel,
     count: int,
 ) -> NDArray[np.float64]:
-    """Moments (count, 13), weighted, of each region in some rows of blocks."""
+    """Moments (count, 13), weighted, of each region in some rows of blocks.
+
+    Their numbers are of all pixels of the blocks, as holes make no region smaller.
+    """
     height, width = regions.shape
     total = np.zeros((count, SIZE))
     for bi in range(first, after):
@@ -120,11 +124,10 @@ def _sum_moments(
             label, squared = int(filled[bi, bj]), blocks.squared[bi, bj]
             if label > 0 and squared > 0:
                 weight = 1 / random_variance(sensor, squared)
-                pixels = blocks.moments[bi, bj, COUNT]
                 for entry in range(CHI2 + 1):
                     total[label, entry] += weight * blocks.moments[bi, bj, entry]
-                total[label, COUNT] += pixels
-                total[label, RATIO] += pixels * weight * systematic_variance(sensor, squared)
+                total[label, COUNT] += BLOCK**2
+                total[label, RATIO] += BLOCK**2 * weight * systematic_variance(sensor, squared)
             if label > 0:
                 continue
             for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):

@@ -182,14 +182,17 @@ def _of_four(
 def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:
     """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(4).
 
-    M rises with the number of pixels that agree: with the share of a block that is `filled`.
+    Of a block only a share is `filled`. Planes through these pixels miss the block's own by what
+    sampling leaves of the residuals around it, as of a finite population; that and theirs count as
+    many times less as there are fewer pixels.
     """
     shown = np.maximum(np.array([*within[:3], between]), 1e-9)
     best = np.inf
     result = 1.0, 1.0, 0.0
     for width in _WIDTHS:
         hidden = correlated_residuals(width)
-        predicted = np.array([*hidden[: len(shown) - 1], 1 + filled * (hidden[3] - 1)])
+        apart = filled * hidden[3] + (1 - filled) * hidden[0]
+        predicted = np.array([*hidden[: len(shown) - 1], apart])
         white, correlated, error = _white_and_correlated(predicted, shown)
         if error < best:
             best, total = error, white + correlated
