@@ -121,7 +121,7 @@ class Segmentation:
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
             table[plane.label] = plane.normal
-        return table[self.labels]
+        return np.take(table, self.labels, axis=0)
 
     @cached_property
     def edges(self) -> NDArray[np.bool_]:

@@ -139,6 +139,7 @@ def _records(cloud: Any) -> NDArray[np.void]:
 
 def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     """sensor_msgs/PointCloud2 with one point per plane; see `planes_from_message`."""
+    upper = np.triu_indices(4)
     rows = np.array(
         [
             (
@@ -156,7 +157,7 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 *plane.extents,
                 *plane.centre,
                 *plane.orientation,
-                *plane.covariance[np.triu_indices(4)],
+                *plane.covariance[upper],
             )
             for plane in planes
         ],
@@ -175,7 +176,9 @@ def points_message(
     if height is None:
         rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
     else:
-        rows = np.column_stack([points, height]).astype('<f4').view(_HEIGHT_TYPE)[:, 0]
+        columns = np.empty((len(points), 4), '<f4')
+        columns[:, :3], columns[:, 3] = points, height
+        rows = columns.view(_HEIGHT_TYPE)[:, 0]
     return _cloud(make, header, rows)
 
 

@@ -71,12 +71,13 @@ def _terrain(make: Make, header: Any, image: RangeImage, result: Segmentation) -
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, result.terrain == GROUND))
+    return points_message(make, header, _points(image, np.flatnonzero(result.terrain == GROUND)))
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    where = result.terrain == OBSTACLE
-    return points_message(make, header, _points(image, where), result.height[where])
+    pixels = np.flatnonzero(result.terrain == OBSTACLE)
+    height = np.take(result.height, pixels)
+    return points_message(make, header, _points(image, pixels), height)
 
 
 def _drops(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -98,11 +99,10 @@ def _crossings(
     return points_message(make, header, found[:, :3], found[:, 3])
 
 
-def _points(image: RangeImage, where: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _points(image: RangeImage, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
     # Of these pixels only, which is faster than RangeImage.points, and by number than by mask.
-    pixels = np.flatnonzero(where)
-    rays = np.take(image.rays.reshape(-1, 3), pixels, axis=0)
-    points: NDArray[np.float32] = rays / np.take(image.inverse, pixels)[:, None]
+    points = np.take(image.rays.reshape(-1, 3), pixels, axis=0)
+    points /= np.take(image.inverse, pixels)[:, None]
     return points
 
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from rangeseg_ros.core.segmenter import Segmentation
 from rangeseg_ros.messages.make import Make
 
-OK, WARN = np.uint8(0), np.uint8(1)
+OK, WARN = 0, 1
 """diagnostic_msgs/DiagnosticStatus: levels."""
 
 
