@@ -4,6 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
@@ -13,10 +15,18 @@ from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.clouds import planes_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
-from rangeseg_ros.messages.markers import ARROW_LENGTH, markers_message
+from rangeseg_ros.messages.marker_bytes import markers_bytes
+from rangeseg_ros.messages.markers import (
+    ARROW_LENGTH,
+    LINE_STRIP,
+    Marker,
+    markers_message,
+    of_planes,
+)
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
+ARRAY = 'visualization_msgs/msg/MarkerArray'
 SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 
 
@@ -106,6 +116,39 @@ def test_node_and_replay_write_the_same_bytes(name, planes):
     # Fast CDR leaves the bytes between aligned fields undefined: write them again.
     sent_again = bytes(STORE.serialize_cdr(STORE.deserialize_cdr(sent, output.kind), output.kind))
     assert len(sent) == len(written) and sent_again == written
+    if output.serialised:
+        assert output.serialised(header(make), image, result) == written
+
+
+@settings(deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9),
+            st.integers(0, 7),
+            st.text(st.characters(exclude_characters='\0', codec='utf-8'), max_size=9),
+        ),
+        max_size=5,
+    )
+)
+def test_markers_serialised_at_once_are_those_of_the_message(drawn):
+    """However long texts and lists of points are, by which everything after them is aligned."""
+    drawn = [
+        Marker(
+            namespace,
+            count - 3,
+            LINE_STRIP,
+            (0.1, 0.2, 0.3),
+            (0.25, 0.5, 0.75, 1.0),
+            np.arange(3.0 * count).reshape(-1, 3),
+            text,
+            (1.0, 2.0, 3.0),
+        )
+        for namespace, count, text in drawn
+    ]
+    at_once = markers_bytes(header(), drawn)
+    written = STORE.serialize_cdr(markers_message(make_rosbags, header(), drawn), ARRAY)
+    assert at_once == bytes(written)
 
 
 def corners_of(marker):
@@ -119,7 +162,7 @@ def area_of(triangles):
 
 
 def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
-    message = markers_message(make_rosbags, header(), [plane(1), plane(2, hull=())])
+    message = markers_message(make_rosbags, header(), of_planes([plane(1), plane(2, hull=())]))
     clear, *drawn = message.markers
     assert clear.action == clear.DELETEALL
     assert [(m.ns, m.id) for m in drawn] == [
@@ -145,7 +188,7 @@ def test_concave_hull_with_a_hole_is_filled_and_no_more():
     outline = [(0, 0), (0, 3), (3, 3), (3, 0), (2, 0), (2, 2), (1, 2), (1, 0)]
     hole = [(0.25, 1), (0.75, 1), (0.75, 1.5), (0.25, 1.5)]
     rings = [[(x, y, 2.0) for x, y in ring] for ring in (outline, hole)]
-    message = markers_message(make_rosbags, header(), [plane(1, rings[0], rings[1:])])
+    message = markers_message(make_rosbags, header(), of_planes([plane(1, rings[0], rings[1:])]))
     triangles = corners_of(message.markers[1])
     assert area_of(triangles) == pytest.approx(9 - 2 - 0.25)
     np.testing.assert_allclose(triangles[..., 2], 2.0, atol=1e-12)
@@ -168,7 +211,7 @@ def test_triangles_of_planes_of_any_direction_face_the_sensor(axis, sign):
     hull = np.array([(0, 0), (2, 0), (1, 0.5), (2, 2), (0, 2)]) @ frame - 2 * normal
     found = plane(1, hull)
     found.normal = normal
-    triangles = corners_of(markers_message(make_rosbags, header(), [found]).markers[1])
+    triangles = corners_of(markers_message(make_rosbags, header(), of_planes([found])).markers[1])
     first, second, third = np.moveaxis(triangles, 1, 0)
     doubled = np.cross(second - first, third - first) @ normal
     assert (doubled > 0).all() and doubled.sum() / 2 == pytest.approx(3)
@@ -176,5 +219,5 @@ def test_triangles_of_planes_of_any_direction_face_the_sensor(axis, sign):
 
 def test_a_hull_that_crosses_itself_still_makes_whole_triangles():
     bow_tie = [(0, 0, 2), (1, 1, 2), (0, 1, 2), (1, 0, 2), (2, 3, 2)]
-    hull = markers_message(make_rosbags, header(), [plane(1, bow_tie)]).markers[1]
+    hull = markers_message(make_rosbags, header(), of_planes([plane(1, bow_tie)])).markers[1]
     assert len(hull.points) % 3 == 0

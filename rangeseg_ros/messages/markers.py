@@ -1,13 +1,12 @@
-"""Planes as RViz markers."""
+"""Planes, the ground and stairs as RViz markers: what is drawn, and its message."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
@@ -22,114 +21,108 @@ ADD, DELETEALL = 0, 3
 ARROW_LENGTH = 0.2
 """Length of the drawn normals, metres."""
 
+_NOWHERE = np.zeros((0, 3))
 
-def markers_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
-    """visualization_msgs/MarkerArray: hulls, normals and names of `planes`, no older ones.
+
+class Marker(NamedTuple):
+    """What a visualization_msgs/Marker says, at the origin unless it is a text.
+
+    Attributes
+    ----------
+    namespace, number, kind : str, int, int
+        Its ns, id and type.
+    scale : tuple of 3 float
+        Metres.
+    colour : tuple of 4 float
+        Red, green, blue, opacity, 0...1.
+    points : (N, 3) float64
+        Metres.
+    text, position : str, tuple of 3 float
+        Letters, and where they are.
+    action : int
+    """
+
+    namespace: str
+    number: int
+    kind: int
+    scale: tuple[float, float, float]
+    colour: tuple[float, float, float, float]
+    points: NDArray[np.floating] = _NOWHERE
+    text: str = ''
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    action: int = ADD
+
+
+CLEAR = Marker('', 0, ARROW, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0), action=DELETEALL)
+"""Removes all older markers; the first of every message."""
+
+
+def of_planes(planes: Sequence[Plane]) -> list[Marker]:
+    """Hulls, normals and names of `planes`.
 
     Namespaces `hulls`, `normals` and `ids`, whose texts are id and role; a marker's id is the
     plane's, its colour that of the overlay. Every three points of a hull are a triangle,
     counter-clockwise seen from the sensor.
     """
-    markers = _Markers(make, header)
+    markers = []
     for plane, colour in zip(planes, colours([plane.id for plane in planes]) / 255, strict=True):
-        rgb = [float(part) for part in colour]
+        red, green, blue = colour.tolist()
         tip = plane.centroid + ARROW_LENGTH * plane.normal
-        hull = markers.add('hulls', plane.id, TRIANGLE_LIST, (1.0, 1.0, 1.0), (*rgb, 0.6))
-        hull.points = _triangles(make, plane)
-        normal = markers.add('normals', plane.id, ARROW, (0.02, 0.04, 0.06), (*rgb, 1.0))
-        normal.points = _points(make, (plane.centroid, tip))
-        markers.add_text('ids', plane.id, f'{plane.id} {plane.role}'.strip(), tip)
-    return markers.message()
+        normal = np.array((plane.centroid, tip))
+        size, thin = (1.0, 1.0, 1.0), (0.02, 0.04, 0.06)
+        opaque, clear = (red, green, blue, 1.0), (red, green, blue, 0.6)
+        markers += [
+            Marker('hulls', plane.id, TRIANGLE_LIST, size, clear, _triangles(plane)),
+            Marker('normals', plane.id, ARROW, thin, opaque, normal),
+            _text('ids', plane.id, f'{plane.id} {plane.role}'.strip(), tip),
+        ]
+    return markers
 
 
-def outline_message(make: Make, header: Any, lines: Sequence[NDArray[np.floating]]) -> Any:
-    """visualization_msgs/MarkerArray: the closed `lines` (N, 3) around the ground, no older ones.
-
-    Namespace `ground`, of type LINE_STRIP.
-    """
-    markers = _Markers(make, header)
-    for number, line in enumerate(lines):
-        strip = markers.add('ground', number, LINE_STRIP, (0.02, 0.0, 0.0), (0.1, 0.9, 0.1, 1.0))
-        strip.points = _points(make, np.concatenate([line, line[:1]]))
-    return markers.message()
+def of_outline(lines: Sequence[NDArray[np.floating]]) -> list[Marker]:
+    """The closed `lines` (N, 3) around the ground: namespace `ground`, of type LINE_STRIP."""
+    size, green = (0.02, 0.0, 0.0), (0.1, 0.9, 0.1, 1.0)
+    return [
+        Marker('ground', number, LINE_STRIP, size, green, np.concatenate([line, line[:1]]))
+        for number, line in enumerate(lines)
+    ]
 
 
-def stairs_message(make: Make, header: Any, staircases: Sequence[Stairs]) -> Any:
-    """visualization_msgs/MarkerArray: the first edges of staircases and what they are, no others.
+def of_stairs(staircases: Sequence[Stairs]) -> list[Marker]:
+    """The first edges of staircases and what they are.
 
     Namespaces `edges`, of type LINE_STRIP, and `stairs`, whose texts are such as
     'up 4 x 0.17 / 0.28 m': direction, treads in sight, rise and run.
     """
-    markers = _Markers(make, header)
+    markers = []
+    size, orange = (0.04, 0.0, 0.0), (1.0, 0.6, 0.0, 1.0)
     for number, stairs in enumerate(staircases):
-        edge = markers.add('edges', number, LINE_STRIP, (0.04, 0.0, 0.0), (1.0, 0.6, 0.0, 1.0))
-        edge.points = _points(make, stairs.edge)
-        markers.add_text('stairs', number, str(stairs), stairs.edge.mean(axis=0))
-    return markers.message()
+        markers += [
+            Marker('edges', number, LINE_STRIP, size, orange, stairs.edge),
+            _text('stairs', number, str(stairs), stairs.edge.mean(axis=0)),
+        ]
+    return markers
 
 
-def _points(make: Make, coordinates: ArrayLike) -> list[Any]:
-    rows = np.asarray(coordinates, float).tolist()
-    return [make('geometry_msgs/msg/Point', x=x, y=y, z=z) for x, y, z in rows]
+def _text(namespace: str, number: int, text: str, position: NDArray[np.floating]) -> Marker:
+    """White letters of 12 cm that face whoever looks."""
+    x, y, z = position.tolist()
+    size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
+    return Marker(namespace, number, TEXT_VIEW_FACING, size, white, text=text, position=(x, y, z))
 
 
-def _triangles(make: Make, plane: Plane) -> list[Any]:
-    """Corners of triangles that make up the outline of `plane` without its holes."""
-    corners = []
-    for rings in plane.outline.parts:
-        if len(rings[0]) > 2:
-            # A message may hold one point at several places.
-            points = _points(make, np.concatenate(rings))
-            corners += [points[k] for k in triangles(rings, plane.normal).ravel().tolist()]
-    return corners
+def _triangles(plane: Plane) -> NDArray[np.floating]:
+    """Corners (N, 3) of triangles that make up the outline of `plane` without its holes."""
+    corners = [
+        np.concatenate(rings)[triangles(rings, plane.normal).ravel()]
+        for rings in plane.outline.parts
+        if len(rings[0]) > 2
+    ]
+    return np.concatenate(corners) if corners else _NOWHERE
 
 
-class _Markers:
-    """The markers of a message: the first one removes all that are older."""
-
-    def __init__(self, make: Make, header: Any) -> None:
-        self._make = make
-        self._header = header
-        self._markers: list[Any] = []
-        self._blank = _blank(make, header)
-        self.add('', 0, ARROW, (1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.0)).action = DELETEALL
-
-    def message(self) -> Any:
-        """visualization_msgs/MarkerArray."""
-        return self._make('visualization_msgs/msg/MarkerArray', markers=self._markers)
-
-    def add_text(
-        self, namespace: str, number: int, text: str, position: NDArray[np.floating]
-    ) -> None:
-        """Add white letters of 12 cm that face whoever looks."""
-        size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
-        marker = self.add(namespace, number, TEXT_VIEW_FACING, size, white)
-        marker.pose = _pose(self._make, position)
-        marker.text = text
-
-    def add(
-        self,
-        namespace: str,
-        number: int,
-        kind: int,
-        scale: tuple[float, float, float],
-        colour: tuple[float, ...],
-    ) -> Any:
-        """Add a visualization_msgs/Marker at the origin."""
-        make = self._make
-        marker = copy(self._blank)
-        marker.ns, marker.id, marker.type = namespace, number, kind
-        marker.scale = make('geometry_msgs/msg/Vector3', **dict(zip('xyz', scale, strict=True)))
-        marker.color = make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', colour, strict=True)))
-        self._markers.append(marker)
-        return marker
-
-
-def _blank(make: Make, header: Any) -> Any:
-    """visualization_msgs/Marker with every field, as not all makers have defaults.
-
-    To be copied: rclpy makes the parts of a marker anew even where they are given.
-    """
+def markers_message(make: Make, header: Any, markers: Iterable[Marker]) -> Any:
+    """visualization_msgs/MarkerArray of `markers`, and of no older ones."""
     time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
     untextured = make(
         'sensor_msgs/msg/CompressedImage',
@@ -138,31 +131,37 @@ def _blank(make: Make, header: Any) -> Any:
         data=np.empty(0, np.uint8),
     )
     mesh = make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8))
-    return make(
-        'visualization_msgs/msg/Marker',
-        header=header,
-        ns='',
-        id=0,
-        type=ARROW,
-        action=ADD,
-        pose=_pose(make, np.zeros(3)),
-        scale=make('geometry_msgs/msg/Vector3', x=1.0, y=1.0, z=1.0),
-        color=make('std_msgs/msg/ColorRGBA', r=0.0, g=0.0, b=0.0, a=0.0),
-        lifetime=make('builtin_interfaces/msg/Duration', sec=0, nanosec=0),
-        frame_locked=False,
-        points=[],
-        colors=[],
-        texture_resource='',
-        texture=untextured,
-        uv_coordinates=[],
-        text='',
-        mesh_resource='',
-        mesh_file=mesh,
-        mesh_use_embedded_materials=False,
-    )
-
-
-def _pose(make: Make, position: NDArray[np.floating]) -> Any:
-    (point,) = _points(make, position[None])
+    lasting = make('builtin_interfaces/msg/Duration', sec=0, nanosec=0)
     unturned = make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
-    return make('geometry_msgs/msg/Pose', position=point, orientation=unturned)
+
+    def triple(kind: str, values: Sequence[float]) -> Any:
+        x, y, z = values
+        return make(f'geometry_msgs/msg/{kind}', x=x, y=y, z=z)
+
+    def message(marker: Marker) -> Any:
+        position = triple('Point', marker.position)
+        return make(
+            'visualization_msgs/msg/Marker',
+            header=header,
+            ns=marker.namespace,
+            id=marker.number,
+            type=marker.kind,
+            action=marker.action,
+            pose=make('geometry_msgs/msg/Pose', position=position, orientation=unturned),
+            scale=triple('Vector3', marker.scale),
+            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', marker.colour, strict=True))),
+            lifetime=lasting,
+            frame_locked=False,
+            points=[triple('Point', point) for point in marker.points.astype(float).tolist()],
+            colors=[],
+            texture_resource='',
+            texture=untextured,
+            uv_coordinates=[],
+            text=marker.text,
+            mesh_resource='',
+            mesh_file=mesh,
+            mesh_use_embedded_materials=False,
+        )
+
+    messages = [message(marker) for marker in (CLEAR, *markers)]
+    return make('visualization_msgs/msg/MarkerArray', markers=messages)

@@ -21,7 +21,14 @@ from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import planes_message, points_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
-from rangeseg_ros.messages.markers import markers_message, outline_message, stairs_message
+from rangeseg_ros.messages.marker_bytes import markers_bytes
+from rangeseg_ros.messages.markers import (
+    Marker,
+    markers_message,
+    of_outline,
+    of_planes,
+    of_stairs,
+)
 from rangeseg_ros.messages.status import status_message
 
 
@@ -35,10 +42,22 @@ class Output:
         Type of the message.
     message : callable
         (make, header, image, result) -> message.
+    serialised : callable or None
+        (header, image, result) -> the bytes of that message, where that is faster.
     """
 
     kind: str
     message: Callable[[Make, Any, RangeImage, Segmentation], Any]
+    serialised: Callable[[Any, RangeImage, Segmentation], bytes] | None = None
+
+
+def _of_markers(draw: Callable[[RangeImage, Segmentation], list[Marker]]) -> Output:
+    """A topic of markers."""
+    return Output(
+        'visualization_msgs/msg/MarkerArray',
+        lambda make, header, image, result: markers_message(make, header, draw(image, result)),
+        lambda header, image, result: markers_bytes(header, draw(image, result)),
+    )
 
 
 def _labels(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -47,10 +66,6 @@ def _labels(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 
 def _planes(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
     return planes_message(make, header, result.planes)
-
-
-def _markers(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return markers_message(make, header, result.planes)
 
 
 def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -106,13 +121,8 @@ def _points(image: RangeImage, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
     return points
 
 
-def _outline(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    lines = [] if result.ground is None else outlines(image, result.ground)
-    return outline_message(make, header, lines)
-
-
-def _stairs(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return stairs_message(make, header, result.stairs)
+def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
+    return of_outline([] if result.ground is None else outlines(image, result.ground))
 
 
 def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -122,7 +132,7 @@ def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 OUTPUTS = {
     'labels': Output('sensor_msgs/msg/Image', _labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
-    'markers': Output('visualization_msgs/msg/MarkerArray', _markers),
+    'markers': _of_markers(lambda image, result: of_planes(result.planes)),
     'overlay': Output('sensor_msgs/msg/Image', _overlay),
     'normals': Output('sensor_msgs/msg/Image', _normals),
     'edges': Output('sensor_msgs/msg/Image', _edges),
@@ -131,17 +141,22 @@ OUTPUTS = {
     'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
     'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
     'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
-    'outline': Output('visualization_msgs/msg/MarkerArray', _outline),
-    'stairs': Output('visualization_msgs/msg/MarkerArray', _stairs),
+    'outline': _of_markers(_outline),
+    'stairs': _of_markers(lambda image, result: of_stairs(result.stairs)),
     'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
 }
 
 IN_TARGET = frozenset({'planes', 'markers'})
 """Outputs in the target frame, where there is one; the others belong to the sensor's pixels."""
 
+
+def _map_markers(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
+    return markers_message(make, header, of_planes(planes))
+
+
 MAP_OUTPUTS: dict[str, tuple[str, Callable[[Make, Any, Sequence[Plane]], Any]]] = {
     'map': ('sensor_msgs/msg/PointCloud2', planes_message),
-    'map_markers': ('visualization_msgs/msg/MarkerArray', markers_message),
+    'map_markers': ('visualization_msgs/msg/MarkerArray', _map_markers),
 }
 """Topics of the map of planes: their types and how messages are made, in the fixed frame."""
 

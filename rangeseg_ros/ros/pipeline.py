@@ -213,7 +213,10 @@ class Pipeline:
             if publisher.get_subscription_count():
                 doing(f'publishing {name}')
                 header, shown = there if name in IN_TARGET else here
-                publisher.publish(output.message(make_rclpy, header, image, shown))
+                if output.serialised:
+                    publisher.publish(output.serialised(header, image, shown))
+                else:
+                    publisher.publish(output.message(make_rclpy, header, image, shown))
         if result.motion and self._odometry_publisher.get_subscription_count():
             message = odometry_message(make_rclpy, frame.message.header, result.motion)
             self._odometry_publisher.publish(message)
