@@ -15,8 +15,8 @@ from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_variance
 from rangeseg_ros.core.significance import chi2_quantile
 
-# Pairs of regions and how much links them, see `find_borders`.
-Stretches = tuple[NDArray[np.intp], NDArray[np.intp]]
+# Pairs of regions, and what links and cuts them, see `find_borders`.
+Stretches = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
 
 RESIDUE = 2.5
 """What the parts of a face differ by beyond their errors, as factor of variances.
@@ -83,15 +83,17 @@ def find_borders(
     -------
     pairs : (N,) int
         k * count + m for regions k and m, both ways round; some repeatedly.
-    balance : (N,) int
-        Edges that link the two less those that a jump cuts, along a stretch of their border.
+    links, cuts : (N,) int
+        Edges that link the two, and those that a jump cuts, along a stretch of their border.
     """
     height, width = regions.shape
     # What the stretch at hand leads to: along a border most pixels lead where the one before does.
-    other, links = np.zeros((2, count), np.intp), np.zeros((2, count), np.intp)
-    pairs, balance = [0], [0]
-    pairs.clear()
-    balance.clear()
+    other = np.zeros((2, count), np.intp)
+    linked, cut = np.zeros((2, count), np.intp), np.zeros((2, count), np.intp)
+    pairs, links, cuts = [0], [0], [0]
+    found = pairs, links, cuts
+    for told in found:
+        told.clear()
     for i in range(height):
         within = inner[i // BLOCK]
         for j in range(width):
@@ -101,45 +103,54 @@ def find_borders(
             for axis in range(2):
                 if axis == 0:
                     m = int(regions[i, j + 1]) if j + 1 < width else k
-                    linked = m != k and grid.right[i, j] > 0
+                    touch = m != k and grid.right[i, j] > 0
                 else:
                     m = int(regions[i + 1, j]) if i + 1 < height else k
-                    linked = m != k and grid.below[i, j] > 0
+                    touch = m != k and grid.below[i, j] > 0
                 if m == k or min(k, m) == 0:
                     continue
                 if other[axis, k] != m:
-                    _tell(k, other[axis, k], links[axis, k], count, pairs, balance)
-                    other[axis, k], links[axis, k] = m, 0
-                links[axis, k] += 1 if linked else -1
+                    _tell(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
+                    other[axis, k], linked[axis, k], cut[axis, k] = m, 0, 0
+                linked[axis, k] += touch
+                cut[axis, k] += not touch
     for axis in range(2):
         for k in range(count):
-            _tell(k, other[axis, k], links[axis, k], count, pairs, balance)
-    return np.array(pairs, np.intp), np.array(balance, np.intp)
+            _tell(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
+    return np.array(pairs, np.intp), np.array(links, np.intp), np.array(cuts, np.intp)
 
 
 @njit(cache=True, nogil=True)
-def _tell(k: int, m: int, links: int, count: int, pairs: list[int], balance: list[int]) -> None:
-    """Note a stretch of border between regions k and m, 0 for none."""
+def _tell(
+    k: int,
+    m: int,
+    linked: int,
+    cut: int,
+    count: int,
+    found: tuple[list[int], list[int], list[int]],
+) -> None:
+    """Note a stretch of border between regions k and m, 0 for none, both ways round."""
     if m > 0:
-        pairs.append(k * count + m)
-        pairs.append(m * count + k)
-        balance.append(links)
-        balance.append(links)
+        for pair in (k * count + m, m * count + k):
+            found[0].append(pair)
+            found[1].append(linked)
+            found[2].append(cut)
 
 
 def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """Group regions that touch and whose planes agree, as `common_surfaces` does.
 
     What lies within a region, and on average no higher or deeper, is a part of it however its
-    own plane is tilted: a dent, or what the sensor saw as one. Regions touch where jumps cut no
-    more than half of their common border: between a step and what is behind it there may be gaps
-    in the jump.
+    own plane is tilted: a dent, or what the sensor saw as one. Where jumps cut more than half of
+    their common border, regions have to agree as those seen apart do: between a step and what is
+    behind it there may be gaps in the jump, and on a face there may be jumps that are none. Where
+    they cut all of it, it is a border.
 
     Parameters
     ----------
     fits : Fits
         Of M + 1 regions.
-    stretches : two (N,) int
+    stretches : three (N,) int
         Of their borders, see `find_borders`.
 
     Returns
@@ -149,16 +160,18 @@ def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     """
     edges, place = np.unique(stretches[0], return_inverse=True)
     links = np.bincount(place, stretches[1], len(edges))
-    around = _around(fits, edges, links)
-    return _groups_of_touching(_by_falling_size(fits), fits, edges[links >= 0], around)
+    balance = links - np.bincount(place, stretches[2], len(edges))
+    around = _around(fits, edges, balance)
+    limits = np.where(balance >= 0, _TOUCHING_LIMIT, np.where(links > 0, _LIMIT, 0.0))
+    return _groups_of_touching(_by_falling_size(fits), fits, edges, limits, around)
 
 
-def _around(fits: Fits, edges: NDArray[np.intp], links: NDArray[np.intp]) -> NDArray[np.intp]:
+def _around(fits: Fits, edges: NDArray[np.intp], balance: NDArray[np.intp]) -> NDArray[np.intp]:
     """Region (M + 1,) that each lies in, neither before nor behind it; 0 for none."""
     count = len(fits.theta)
     result = np.zeros(count, np.intp)
     inner, outer = edges // count, edges % count
-    enclosed = links > _ENCLOSED * fits.cells.border[inner]
+    enclosed = balance > _ENCLOSED * fits.cells.border[inner]
     inner, outer = inner[enclosed], outer[enclosed]
     theta, sums = fits.theta[outer], fits.explained[inner]
     normal = symmetric(sums[:, :6])
@@ -195,7 +208,11 @@ def _groups(order: NDArray[np.intp], fits: Fits) -> NDArray[np.intp]:
 
 @njit(cache=True, nogil=True)
 def _groups_of_touching(
-    order: NDArray[np.intp], fits: Fits, edges: NDArray[np.intp], around: NDArray[np.intp]
+    order: NDArray[np.intp],
+    fits: Fits,
+    edges: NDArray[np.intp],
+    limits: NDArray[np.float64],
+    around: NDArray[np.intp],
 ) -> NDArray[np.intp]:
     count = len(fits.theta)
     group = np.zeros(count, np.intp)
@@ -207,12 +224,12 @@ def _groups_of_touching(
             continue
         group[k] = k
         least = _TOUCHING_LIMIT
-        for edge in edges[start[k] : start[k + 1]]:
+        for e in range(start[k], start[k + 1]):
             # 0 while the region at the other end, smaller, has had no turn.
-            leader = group[edge % count]
+            leader = group[edges[e] % count]
             if leader > 0 and leader != k:
-                value = _difference(fits, k, leader, _TOUCHING_LIMIT)
-                if value < least:
+                value = _difference(fits, k, leader, limits[e])
+                if value < min(least, limits[e]):
                     least, group[k] = value, leader
     return group
 
