@@ -54,7 +54,7 @@ def halves(folder):
         v, u = (np.rint(each).astype(int) for each in pixels(other, camera))
         error = learned.offset[v, u].astype(float)
         if learned.slope is not None:
-            error += learned.slope[v, u] * other.inverse
+            error += learned.slope[v, u] * (other.inverse - learned.reference)
         before, after = (rms(residuals(other, other.inverse - e)) for e in (0, error))
         print(f'{name} half: {before:.5f} to {after:.5f} / m, {1 - after / before:.0%} less')
     known = (maps[0].deviation > 0) & (maps[1].deviation > 0)
@@ -77,7 +77,9 @@ def simulated(name, count):
     cells = concatenate(seen)
     learned, inverse = calibrate(cells, camera.shape).distortion, np.median(cells.inverse)
     known = learned.deviation > 0
-    field = learned.offset + (0 if learned.slope is None else learned.slope * inverse)
+    field = learned.offset
+    if learned.slope is not None:
+        field = field + learned.slope * (inverse - learned.reference)
     true = without_plane(true_error(name, camera, inverse), known)
     off = without_plane(field.astype(float) - true, known)[known]
     ratio = rms(off / learned.deviation[known])

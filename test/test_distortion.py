@@ -52,9 +52,10 @@ def test_clouds_are_corrected_along_their_rays():
 def test_slope_is_the_coefficient_of_the_inverse_depth():
     slope = np.full(CAMERA.shape, 0.1, np.float32)
     image = RangeImage.from_depth((1 / wall()).astype(np.float32), CAMERA)
-    found = DistortionMap(smooth_map(), None, slope).corrected(image)
-    error = smooth_map() + 0.1 * wall()
-    assert found.inverse == pytest.approx(wall() - error, abs=1e-6)
+    for reference in (0.0, 0.4):
+        found = DistortionMap(smooth_map(), None, slope, None, reference).corrected(image)
+        error = smooth_map() + 0.1 * (wall() - reference)
+        assert found.inverse == pytest.approx(wall() - error, abs=1e-6)
 
 
 def test_what_lies_beyond_infinity_was_not_measured():
@@ -82,19 +83,23 @@ def test_segmenter_does_not_forget_the_map(tmp_path):
     assert Segmenter(config).segment(corrected(image, config)) is not None
 
 
-@pytest.mark.parametrize('pages', [1, 2, 3])
-def test_file_holds_the_map(tmp_path, pages):
+@pytest.mark.parametrize(('pages', 'reference'), [(1, 0.0), (2, 0.0), (3, 0.0), (3, 0.6)])
+def test_file_holds_the_map(tmp_path, pages, reference):
     parts = [smooth_map(), abs(smooth_map()), smooth_map(0.1)][:pages]
-    distortion = DistortionMap(*[*parts, None, None][:3], camera=CAMERA)
+    distortion = DistortionMap(*[*parts, None, None][:3], CAMERA, reference)
     path = tmp_path / 'map.tiff'
     write_distortion(path, distortion)
     read = read_distortion(path)
     for name in ('offset', 'deviation', 'slope'):
         before, after = getattr(distortion, name), getattr(read, name)
         assert (before is None and after is None) or np.array_equal(before, after)
-    assert read.camera == CAMERA
-    # Readers of one page read the offset.
+    assert read.camera == CAMERA and read.reference == reference
+    # Readers of one page read the offset, and so do those who add the third times 1/z, unless it
+    # is the slope of an offset at 1/z = 0.
     assert np.array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), smooth_map())
+    if reference:
+        _, images = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
+        assert len(images) == 4 and not images[2].any()
     assert [file.name for file in tmp_path.iterdir()] == ['map.tiff']
 
 

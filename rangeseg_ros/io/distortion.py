@@ -1,7 +1,10 @@
 """Distortion maps in files: TIFF with a float32 page for each of offset, deviation and slope.
 
 The description tag of the first page holds, as JSON, the camera; other programs' maps, of one page
-and without a description, are read as well.
+and without a description, are read as well. The third page is the slope of an offset at 1/z = 0.
+Where the offset holds at another inverse depth, which the description tells, the third page is
+zero and the slope the fourth: those who read the offset alone, or add the third page times 1/z,
+have the map that is right at that distance.
 """
 
 from __future__ import annotations
@@ -61,16 +64,21 @@ def read_distortion(path: Path) -> DistortionMap:
     # Damaged files are met with exceptions of every kind.
     except Exception:
         raise DistortionError(f'{path}: not a readable TIFF') from None
-    if len(pages) > 3 or any(page.shape != pages[0].shape for page in pages):
-        raise DistortionError(f'{path}: not one to three pages of one size')
+    if len(pages) > 4 or any(page.shape != pages[0].shape for page in pages):
+        raise DistortionError(f'{path}: not one to four pages of one size')
     about = _about(description)
+    reference = 0.0
     try:
         camera = Camera(**about['camera']) if about.get('camera') else None
-    except (TypeError, ValueError):
+        if len(pages) == 4:
+            reference = float(about['reference'])
+    except (KeyError, TypeError, ValueError):
         raise DistortionError(f'{path}: damaged description') from None
+    if not np.isfinite(reference) or (len(pages) == 4 and pages.pop(2).any()):
+        raise DistortionError(f'{path}: a third page beside a reference')
     offset, deviation, slope = [*pages, None, None][:3]
     assert offset is not None
-    return DistortionMap(offset, deviation, slope, camera)
+    return DistortionMap(offset, deviation, slope, camera, reference)
 
 
 def write_distortion(path: Path, distortion: DistortionMap) -> None:
@@ -79,8 +87,12 @@ def write_distortion(path: Path, distortion: DistortionMap) -> None:
     if distortion.deviation is not None:
         pages.append(distortion.deviation)
         if distortion.slope is not None:
+            if distortion.reference:
+                pages.append(np.zeros_like(distortion.slope))
             pages.append(distortion.slope)
     about: dict[str, Any] = {'kind': KIND, 'unit': '1/m'}
+    if distortion.reference:
+        about['reference'] = distortion.reference
     if distortion.camera is not None:
         about['camera'] = asdict(distortion.camera)
     tags = TiffImagePlugin.ImageFileDirectory_v2()

@@ -102,7 +102,6 @@ def calibrate(
         slope = np.where(known, _smooth_in_pixels(learned.field[1], shape), 0)
         # One slope everywhere scales all planes, and leaves them planes.
         slope -= known * slope[known].mean()
-        offset -= slope * learned.reference
         slope = slope.astype(np.float32)
     offset = without_plane(offset, known)
     deviation = np.where(known, _smooth_in_pixels(learned.deviation, shape), 0)
@@ -111,6 +110,7 @@ def calibrate(
         deviation.astype(np.float32),
         slope,
         camera,
+        0.0 if slope is None else learned.reference,
     )
     kept = learned.profile, learned.gain, learned.smoothness, learned.folds
     return Calibration(distortion, views, *kept)

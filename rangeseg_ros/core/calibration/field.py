@@ -5,15 +5,17 @@ are the coefficients of the field at the cell and b its basis at this sighting: 
 that depends on the distance a second one. The planes are eliminated: with W the weights, R the
 rays of a plane's cells and P = W - W R (R^T W R)^-1 R^T W, the field solves
 
-    (sum_p P_p + smoothness L) m = sum_p P_p y_p,
+    (sum_p P_p + smoothness S) m = sum_p P_p y_p,
 
-L the Laplacian of the cells (first differences between neighbours, squared), with a smoothness
-for each coefficient. It is solved by conjugate gradients, as no matrix but those of single planes
-is ever formed. Weights fall as 1 / s^2 with the robust standard deviation s of a plane's residuals
-(where ranges err, near planes are much noisier in inverse depth), and as 1 / (1 + (e / (k s))^2)
-with the residual e (Cauchy), so that wrong regions do not bend the field.
+S the squared second differences of the cells (bending energy; of a slope the first differences),
+with a smoothness for each coefficient. It is solved by conjugate gradients, as no matrix but those
+of single planes is ever formed, preconditioned with W in place of P. Weights fall as 1 / s^2 with
+the robust standard deviation s of a plane's residuals (where ranges err, near planes are much
+noisier in inverse depth), and as 1 / (1 + (e / (k s))^2) with the residual e (Cauchy), so that
+wrong regions do not bend the field.
 
-A plane in inverse depth over the whole image is in the null space: any of it may be added to m.
+A plane in inverse depth over the whole image is in the null space of P, and of S: any of it may be
+added to m, which makes the field no less smooth. So is a slope that is the same everywhere.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from itertools import pairwise
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.linalg import splu
 
 from rangeseg_ros.core.calibration.sightings import Sightings
 
@@ -55,7 +59,7 @@ def solve(
     grid : (int, int)
         Rows and columns of cells.
     smoothness : (K,) float
-        Weight of the squared difference of neighbouring cells, in sightings of a cell.
+        Weight of the squared differences, in sightings of a cell.
     start : (K, rows * columns) float64, optional
         Where to begin.
 
@@ -67,22 +71,31 @@ def solve(
     size = grid[0] * grid[1]
     field = np.zeros((len(basis), size)) if start is None else start.copy()
     inverses, residual = _planes(seen.start, seen.ray, seen.inverse, weight)
-    target = np.stack([np.bincount(seen.cell, weight * b * residual, size) for b in basis])
-    weights = np.stack([np.bincount(seen.cell, weight * b * b, size) for b in basis])
-    diagonal = weights + 4 * np.asarray(smoothness)[:, None] + _RIDGE
+    target: NDArray[np.float64] = np.stack(
+        [np.bincount(seen.cell, weight * b * residual, size) for b in basis]
+    )
+    smoothing = [
+        strength * _roughness(grid, place) + _RIDGE * sparse.eye(size)
+        for place, strength in enumerate(smoothness)
+    ]
+    alone = [
+        splu((sparse.diags(np.bincount(seen.cell, weight * b * b, size)) + part).tocsc())
+        for b, part in zip(basis, smoothing, strict=True)
+    ]
 
     def product(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        result = np.zeros_like(vector)
+        result = np.stack([part @ image for part, image in zip(smoothing, vector, strict=True)])
         sums = seen.start, seen.cell, seen.ray, weight, basis, inverses
         _add_normal_product(*sums, vector, result)
-        for part, image, strength in zip(result, vector, smoothness, strict=True):
-            _add_laplacian(image, grid, float(strength), part)
         return result
 
+    def preconditioned(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.stack([part.solve(image) for part, image in zip(alone, vector, strict=True)])
+
     rest = target - product(field)
-    step = rest / diagonal
+    step = preconditioned(rest)
     direction, rest_size = step.copy(), float((rest * step).sum())
-    enough = _TOLERANCE**2 * float((target * target / diagonal).sum())
+    enough = _TOLERANCE**2 * float((target * preconditioned(target)).sum())
     for _ in range(_ITERATIONS):
         if rest_size <= enough:
             break
@@ -90,10 +103,31 @@ def solve(
         length = rest_size / float((direction * image).sum())
         field += length * direction
         rest -= length * image
-        step = rest / diagonal
+        step = preconditioned(rest)
         before, rest_size = rest_size, float((rest * step).sum())
         direction = step + rest_size / before * direction
     return field
+
+
+def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
+    """Sum of squares of differences of cells (G,), as a matrix (G, G).
+
+    Second differences for the offset, which a plane leaves as it is, and first ones for the slope,
+    which a constant does: neither punishes what is free.
+    """
+    one_v, one_u = (sparse.eye(n) for n in grid)
+    first_v, first_u = (sparse.diags([-1.0, 1.0], [0, 1], (n - 1, n)) for n in grid)
+    second_v, second_u = (sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n)) for n in grid)
+    if place == 0:
+        parts = [
+            sparse.kron(second_v, one_u),
+            sparse.kron(one_v, second_u),
+            np.sqrt(2) * sparse.kron(first_v, first_u),
+        ]
+    else:
+        parts = [sparse.kron(first_v, one_u), sparse.kron(one_v, first_u)]
+    rows = sparse.vstack(parts)
+    return (rows.T @ rows).tocsr()
 
 
 def robust_weights(seen: Sightings, error: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,24 +209,3 @@ def _add_normal_product(
                 value += basis[k, i] * field[k, cell[i]]
             for k in range(count):
                 result[k, cell[i]] += weight[i] * basis[k, i] * value
-
-
-@njit(cache=True, nogil=True)
-def _add_laplacian(
-    field: NDArray[np.float64], grid: tuple[int, int], weight: float, result: NDArray[np.float64]
-) -> None:
-    """Add weight L m to `result`, and the ridge that leaves no part of the field free."""
-    rows, columns = grid
-    for v in range(rows):
-        for u in range(columns):
-            k = v * columns + u
-            value = 0.0
-            if u > 0:
-                value += field[k] - field[k - 1]
-            if u < columns - 1:
-                value += field[k] - field[k + 1]
-            if v > 0:
-                value += field[k] - field[k - columns]
-            if v < rows - 1:
-                value += field[k] - field[k + columns]
-            result[k] += weight * value + _RIDGE * field[k]

@@ -1,12 +1,11 @@
 """How much of the residuals a field explains on frames it was not learned from.
 
 The frames are cut into blocks of consecutive ones, as neighbours in time see almost the same. Each
-block is left out once, and the field of the others is tried on it. With two blocks, of which each
-sees much that the other does not, this decides how smooth the field is, and how it depends on the
-distance (`kinds.py`). With more blocks, whose fields are almost that of all frames, it tells how
-much of the residual is explained, by how much the field is scaled down where little of it holds,
-and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth field is
-added).
+block is left out once, and the field of the others, which is almost that of all frames, is tried
+on it. This decides how smooth the field is, and how it depends on the distance (`kinds.py`), and
+tells how much of the residual is explained, by how much the field is scaled down where little of
+it holds, and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth
+field is added).
 
 Cells count by robust weights, as in the solution: a few wrong regions would outvote the field.
 Each field has weights of its own: with those of all frames a block that is left out has its say,
@@ -30,13 +29,16 @@ from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_s
 
 BLOCKS = 5
 """Parts of the recording that are left out in turn."""
-# Tried from the smoothest on, in sightings of a cell, a factor of 4 apart.
-_SMOOTHNESS = (64.0, 16.0, 4.0)
-# Times the variance explained by a field fixed in inverse depth that one of another kind must
-# explain. Fixed in range, it explains 0.1 to 0.99 on sensors that are not (simulated, and a
-# Kinect), 1.2 to 1.6 on those that are; with a slope 1.00, and on a Kinect up to 1.15. Then it is
-# left out, as with a second coefficient readers of page 1 alone are left without a map.
-_WORTH = 1.2
+# Tried from the smoothest on, in sightings of a cell; with each step, waves that are shorter by a
+# factor of 1.7 are kept.
+_STEP = 8.0
+_SMOOTHNESS = (4096.0, 512.0, 64.0, 8.0)
+# Of the slope, which is known worse, as distances differ little.
+_SLOPES = (512.0, 64.0)
+# Part of the variance left by a field fixed in inverse depth that one of another kind must take
+# away. On sensors simulated without such an error it takes 0.0004 at most, on those with one, and
+# on a Kinect, 0.03 to 0.12.
+_WORTH = 0.01
 # Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
 # is low by chance would be trusted most.
 _AVERAGED = 5.0
@@ -110,31 +112,31 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     """
     reference = float(np.median(seen.inverse))
     fixed, ranged, sloped = kinds(seen, reference)
-    # Of two halves each sees much that the other does not, as later recordings will.
-    halves, grid = _splits(seen, shape, 2), cell_grid(shape)
+    splits, grid = _splits(seen, shape), cell_grid(shape)
 
-    def tried(kind: Kind, choices: list[tuple[float, ...]]) -> tuple[float, tuple[float, ...]]:
-        found = _leave_out(halves, kind.basis, grid, choices)
-        return max(zip([_explained(folds) for folds in found], choices, strict=True))
+    def best(
+        kind: Kind, choices: list[tuple[float, ...]]
+    ) -> tuple[Kind, tuple[float, ...], list[Fold]]:
+        found = zip(_leave_out(splits, kind.basis, grid, choices), choices, strict=True)
+        folds, smoothness = min(found, key=lambda pair: _left(pair[0]))
+        return kind, smoothness, folds
 
     alone: list[tuple[float, ...]] = [(value,) for value in _SMOOTHNESS]
-    explained, smoothness = tried(fixed, alone)
-    kind, least = fixed, _WORTH * max(explained, 0.0)
-    # The second coefficient is known worse, as distances differ little.
-    pairs = [(*smoothness, smoothness[0] * factor) for factor in _SMOOTHNESS]
-    for other, choices in ((ranged, alone), (sloped, pairs)):
-        explained, chosen = tried(other, choices)
-        if explained > least:
-            kind, smoothness, least = other, chosen, explained
-    (folds,) = _leave_out(_splits(seen, shape, BLOCKS), kind.basis, grid, [smoothness])
+    chosen = best(fixed, alone)
+    most = (1 - _WORTH) * _left(chosen[2])
+    pairs = [(*chosen[1], value) for value in _SLOPES]
+    for other in (best(ranged, alone), best(sloped, pairs)):
+        if (left := _left(other[2])) < most:
+            chosen, most = other, left
+    kind, smoothness, folds = chosen
     weight, _ = _settled_weights(seen, grid)
     profile = column_profile(seen)
     banded = seen._replace(inverse=seen.inverse - _in_cells(profile, shape)[seen.cell])
     field = solve(banded, kind.basis, weight, grid, smoothness)
-    along, square = np.sum([fold.projection for fold in folds], axis=0)
-    gain = float(np.clip(along / square, 0, 1)) if square > 0 else 0.0
+    gain = _gain([fold.projection for fold in folds])
     # What smoothing costs shows in a field that is less smooth.
-    rougher = solve(banded, kind.basis, weight, grid, [value / 4 for value in smoothness], field)
+    less = [value / _STEP for value in smoothness]
+    rougher = solve(banded, kind.basis, weight, grid, less, field)
     # What was scaled off may be true.
     offset, rough = (kind.linear[0] @ each for each in (field, rougher))
     biases = [gain * (rough - offset), (1 - gain) * offset]
@@ -169,8 +171,8 @@ class _Split(NamedTuple):
     bands: NDArray[np.float64]
 
 
-def _splits(seen: Sightings, shape: tuple[int, int], count: int) -> list[_Split]:
-    """Each of `count` blocks of frames, and the others."""
+def _splits(seen: Sightings, shape: tuple[int, int]) -> list[_Split]:
+    """Each block of frames, and the others."""
 
     def split(block: NDArray[np.intp]) -> _Split:
         frames = np.arange(len(seen.jumps))
@@ -184,7 +186,7 @@ def _splits(seen: Sightings, shape: tuple[int, int], count: int) -> list[_Split]
         return _Split(ends, out, train, test, weight, counts, bands)
 
     with ThreadPoolExecutor() as pool:
-        return list(pool.map(split, np.array_split(np.unique(seen.frame), count)))
+        return list(pool.map(split, np.array_split(np.unique(seen.frame), BLOCKS)))
 
 
 def _settled_weights(
@@ -229,15 +231,30 @@ def _folds(
     return result
 
 
-def _explained(folds: list[Fold]) -> float:
-    """Sum of the squares that the field takes away from the residuals of all blocks."""
-    return sum(fold.weight * (fold.before**2 - fold.after**2) for fold in folds)
+def _left(folds: list[Fold]) -> float:
+    """Sum of the squares of what the fields leave of the residuals of all blocks."""
+    return sum(fold.weight * fold.after**2 for fold in folds)
 
 
 def root_mean_square(parts: list[tuple[float, float]]) -> float:
     """Of parts with a weight and a root mean square each."""
     weight, value = np.array(parts, np.float64).T
     return float(np.sqrt((weight * value**2).sum() / weight.sum()))
+
+
+def _gain(projections: list[tuple[float, float]]) -> float:
+    """Share 0...1 of a field that is kept: what of it held, less what of that may be chance.
+
+    The ratio of the sums of `projection`, with the factor 1 - (standard error / ratio)^2 (James
+    and Stein 1961): little of a field that is known well, and most of one that is none.
+    """
+    along, square = np.array(projections).T
+    if along.sum() <= 0 or square.sum() <= 0:
+        return 0.0
+    ratio = along.sum() / square.sum()
+    variance = ((along - ratio * square) ** 2).sum() / square.sum() ** 2
+    variance *= len(along) / (len(along) - 1)
+    return float(np.clip(ratio - variance / ratio, 0, 1))
 
 
 def _in_cells(profile: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:

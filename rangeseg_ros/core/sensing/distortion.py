@@ -22,7 +22,7 @@ class DistortionError(ValueError):
 class DistortionMap:
     """Error of the inverse depth 1/z of every pixel, z along the optical axis.
 
-    The error at an inverse depth y is offset + slope y.
+    The error at an inverse depth y is offset + slope (y - reference).
 
     Attributes
     ----------
@@ -36,12 +36,15 @@ class DistortionMap:
         Change of the error with y; None where it does not depend on it.
     camera : Camera or None
         Whose images it is for; None where that is not known.
+    reference : float
+        Inverse depth at which the error is the offset, 1/m.
     """
 
     offset: NDArray[np.float32]
     deviation: NDArray[np.float32] | None = None
     slope: NDArray[np.float32] | None = None
     camera: Camera | None = None
+    reference: float = 0.0
 
     def corrected(self, image: RangeImage) -> RangeImage:
         """`image` without the distortion.
@@ -60,7 +63,7 @@ class DistortionMap:
         if self.slope is not None:
             with np.errstate(divide='ignore', invalid='ignore'):
                 inverse_depth = image.inverse / along
-            error = error + self.slope * inverse_depth
+            error = error + self.slope * (inverse_depth - np.float32(self.reference))
         if image.camera is None:
             error = error * along
         inverse = np.where(image.inverse > 0, image.inverse - error, np.float32(0))
