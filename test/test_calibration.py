@@ -10,7 +10,7 @@ from rangeseg_ros.core.calibration.calibrate import CalibrationError, calibrate
 from rangeseg_ros.core.calibration.field import solve
 from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
-from rangeseg_ros.core.calibration.validation import _splits, without_plane
+from rangeseg_ros.core.calibration.validation import _gain, _splits, without_plane
 from rangeseg_ros.simulation.fields import smooth_field
 
 
@@ -88,7 +88,10 @@ def test_slope_that_is_no_error_of_the_range_is_learned():
     cells = seen(40, lambda inverse: true_map(0.001) + slope * (inverse - 0.6))
     result = calibrate(cells, CAMERA.shape)
     assert result.distortion.slope is not None and len(result.smoothness) == 2
-    assert np.corrcoef(result.distortion.slope.ravel(), slope.ravel())[0, 1] > 0.6
+    learned, true = result.distortion.slope.ravel(), slope.ravel() - slope.mean()
+    assert np.corrcoef(learned, true)[0, 1] > 0.6
+    # Smoothing takes the rest.
+    assert 0.25 < learned @ true / (true @ true) < 1.1
 
 
 def test_frames_left_out_do_not_weigh_the_others():
@@ -115,6 +118,25 @@ def test_near_planes_that_are_much_noisier_do_not_outvote_the_others():
     result = calibrate(concatenate(cells), CAMERA.shape)
     assert rms(result.distortion.offset - true_map()) < 0.4 * rms(true_map())
     assert result.gain > 0.9 and result.after < 0.85 * result.before
+
+
+def test_wrong_regions_do_not_bend_the_field():
+    cells = []
+    for number, (labels, image) in enumerate(frames(40, true_map())):
+        # Two planes taken as one in every fourth frame.
+        wrong = np.ones_like(labels) if number % 4 == 0 else labels
+        cells.append(find_sightings(wrong, image))
+    offset = calibrate(concatenate(cells), CAMERA.shape).distortion.offset
+    assert rms(offset - true_map()) < 0.3 * rms(true_map())
+
+
+def test_share_that_is_kept_is_less_what_may_be_chance():
+    assert _gain([(2.0, 2.0)] * 5) == 1
+    assert _gain([(1.0, 2.0)] * 5) == pytest.approx(0.5)
+    # A ratio of 0.5 with a standard error of 0.25 by five blocks.
+    uneven = [0.5 + 0.25 * np.sqrt(20 / 4) * sign for sign in (-1, -1, 1, 1, 0)]
+    assert _gain([(along, 1.0) for along in uneven]) == pytest.approx(0.5 * (1 - 0.5**2))
+    assert _gain([(-1.0, 2.0)] * 5) == _gain([(0.0, 0.0)] * 5) == 0
 
 
 @pytest.mark.parametrize('seed', [0, 1])

@@ -1,17 +1,20 @@
 """The fixed distortion of a sensor: subtracted as the contract says, read from damaged files."""
 
+import json
+
 import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from PIL import Image, TiffImagePlugin
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
 from rangeseg_ros.cli.segment import command
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.distortion import load, read_distortion, write_distortion
+from rangeseg_ros.io.distortion import KIND, load, read_distortion, write_distortion
 from rangeseg_ros.io.images import write_image
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -101,6 +104,17 @@ def test_file_holds_the_map(tmp_path, pages, reference):
         _, images = cv2.imreadmulti(str(path), flags=cv2.IMREAD_UNCHANGED)
         assert len(images) == 4 and not images[2].any()
     assert [file.name for file in tmp_path.iterdir()] == ['map.tiff']
+
+
+def test_slope_has_one_page(tmp_path):
+    path = tmp_path / 'map.tiff'
+    pages = [Image.fromarray(smooth_map()) for _ in range(4)]
+    tags = TiffImagePlugin.ImageFileDirectory_v2()
+    for reference, words in ((0.6, 'a third page beside'), (None, 'damaged description')):
+        tags[270] = json.dumps({'kind': KIND, 'reference': reference})
+        pages[0].save(path, save_all=True, append_images=pages[1:], tiffinfo=tags)
+        with pytest.raises(DistortionError, match=words):
+            read_distortion(path)
 
 
 def test_maps_of_other_programs_are_read(tmp_path):

@@ -24,7 +24,7 @@ def column_profile(seen: Sightings) -> NDArray[np.float64]:
 
     Of `seen` the jumps count.
     """
-    total, count = seen.jumps.sum(axis=0)
+    total, count = _without_outliers(seen.jumps).sum(axis=0)
     change = total / np.maximum(count, 1)
     change -= median_filter(change, 2 * _REACH + 1, mode='nearest')
     # Columns seen in few rows are as much noisier.
@@ -33,3 +33,13 @@ def column_profile(seen: Sightings) -> NDArray[np.float64]:
     steps = np.where(np.abs(noise) > CERTAIN * max(spread, 1e-12), change, 0.0)
     profile: NDArray[np.float64] = np.concatenate([[0.0], np.cumsum(steps)])
     return profile - profile.mean()
+
+
+def _without_outliers(jumps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Jumps without those of single frames, as where a wrong region is of two planes."""
+    total, count = np.moveaxis(jumps, 1, 0)
+    each = np.ma.masked_array(total / np.maximum(count, 1), count == 0)
+    # As much noisier as they are of fewer rows.
+    off = np.abs(each - np.ma.median(each, axis=0)) * np.sqrt(count)
+    kept = off <= CERTAIN * 1.4826 * np.ma.median(off)
+    return jumps * np.ma.filled(kept, False)[:, None]
