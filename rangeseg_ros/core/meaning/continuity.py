@@ -28,6 +28,8 @@ BROAD = 3
 _HALF, _NEXT, _SECOND = 1, 1, 2
 # What a step between two cells must exceed, in standard deviations of the noise of one.
 _DIFFERENCE = OUTLIER * math.sqrt(2.0)
+_MEASURED, _BELOW, _BEYOND, _RIGHT = (np.uint8(bit) for bit in (1, 2, 4, 8))
+"""Bits of links, see `join_cells`."""
 # Cells without a measurement that a surface may reach across: the holes that are bridged, as a
 # cell has two rows of an image of VGA.
 _GAP = SPAN // 2
@@ -75,28 +77,13 @@ def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
     -------
     (B,) float64, one for each of `BASELINES`.
     """
-    result: NDArray[np.float64] = _noise_of(cells.inverse, sensor)
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _noise_of(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float64]:
-    rows, columns = inverse.shape
+    bends, counts = _bends_of(cells.inverse, sensor)
     found = np.ones(len(BASELINES))
-    bends = np.empty(rows * columns)
-    for b in range(len(BASELINES)):
-        k, count = BASELINES[b], 0
-        for i in range(k, rows - k, 2):
-            for c in range(0, columns, 4):
-                above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]
-                if above > 0 and middle > 0 and below > 0:
-                    bend = above - 2 * middle + below
-                    bends[count] = bend * bend / random_variance(sensor, middle * middle)
-                    count += 1
+    for b, count in enumerate(map(int, counts)):
         if count:
             rank = int(0.4 * count)
             # Of a normal distribution, 40 % lie within 0.524 standard deviations.
-            found[b] = np.sqrt(np.partition(bends[:count], rank)[rank] / 6) / 0.524
+            found[b] = np.sqrt(np.partition(bends[b, :count], rank)[rank] / 6) / 0.524
         elif b:
             found[b] = found[b - 1]
         # Never less than at shorter ones, nor than rounding makes.
@@ -104,28 +91,60 @@ def _noise_of(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.f
     return found
 
 
-def surfaces_of(
-    cells: Cells, steps: Steps
-) -> tuple[NDArray[np.int32], int, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Surfaces that no step divides.
+@njit(cache=True, nogil=True)
+def _bends_of(
+    inverse: NDArray[np.float32], sensor: SensorModel
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Squares of second differences over their variance, (B, N), and how many are known, (B,)."""
+    rows, columns = inverse.shape
+    bends = np.empty((len(BASELINES), -(-rows // 2) * -(-columns // 4)))
+    counts = np.zeros(len(BASELINES), np.int64)
+    for b in range(len(BASELINES)):
+        k, count = BASELINES[b], 0
+        for i in range(k, rows - k, 2):
+            for c in range(0, columns, 4):
+                above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]
+                if above > 0 and middle > 0 and below > 0:
+                    bend = above - 2 * middle + below
+                    bends[b, count] = bend * bend / random_variance(sensor, middle * middle)
+                    count += 1
+        counts[b] = count
+    return bends, counts
 
-    Returns
-    -------
-    surface : (rows, columns) int32
+
+class Surfaces(NamedTuple):
+    """Surfaces that no step divides, and what divides them, (rows, columns).
+
+    Attributes
+    ----------
+    label : (...) int32
         1...N, 0 for none.
     count : int
         N.
-    steep : (rows, columns) bool
+    steep : (...) bool
         Cells that lie in a step.
-    broken : (rows, columns) bool
+    broken : (...) bool
         Where a step is between a cell and the next measured one below.
+    links : (...) uint8
+        What else hangs together, see `join_cells`.
     """
+
+    label: NDArray[np.int32]
+    count: int
+    steep: NDArray[np.bool_]
+    broken: NDArray[np.bool_]
+    links: NDArray[np.uint8]
+
+
+def surfaces_of(cells: Cells, steps: Steps) -> Surfaces:
+    """Surfaces of an image."""
     steep, broken = (np.zeros(cells.error.shape, np.bool_) for _ in range(2))
     _mark(cells, steps, steep, broken)
     # Noise hides parts of a step.
     closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     steep = closed.view(np.bool_)
-    return *join_cells(cells, steps, (~steep).view(np.uint8), broken), steep, broken
+    links = _links_of(cells, steps, broken)
+    return Surfaces(*join_cells(links, (~steep).view(np.uint8)), steep, broken, links)
 
 
 @njit(cache=True, nogil=True)
@@ -205,17 +224,15 @@ def _is_step(
 
 
 @njit(cache=True, nogil=True)
-def join_cells(
-    cells: Cells, steps: Steps, part: NDArray[np.uint8], broken: NDArray[np.bool_]
-) -> tuple[NDArray[np.int32], int]:
-    """Surfaces of the cells of each part but 0, along links that are not broken; their number."""
+def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """What no step is between: see `join_cells`."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
     slope, up, down = np.float32(steps.slope), np.float32(steps.least), np.float32(steps.beside)
     factors = (_DIFFERENCE * steps.noise).astype(np.float32)
+    links = np.zeros((rows, columns), np.uint8)
     # Whether a step is between a cell and the one below, the next, and the next but one.
     below, beside, across = np.zeros((3, columns), np.bool_)
-    parent = np.arange(rows * columns, dtype=np.int32)
     for i in range(rows):
         # As vector instructions.
         if i + 1 < rows:
@@ -226,35 +243,76 @@ def join_cells(
         for c in range(columns - 2):
             across[c] = _is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
         for c in range(columns):
-            own = part[i, c]
-            if own == 0 or np.isnan(place[0, i, c]):
+            if np.isnan(place[0, i, c]):
                 continue
-            # The next measured cell below.
-            k = i + 1 if i + 1 < rows and not np.isnan(place[0, i + 1, c]) else i + 2
-            if k < rows and part[i + 1, c] == own and part[k, c] == own and not broken[i, c]:
-                apart = below[c]
-                if k > i + 1:
-                    apart = _is_step(place, error, factors[0], slope, up, down, i, c, k, c)
-                if not (apart or np.isnan(place[0, k, c])):
-                    _join(parent, i * columns + c, k * columns + c)
+            link = np.uint8(0)
+            if not broken[i, c] and i + 1 < rows:
+                if not np.isnan(place[0, i + 1, c]):
+                    link |= np.uint8(0) if below[c] else _BELOW
+                # The next measured cell below.
+                elif i + 2 < rows and not np.isnan(place[0, i + 2, c]):
+                    apart = _is_step(place, error, factors[0], slope, up, down, i, c, i + 2, c)
+                    link |= np.uint8(0) if apart else _BEYOND
             # The one to the right, where the next but one agrees on either side.
-            if c + 1 < columns and part[i, c + 1] == own and not np.isnan(place[0, i, c + 1]):
+            if c + 1 < columns and not np.isnan(place[0, i, c + 1]):
                 apart = beside[c] or (c + 2 < columns and across[c]) or (c > 0 and across[c - 1])
-                if not apart:
-                    _join(parent, i * columns + c, i * columns + c + 1)
-    label = np.zeros(rows * columns, np.int32)
+                link |= np.uint8(0) if apart else _RIGHT
+            links[i, c] = link | _MEASURED
+    return links
+
+
+@njit(cache=True, nogil=True)
+def join_cells(
+    links: NDArray[np.uint8], part: NDArray[np.uint8]
+) -> tuple[NDArray[np.int32], int]:
+    """Surfaces of the linked cells of each part but 0, and their number.
+
+    Parameters
+    ----------
+    links : (rows, columns) uint8
+        Bits: whether it is measured; whether it hangs together with the one below, with the next
+        but one below, across one that is not measured, with the one to the right.
+    part : (rows, columns) uint8
+        Cells of different parts do not hang together.
+    """
+    rows, columns = part.shape
+    label = np.zeros((rows, columns), np.int32)
+    parent = np.zeros(rows * columns + 1, np.int32)
     count = 0
     for i in range(rows):
         for c in range(columns):
-            if part[i, c] == 0 or np.isnan(place[0, i, c]):
+            own = part[i, c]
+            if own == 0 or links[i, c] == 0:
                 continue
-            # The root is the first of its surface.
-            root = _find(parent, i * columns + c)
-            if label[root] == 0:
+            found = 0
+            if c > 0 and links[i, c - 1] & _RIGHT and part[i, c - 1] == own:
+                found = label[i, c - 1]
+            if i > 0 and part[i - 1, c] == own:
+                other = 0
+                if links[i - 1, c] & _BELOW:
+                    other = label[i - 1, c]
+                elif i > 1 and links[i - 2, c] & _BEYOND and part[i - 2, c] == own:
+                    other = label[i - 2, c]
+                if other > 0 and other != found:
+                    found = other if found == 0 else _join(parent, found, other)
+            if found == 0:
                 count += 1
-                label[root] = count
-            label[i * columns + c] = label[root]
-    return label.reshape((rows, columns)), count
+                found = parent[count] = count
+            label[i, c] = found
+    # Roots are the first of their surfaces: in the order of their first cells.
+    number = np.zeros(count + 1, np.int32)
+    surfaces = 0
+    for k in range(1, count + 1):
+        root = _find(parent, k)
+        if root == k:
+            surfaces += 1
+            number[k] = surfaces
+        else:
+            number[k] = number[root]
+    for i in range(rows):
+        for c in range(columns):
+            label[i, c] = number[label[i, c]]
+    return label, surfaces
 
 
 @njit(cache=True, nogil=True)
@@ -266,7 +324,9 @@ def _find(parent: NDArray[np.int32], i: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _join(parent: NDArray[np.int32], i: int, k: int) -> None:
+def _join(parent: NDArray[np.int32], i: int, k: int) -> int:
+    """Their common root: the smaller one, so that it does not depend on the order."""
     a, b = _find(parent, i), _find(parent, k)
-    # The smaller root, so that the result does not depend on the order.
-    parent[max(a, b)] = min(a, b)
+    first, other = min(a, b), max(a, b)
+    parent[other] = first
+    return first

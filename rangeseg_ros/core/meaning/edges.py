@@ -39,7 +39,7 @@ def below_edges(
     cells : Cells
     steps : Steps
     steep, broken : (rows, columns) bool
-        See `surfaces_of`.
+        See `Surfaces`.
     turned : bool
         Whether up is down along the columns.
     rise : bool
@@ -47,10 +47,10 @@ def below_edges(
     """
     fallen = _fallen(-height if rise else height, cells.place, steps, steep, broken, turned, rise)
     result = np.zeros(fallen.shape, np.bool_)
-    for width in _BESIDE:
-        result |= (
-            2 * cv2.boxFilter(fallen.view(np.uint8) * np.uint8(width), -1, (width, 1)) > width
-        )
+    if fallen.any():
+        for width in _BESIDE:
+            number = cv2.boxFilter(fallen.view(np.uint8), -1, (width, 1), normalize=False)
+            result |= number > width // 2
     return result
 
 
@@ -71,50 +71,73 @@ def _fallen(
     """
     rows, columns = height.shape
     result = np.zeros((rows, columns), np.bool_)
-    total = np.empty((2, 4))
-    for c in range(columns):
-        near = np.nan  # mean height of the ground before
-        x = y = 0.0  # where that is, or its last cell
-        edge = fallen = False
-        for m in range(rows):  # outwards
-            i = m if turned else rows - 1 - m
-            # Between this cell and the one before.
-            edge |= broken[i, c] if not turned else m > 0 and broken[i - 1, c]
+    # Of each column: mean height of the ground before, where that is, or its last cell, whether an
+    # edge was passed since, and whether it has fallen.
+    near, (x, y) = np.full(columns, np.nan), np.zeros((2, columns))
+    edge, fallen = np.zeros((2, columns), np.bool_)
+    for m in range(rows):  # outwards
+        i = m if turned else rows - 1 - m
+        # Between these cells and those before.
+        before = i if not turned else i - 1
+        for c in range(columns):
+            edge[c] |= before >= 0 and broken[before, c]
             if np.isnan(height[i, c]) or steep[i, c]:
-                edge |= steep[i, c]
+                edge[c] |= steep[i, c]
                 continue
-            if edge:
-                # Sums of height and place beyond the edge, and farther away.
-                total[:] = 0
-                n = m
-                while total[1, 0] < 3 * _MEAN and n < rows:
-                    k = n if turned else rows - 1 - n
-                    if not (np.isnan(height[k, c]) or steep[k, c]):
-                        part = total[int(total[0, 0] >= _MEAN)]
-                        part[0] += 1
-                        part[1] += height[k, c]
-                        part[2] += place[1, k, c]
-                        part[3] += place[2, k, c]
-                    n += 1
-                _, far, p, q = total[0] / total[0, 0]
-                # A ramp that hides behind its edge falls on.
-                ramp = 0.0
-                if fallen:  # it takes more than a patch of noise to come back
-                    far = (total[0, 1] + total[1, 1]) / (total[0, 0] + total[1, 0])
-                elif total[1, 0] > 0:
-                    _, farther, v, w = total[1] / total[1, 0]
-                    fall = (far - farther) / np.sqrt((v - p) * (v - p) + (w - q) * (w - q))
-                    ramp = min(max(fall, 0.0), steps.slope)
-                    ramp *= np.sqrt((p - x) * (p - x) + (q - y) * (q - y))
-                fallen = near - far > steps.least + ramp
-                edge = False
-            result[i, c] = fallen
-            if not fallen:
-                share = 1.0 if np.isnan(near) or not rise else 1.0 / _MEAN
-                near = height[i, c] if np.isnan(near) else near + (height[i, c] - near) / _MEAN
-                x += (place[1, i, c] - x) * share
-                y += (place[2, i, c] - y) * share
+            if edge[c]:
+                far, ramp = _beyond(m, c, height, place, steps, steep, turned, fallen[c], x, y)
+                fallen[c] = near[c] - far > steps.least + ramp
+                edge[c] = False
+            result[i, c] = fallen[c]
+            if not fallen[c]:
+                first = np.isnan(near[c])
+                share = 1.0 if first or not rise else 1.0 / _MEAN
+                near[c] = height[i, c] if first else near[c] + (height[i, c] - near[c]) / _MEAN
+                x[c] += (place[1, i, c] - x[c]) * share
+                y[c] += (place[2, i, c] - y[c]) * share
     return result
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _beyond(
+    m: int,
+    c: int,
+    height: NDArray[np.float32],
+    place: NDArray[np.float32],
+    steps: Steps,
+    steep: NDArray[np.bool_],
+    turned: bool,
+    fallen: bool,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+) -> tuple[float, float]:
+    """Mean height from row m of column c outwards, and what of its fall a ramp may explain.
+
+    Ten parameters: what `_fallen` knows where it finds an edge.
+    """
+    rows = len(height)
+    # Sums of height and place beyond the edge, and farther away.
+    total = np.zeros((2, 4))
+    n = m
+    while total[1, 0] < 3 * _MEAN and n < rows:
+        k = n if turned else rows - 1 - n
+        if not (np.isnan(height[k, c]) or steep[k, c]):
+            part = total[int(total[0, 0] >= _MEAN)]
+            part[0] += 1
+            part[1] += height[k, c]
+            part[2] += place[1, k, c]
+            part[3] += place[2, k, c]
+        n += 1
+    _, far, p, q = total[0] / total[0, 0]
+    if fallen:  # it takes more than a patch of noise to come back
+        return (total[0, 1] + total[1, 1]) / (total[0, 0] + total[1, 0]), 0.0
+    if total[1, 0] == 0:
+        return far, 0.0
+    # A ramp that hides behind its edge falls on.
+    _, farther, v, w = total[1] / total[1, 0]
+    fall = (far - farther) / np.sqrt((v - p) * (v - p) + (w - q) * (w - q))
+    ramp = min(max(fall, 0.0), steps.slope)
+    return far, ramp * np.sqrt((p - x[c]) * (p - x[c]) + (q - y[c]) * (q - y[c]))
 
 
 @njit(cache=True, nogil=True)

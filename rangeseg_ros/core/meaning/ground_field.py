@@ -24,16 +24,16 @@ _PRIOR = 0.25
 
 
 def ground_field(
-    cells: Cells, on_ground: NDArray[np.bool_], base: NDArray[np.float64]
+    ground: list[NDArray[np.float64]],
+    measured: list[NDArray[np.float64]],
+    base: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Planes theta of the ground: theta . ray is its inverse range.
 
     Parameters
     ----------
-    cells : Cells
-        (rows, columns).
-    on_ground : (rows, columns) bool
-        Cells that are ground.
+    ground, measured : list of (M, N, 9) float64
+        See `levels_of`: of the ground, and of all cells.
     base : (3,) float64
         Plane under the robot.
 
@@ -41,41 +41,65 @@ def ground_field(
     -------
     (M, N, 3) float64, one for each block of the image.
     """
-    levels = [_moments(cells.ray, cells.inverse, on_ground)]
+    theta = np.array(base, np.float64).reshape(1, 1, 3)
+    for sums, squares in zip(reversed(ground), reversed(measured), strict=True):
+        theta = _fitted(sums, squares, theta)
+    return theta
+
+
+def levels_of(cells: Cells, where: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
+    """Sums of the regression of some measured cells.
+
+    Parameters
+    ----------
+    cells : Cells
+        (rows, columns).
+    where : (rows, columns) bool
+        Which ones.
+
+    Returns
+    -------
+    list of (M, N, 9) float64
+        ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse over blocks, over 2 x 2 blocks, and so
+        on up to the whole image.
+    """
+    levels = [_moments(cells.ray, cells.inverse, where)]
     while max(levels[-1].shape[:2]) > 1:
         levels.append(_halved(levels[-1]))
-    theta = np.array(base, np.float64).reshape(1, 1, 3)
-    for sums in reversed(levels):
-        theta = _fitted(sums, theta)
-    return theta
+    return levels
 
 
 @njit(cache=True, nogil=True)
 def _moments(
-    ray: NDArray[np.float32], inverse: NDArray[np.float32], on_ground: NDArray[np.bool_]
+    ray: NDArray[np.float32], inverse: NDArray[np.float32], where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Sums over blocks: ray ray^T (6), ray * inverse (3) of the ground; ray ray^T of all (6)."""
-    rows, columns = on_ground.shape
-    high, wide = -(-rows // _ROWS), -(-columns // _COLUMNS)
-    sums = np.zeros((high, wide, 15))
+    """See `levels_of`."""
+    rows, columns = where.shape
+    high = -(-rows // _ROWS)
+    sums = np.zeros((high, -(-columns // _COLUMNS), 9))
+    # Of the columns by themselves, as vector instructions.
+    total = np.empty((9, columns))
     for m in range(high):
-        for n in range(wide):
-            total = sums[m, n]
-            for i in range(m * _ROWS, min((m + 1) * _ROWS, rows)):
-                for c in range(n * _COLUMNS, min((n + 1) * _COLUMNS, columns)):
-                    value = inverse[i, c]
-                    if value == 0:
-                        continue
-                    x, y, z = ray[0, i, c], ray[1, i, c], ray[2, i, c]
-                    squares = (x * x, x * y, x * z, y * y, y * z, z * z)
-                    for k in range(6):
-                        total[9 + k] += squares[k]
-                    if on_ground[i, c]:
-                        for k in range(6):
-                            total[k] += squares[k]
-                        total[6] += x * value
-                        total[7] += y * value
-                        total[8] += z * value
+        total[:] = 0
+        for i in range(m * _ROWS, min((m + 1) * _ROWS, rows)):
+            for c in range(columns):
+                value = inverse[i, c]
+                there = where[i, c] & (value > 0)
+                x = ray[0, i, c] if there else np.float32(0)
+                y = ray[1, i, c] if there else np.float32(0)
+                z = ray[2, i, c] if there else np.float32(0)
+                total[0, c] += x * x
+                total[1, c] += x * y
+                total[2, c] += x * z
+                total[3, c] += y * y
+                total[4, c] += y * z
+                total[5, c] += z * z
+                total[6, c] += x * value
+                total[7, c] += y * value
+                total[8, c] += z * value
+        for c in range(columns):
+            for k in range(9):
+                sums[m, c // _COLUMNS, k] += total[k, c]
     return sums
 
 
@@ -83,37 +107,39 @@ def _moments(
 def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums of 2 x 2 neighbours."""
     rows, columns = sums.shape[:2]
-    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, 15))
+    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, 9))
     for i in range(rows):
         for j in range(columns):
-            for k in range(15):
+            for k in range(9):
                 result[i // 2, j // 2, k] += sums[i, j, k]
     return result
 
 
 @njit(cache=True, nogil=True)
-def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+def _fitted(
+    sums: NDArray[np.float64], squares: NDArray[np.float64], prior: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Planes that fit the ground in windows of 3 x 3 blocks, and all rays on the prior planes.
 
     `prior` has a plane for 2 x 2 blocks.
     """
     rows, columns = sums.shape[:2]
     theta = np.empty((rows, columns, 3))
-    window = np.empty(15)
+    # Sums of three blocks above each other.
+    high, wide = np.empty((2, columns, 9))
+    g, s = np.empty((2, 9))
     for i in range(rows):
+        _add_three(sums, i, high)
+        _add_three(squares, i, wide)
         for j in range(columns):
             p = prior[min(i // 2, prior.shape[0] - 1), min(j // 2, prior.shape[1] - 1)]
             theta[i, j] = p
-            window[:] = 0
-            for m in range(max(i - 1, 0), min(i + 2, rows)):
-                for n in range(max(j - 1, 0), min(j + 2, columns)):
-                    for k in range(15):
-                        window[k] += sums[m, n, k]
-            g = window
+            _add_beside(high, j, g)
             if g[0] + g[3] + g[5] == 0:
                 continue
-            a, b, c = g[0] + _PRIOR * g[9], g[1] + _PRIOR * g[10], g[2] + _PRIOR * g[11]
-            d, e, f = g[3] + _PRIOR * g[12], g[4] + _PRIOR * g[13], g[5] + _PRIOR * g[14]
+            _add_beside(wide, j, s)
+            a, b, c = g[0] + _PRIOR * s[0], g[1] + _PRIOR * s[1], g[2] + _PRIOR * s[2]
+            d, e, f = g[3] + _PRIOR * s[3], g[4] + _PRIOR * s[4], g[5] + _PRIOR * s[5]
             # What the ground is off the prior plane.
             x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
             y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
@@ -125,6 +151,25 @@ def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np
             theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
             theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
     return theta
+
+
+@njit(cache=True, inline='always')
+def _add_three(sums: NDArray[np.float64], i: int, total: NDArray[np.float64]) -> None:
+    """Sums of row i and those beside it."""
+    total[:] = 0
+    for m in range(max(i - 1, 0), min(i + 2, sums.shape[0])):
+        for j in range(len(total)):
+            for k in range(9):
+                total[j, k] += sums[m, j, k]
+
+
+@njit(cache=True, inline='always')
+def _add_beside(sums: NDArray[np.float64], j: int, total: NDArray[np.float64]) -> None:
+    """Sums of column j and those beside it."""
+    total[:] = 0
+    for n in range(max(j - 1, 0), min(j + 2, sums.shape[0])):
+        for k in range(9):
+            total[k] += sums[n, k]
 
 
 class GroundField(NamedTuple):
@@ -189,18 +234,25 @@ def spread_planes(field: GroundField, width: int) -> NDArray[np.float32]:
     """Planes of the ground at the columns of an image, (M, 4, width): theta, and theta . up."""
     theta, up = field.theta, field.up
     last = theta.shape[1] - 1
-    result = np.empty((theta.shape[0], 4, width), np.float32)
+    # Blocks beside a column, and how near it is to the right one. As they are not signed, the
+    # compiler need not look for negative indices.
+    left, right = np.empty((2, width), np.uint64)
+    share = np.empty(width)
     for j in range(width):
         x = min(max((j + 0.5) / field.columns - 0.5, 0.0), float(last))
         k = int(x)
-        m, u = min(k + 1, last), x - k
-        for i in range(theta.shape[0]):
-            rise = 0.0
-            for n in range(3):
-                value = theta[i, k, n] + u * (theta[i, m, n] - theta[i, k, n])
-                result[i, n, j] = value
-                rise += value * up[n]
-            result[i, 3, j] = rise
+        left[j], right[j], share[j] = k, min(k + 1, last), x - k
+    result = np.empty((theta.shape[0], 4, width), np.float32)
+    planes = np.empty((4, theta.shape[1]))
+    for i in range(theta.shape[0]):
+        for k in range(theta.shape[1]):
+            x, y, z = theta[i, k]
+            planes[0, k], planes[1, k], planes[2, k] = x, y, z
+            planes[3, k] = x * up[0] + y * up[1] + z * up[2]
+        for n in range(4):
+            for j in range(width):
+                value = planes[n, left[j]]
+                result[i, n, j] = value + share[j] * (planes[n, right[j]] - value)
     return result
 
 

@@ -88,7 +88,6 @@ def nearest_part(
     return near
 
 
-@njit(cache=True, nogil=True)
 def grown(
     height: NDArray[np.float32],
     cells: Cells,
@@ -114,34 +113,76 @@ def grown(
     -------
     (rows, columns) bool
     """
+    ground = seed.copy()
+    sums, rest, distance = _started(height, cells, candidate, seed)
+    # Numbers in the order of the distance, and then of the tiles: floats that are not negative
+    # are in the order of their bits.
+    tiles = np.flatnonzero(rest[..., 0])
+    keys = (distance.ravel()[tiles].view(np.int32).astype(np.int64) << 32) | tiles
+    keys.sort()
+    _grow(keys & 0xFFFFFFFF, height, cells, candidate, steps, sums, rest, ground)
+    return ground
+
+
+@njit(cache=True, nogil=True)
+def _started(
+    height: NDArray[np.float32],
+    cells: Cells,
+    candidate: NDArray[np.bool_],
+    seed: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+    """What the growth starts from.
+
+    Returns
+    -------
+    sums : (M, columns of tiles, 10) float64
+        Of the ground in a block of tiles: sums of the regression.
+    rest : (rows of tiles, columns of tiles, 4) float64
+        Of the candidates in a tile that are not ground: their number, and sums of height and
+        place.
+    distance : (rows of tiles, columns of tiles) float32
+        Of the nearest candidate of a tile, squared.
+    """
     rows, columns = height.shape
     place = cells.place
     high, wide = -(-rows // ROWS), -(-columns // COLUMNS)
-    # Of the ground in a block: sums of the regression. Of the candidates in a tile that are not
-    # ground: their number, and sums of height and place.
     sums = np.zeros((-(-high // _HIGH), wide, 10))
     rest = np.zeros((high, wide, 4))
-    ground = np.zeros((rows, columns), np.bool_)
-    distance = np.full(high * wide, np.float32(np.inf))
+    distance = np.full((high, wide), np.float32(np.inf))
     for i in range(rows):
         for c in range(columns):
-            m, n = i // ROWS, c // COLUMNS
             if seed[i, c]:
-                _add(sums, ground, height, cells, i, c)
+                _add(sums, height, cells, i, c)
             elif candidate[i, c]:
+                m, n = i // ROWS, c // COLUMNS
                 _count(rest[m, n], height, place, i, c, 1.0)
-            if candidate[i, c]:
                 x, y = place[1, i, c], place[2, i, c]
-                distance[m * wide + n] = min(distance[m * wide + n], x * x + y * y)
-    order = np.argsort(distance, kind='mergesort')
-    total = np.empty(10)
-    for turn in range(2):  # outwards, and back behind what stands in the way
+                distance[m, n] = min(distance[m, n], x * x + y * y)
+    return sums, rest, distance
+
+
+@njit(cache=True, nogil=True)
+def _grow(
+    order: NDArray[np.int64],
+    height: NDArray[np.float32],
+    cells: Cells,
+    candidate: NDArray[np.bool_],
+    steps: Steps,
+    sums: NDArray[np.float64],
+    rest: NDArray[np.float64],
+    ground: NDArray[np.bool_],
+) -> None:
+    """Grow tile by tile in that order, outwards, and back behind what stands in the way.
+
+    Eight parameters: a kernel that changes three arrays.
+    """
+    wide = rest.shape[1]
+    for turn in range(2):
         for k in range(len(order)):
             tile = order[k] if turn == 0 else order[len(order) - 1 - k]
             m, n = tile // wide, tile % wide
             if rest[m, n, 0] > 0:
-                _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground, total)
-    return ground
+                _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground)
 
 
 @njit(cache=True, nogil=True)
@@ -155,44 +196,38 @@ def _grow_tile(
     sums: NDArray[np.float64],
     rest: NDArray[np.float64],
     ground: NDArray[np.bool_],
-    total: NDArray[np.float64],
 ) -> None:
     """Accept the cells of tile (m, n) that agree with the ground around it, if their mean does.
 
-    Ten parameters: a kernel that changes three arrays, and one it need not make each time.
+    Nine parameters: a kernel that changes three arrays.
     """
-    b = m // _HIGH
-    total[:] = 0
-    for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
-        for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
-            for k in range(10):
-                total[k] += sums[i, j, k]
-    if total[9] < _ENOUGH:
+    w, wx, wy, wxx, wxy, wyy, wh, wxh, wyh, number = _around(sums, m // _HIGH, n)
+    if number < _ENOUGH:
         return
-    w = total[0]
-    x, y, h = total[1] / w, total[2] / w, total[6] / w
+    x, y, h = wx / w, wy / w, wh / w
     # The weights are those of the sensor model, which the image shows to err by a factor.
     # It starts from level: steeper than the steepest ground is certainly none.
     prior = (steps.noise[BROAD] * CERTAIN / steps.slope) ** 2
     xx, xy, yy = (
-        total[3] - w * x * x + prior,
-        total[4] - w * x * y,
-        total[5] - w * y * y + prior,
+        wxx - w * x * x + prior,
+        wxy - w * x * y,
+        wyy - w * y * y + prior,
     )
-    xh, yh = total[7] - w * x * h, total[8] - w * y * h
+    xh, yh = wxh - w * x * h, wyh - w * y * h
     determinant = xx * yy - xy * xy
     p, q = (yy * xh - xy * yh) / determinant, (xx * yh - xy * xh) / determinant
     steepness = np.sqrt(p * p + q * q)
     if steepness > steps.slope:
         p, q = p * steps.slope / steepness, q * steps.slope / steepness
     # Noise lets single cells of a step through, not the mean of what is not yet ground around.
-    off, count = 0.0, 0.0
+    count = rise = ahead = aside = 0.0
     for i in range(max(m - _BESIDE[0], 0), min(m + _BESIDE[0] + 1, rest.shape[0])):
         for j in range(max(n - _BESIDE[1], 0), min(n + _BESIDE[1] + 1, rest.shape[1])):
-            number = rest[i, j, 0]
-            count += number
-            off += rest[i, j, 1] - number * h
-            off -= p * (rest[i, j, 2] - number * x) + q * (rest[i, j, 3] - number * y)
+            count += rest[i, j, 0]
+            rise += rest[i, j, 1]
+            ahead += rest[i, j, 2]
+            aside += rest[i, j, 3]
+    off = rise - count * h - p * (ahead - count * x) - q * (aside - count * y)
     if abs(off) > count * steps.least:
         return
     place = cells.place
@@ -201,8 +236,28 @@ def _grow_tile(
             if candidate[i, c] and not ground[i, c]:
                 expected = h + p * (place[1, i, c] - x) + q * (place[2, i, c] - y)
                 if abs(height[i, c] - expected) <= steps.least:
-                    _add(sums, ground, height, cells, i, c)
+                    ground[i, c] = True
+                    _add(sums, height, cells, i, c)
                     _count(rest[m, n], height, place, i, c, -1.0)
+
+
+@njit(cache=True, inline='always')
+def _around(sums: NDArray[np.float64], b: int, n: int) -> tuple[float, ...]:
+    """Sums over three blocks by three, one by one, as the compiler keeps numbers in registers."""
+    w = x = y = xx = xy = yy = h = xh = yh = number = 0.0
+    for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
+        for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
+            w += sums[i, j, 0]
+            x += sums[i, j, 1]
+            y += sums[i, j, 2]
+            xx += sums[i, j, 3]
+            xy += sums[i, j, 4]
+            yy += sums[i, j, 5]
+            h += sums[i, j, 6]
+            xh += sums[i, j, 7]
+            yh += sums[i, j, 8]
+            number += sums[i, j, 9]
+    return w, x, y, xx, xy, yy, h, xh, yh, number
 
 
 @njit(cache=True, inline='always')
@@ -224,13 +279,11 @@ def _count(
 @njit(cache=True, inline='always')
 def _add(
     sums: NDArray[np.float64],
-    ground: NDArray[np.bool_],
     height: NDArray[np.float32],
     cells: Cells,
     i: int,
     c: int,
 ) -> None:
-    ground[i, c] = True
     total = sums[i // (ROWS * _HIGH), c // COLUMNS]
     w = 1 / max(cells.error[i, c] ** 2, np.float32(1e-10))
     place = cells.place

@@ -124,7 +124,7 @@ def _reaches(
         for c in range(surface.shape[1]):
             k = surface[i, c]
             if k:
-                z, x, y = cells.place[:, i, c]
+                z, x, y = cells.place[0, i, c], cells.place[1, i, c], cells.place[2, i, c]
                 way = np.sqrt(x * x + y * y)
                 sizes[k] += 1
                 reach[k] = min(reach[k], way)
@@ -154,7 +154,7 @@ def _sums(
             k = surface[i, c]
             if k == 0 or rank[k] < 0:
                 continue
-            z, x, y = cells.place[:, i, c]
+            z, x, y = cells.place[0, i, c], cells.place[1, i, c], cells.place[2, i, c]
             way = np.sqrt(x * x + y * y) - reach[k]
             if way > _WAYS[0]:
                 continue
