@@ -11,8 +11,9 @@ from scipy.special import ndtr
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.meaning.cells import Cells
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.continuity import BASELINES, Steps, surfaces_of
+from rangeseg_ros.core.meaning.continuity import surfaces_of
 from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
+from rangeseg_ros.core.meaning.steps import BASELINES, Steps
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -80,7 +81,7 @@ def test_below_a_drop_is_no_ground(depth, height):
 @pytest.mark.parametrize(('falls', 'blur', 'levels'), [(1, 2.0, 2), (1, 0.0, 1), (-1, 2.0, 1)])
 def test_a_step_down_that_the_sensor_smooths_is_one(falls, blur, levels):
     """Over the same way a ramp that is allowed falls as much; one up is given that chance."""
-    rows, columns = 40, 6
+    rows, columns = 240, 6
     place = np.zeros((3, rows, columns), np.float32)
     far = np.arange(rows)[::-1, None]  # the first row is farthest
     place[0] = -falls * 0.05 * ndtr((far - rows / 2) / 2)

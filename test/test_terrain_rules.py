@@ -8,18 +8,20 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.continuity import BASELINES, Steps
 from rangeseg_ros.core.meaning.edges import below_edges
 from rangeseg_ros.core.meaning.ground import CellTerrain
 from rangeseg_ros.core.meaning.ground_field import GroundField
 from rangeseg_ros.core.meaning.pixels import Said, pixels_of
 from rangeseg_ros.core.meaning.stairs import _find_level
+from rangeseg_ros.core.meaning.steps import BASELINES, Steps
 from rangeseg_ros.core.segmenter import STATED
 from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import ALL, Piece, Terrain, slab
 
 SLOPE = float(np.tan(np.radians(13.5)))
@@ -179,3 +181,30 @@ def test_a_level_that_noise_hides_is_not_the_ground_where_single_places_look_lik
     judged &= frame.crossing < 2.5
     assert judged.sum() > 1000
     assert (found[judged] == GROUND).mean() < 0.01
+
+
+def test_a_small_image_whose_floor_is_partly_hidden_has_ground():
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    down = camera.rays[..., 1]
+    floor = np.divide(0.8, down, out=np.full(camera.shape, 3.0), where=down > 0)
+    depth = np.round(1000 * np.minimum(floor, 3.0)).astype(np.uint16)
+    body = np.zeros(camera.shape, np.bool_)
+    body[44:, :20] = True
+    result = Segmenter(Config()).segment(RangeImage.from_depth(depth, camera).without(body))
+    np.testing.assert_array_equal(result.terrain == GROUND, (depth < 3000) & ~body)
+
+
+@pytest.mark.parametrize(
+    ('kind', 'seed', 'class_'), [('hole', 955078, DROP), ('low boxes', 955055, OBSTACLE)]
+)
+def test_little_is_called_ground_that_the_noise_nearly_hides(kind, seed, class_):
+    """A hole 6 cm deep at 2.5 m, and boxes of 5 to 7 cm beside ground that comes back."""
+    scene, sensor = terrain_scene(kind, seed), SENSORS['realsense'](seed)
+    frame = simulate_terrain(scene, sensor, seed=seed)
+    up, height = stated(scene, seed)
+    x, y, z = map(float, up)
+    config = Config(up_x=x, up_y=y, up_z=z, sensor_height=height)
+    terrain = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera)).terrain
+    there = (frame.terrain == class_) & (frame.crossing < 2.5)
+    inside = cv2.erode(there.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    assert inside.sum() > 2000 and (terrain[inside] == GROUND).mean() < 0.008

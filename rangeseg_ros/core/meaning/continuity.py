@@ -16,100 +16,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.sensing.bridges import SPAN
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
-from rangeseg_ros.core.significance import OUTLIER
+from rangeseg_ros.core.meaning.steps import BASELINES, DIFFERENCE, GAP, Steps, is_step
 
-BASELINES = (1, 2, 4, 8, 16)
-"""Rows between cells that are compared; neighbours are as far apart as four rows or more."""
-BROAD = 3
-"""Baseline of the noise that cells of a patch share."""
+# Rows of cells that an image must have for each row of a baseline: as a whole image has for the
+# longest one, to the nearest power of two. Across a small one, it would span wall and floor.
+_SPANNED = 240 / BASELINES[-1] / math.sqrt(2.0)
 # Baselines of the noise between the halves of a cell, its neighbours, and the next but one.
 _HALF, _NEXT, _SECOND = 1, 1, 2
-# What a step between two cells must exceed, in standard deviations of the noise of one.
-_DIFFERENCE = OUTLIER * math.sqrt(2.0)
 _MEASURED, _BELOW, _BEYOND, _RIGHT = (np.uint8(bit) for bit in (1, 2, 4, 8))
 """Bits of links, see `join_cells`."""
-# Cells without a measurement that a surface may reach across: the holes that are bridged, as a
-# cell has two rows of an image of VGA.
-_GAP = SPAN // 2
-
-
-class Steps(NamedTuple):
-    """What counts as a step.
-
-    Attributes
-    ----------
-    slope : float
-        Tangent of the steepest ground.
-    least : float
-        What the ground may differ by from where it is expected, metres.
-    beside : float
-        Height that the ground does not fall by between neighbours, metres.
-    noise : (B,) float64
-        See `noise_of`.
-    """
-
-    slope: float
-    least: float
-    beside: float
-    noise: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, slope: float, step: float, noise: NDArray[np.float64], blur: float) -> Steps:
-        """What tells a step of the least height, metres, from ground.
-
-        Half of it is not the same ground. Where the sensor smooths a step as a Gaussian kernel of
-        a width of `blur` cells does, neighbours show a part of it.
-        """
-        shown = math.erf(_GAP / (2 * math.sqrt(2) * blur)) if blur > 0 else 1.0
-        return cls(slope, step / 2, shown * step / 2, noise)
-
-
-def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
-    """What the cells of this image err by, relative to the sensor model, at each baseline.
-
-    On a plane the inverse range is linear along a column, so that second differences are noise.
-    Most cells lie on surfaces that are plane over these distances: the quantile 0.4 of what
-    they show, as a standard deviation.
-
-    Returns
-    -------
-    (B,) float64, one for each of `BASELINES`.
-    """
-    bends, counts = _bends_of(cells.inverse, sensor)
-    found = np.ones(len(BASELINES))
-    for b, count in enumerate(map(int, counts)):
-        if count:
-            rank = int(0.4 * count)
-            # Of a normal distribution, 40 % lie within 0.524 standard deviations.
-            found[b] = np.sqrt(np.partition(bends[b, :count], rank)[rank] / 6) / 0.524
-        elif b:
-            found[b] = found[b - 1]
-        # Never less than at shorter ones, nor than rounding makes.
-        found[b] = max(found[b], found[b - 1] if b else 0.05)
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _bends_of(
-    inverse: NDArray[np.float32], sensor: SensorModel
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Squares of second differences over their variance, (B, N), and how many are known, (B,)."""
-    rows, columns = inverse.shape
-    bends = np.empty((len(BASELINES), -(-rows // 2) * -(-columns // 4)))
-    counts = np.zeros(len(BASELINES), np.int64)
-    for b in range(len(BASELINES)):
-        k, count = BASELINES[b], 0
-        for i in range(k, rows - k, 2):
-            for c in range(0, columns, 4):
-                above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]
-                if above > 0 and middle > 0 and below > 0:
-                    bend = above - 2 * middle + below
-                    bends[b, count] = bend * bend / random_variance(sensor, middle * middle)
-                    count += 1
-        counts[b] = count
-    return bends, counts
 
 
 class Surfaces(NamedTuple):
@@ -152,7 +67,7 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
     """Mark steps along the columns of cells."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
-    slope, factor = np.float32(steps.slope), np.float32(_DIFFERENCE * steps.noise[_HALF])
+    slope, factor = np.float32(steps.slope), np.float32(DIFFERENCE * steps.noise[_HALF])
     for i in range(rows):
         for c in range(columns):
             bound = slope * cells.kink[1, i, c] + factor * error[i, c]
@@ -162,10 +77,12 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
     step = np.empty(columns, np.bool_)
     for b in range(len(BASELINES)):
         k = BASELINES[b]
-        factor = np.float32(_DIFFERENCE * steps.noise[b])
+        if k > 1 and k * _SPANNED > rows:
+            break
+        factor = np.float32(DIFFERENCE * steps.noise[b])
         # A step down, or along the view, is fatal where it is taken for a ramp; one up only hides.
         up, down = np.float32(steps.least), np.float32(steps.beside)
-        if k > _GAP:
+        if k > GAP:
             up = down = np.float32(np.inf)
         within[:] = 0
         last = 0
@@ -178,7 +95,7 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
                 continue
             # No branch, so that the compiler makes them vector instructions.
             for c in range(columns):
-                step[c] = _is_step(place, error, factor, slope, up, down, i, c, i + k, c)
+                step[c] = is_step(place, error, factor, slope, up, down, i, c, i + k, c)
             for c in range(columns):
                 if not step[c]:
                     continue
@@ -193,43 +110,13 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
                 last = max(last, end)
 
 
-@njit(cache=True, inline='always')
-def _is_step(
-    place: NDArray[np.float32],
-    error: NDArray[np.float32],
-    factor: np.float32,
-    slope: np.float32,
-    up: np.float32,
-    down: np.float32,
-    i: int,
-    c: int,
-    k: int,
-    m: int,
-) -> bool:
-    """Whether cells (i, c) and (k, m) differ by more than the ground may; false if unknown.
-
-    Ten parameters: two places, which kernels do not take as one, and the four numbers that tell
-    a step: standard deviations of the noise, the steepest ground, and what it may rise or fall by
-    beyond the noise.
-    """
-    x, y = place[1, i, c], place[2, i, c]
-    p, q = place[1, k, m], place[2, k, m]
-    rise = place[0, i, c] - place[0, k, m]
-    way = np.sqrt((x - p) * (x - p) + (y - q) * (y - q))  # several times faster than hypot
-    chance = factor * max(error[i, c], error[k, m])
-    # Neighbours in a row are along the view.
-    farther = x * x + y * y - p * p - q * q
-    least = up if (i != k) & (rise * farther > 0) else down
-    return abs(rise) > min(slope * way + chance, max(least, chance))
-
-
 @njit(cache=True, nogil=True)
 def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """What no step is between: see `join_cells`."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
     slope, up, down = np.float32(steps.slope), np.float32(steps.least), np.float32(steps.beside)
-    factors = (_DIFFERENCE * steps.noise).astype(np.float32)
+    factors = (DIFFERENCE * steps.noise).astype(np.float32)
     links = np.zeros((rows, columns), np.uint8)
     # Whether a step is between a cell and the one below, the next, and the next but one.
     below, beside, across = np.zeros((3, columns), np.bool_)
@@ -237,11 +124,11 @@ def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[
         # As vector instructions.
         if i + 1 < rows:
             for c in range(columns):
-                below[c] = _is_step(place, error, factors[0], slope, up, down, i, c, i + 1, c)
+                below[c] = is_step(place, error, factors[0], slope, up, down, i, c, i + 1, c)
         for c in range(columns - 1):
-            beside[c] = _is_step(place, error, factors[_NEXT], slope, up, down, i, c, i, c + 1)
+            beside[c] = is_step(place, error, factors[_NEXT], slope, up, down, i, c, i, c + 1)
         for c in range(columns - 2):
-            across[c] = _is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
+            across[c] = is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
         for c in range(columns):
             if np.isnan(place[0, i, c]):
                 continue
@@ -251,7 +138,7 @@ def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[
                     link |= np.uint8(0) if below[c] else _BELOW
                 # The next measured cell below.
                 elif i + 2 < rows and not np.isnan(place[0, i + 2, c]):
-                    apart = _is_step(place, error, factors[0], slope, up, down, i, c, i + 2, c)
+                    apart = is_step(place, error, factors[0], slope, up, down, i, c, i + 2, c)
                     link |= np.uint8(0) if apart else _BEYOND
             # The one to the right, where the next but one agrees on either side.
             if c + 1 < columns and not np.isnan(place[0, i, c + 1]):
@@ -262,9 +149,7 @@ def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[
 
 
 @njit(cache=True, nogil=True)
-def join_cells(
-    links: NDArray[np.uint8], part: NDArray[np.uint8]
-) -> tuple[NDArray[np.int32], int]:
+def join_cells(links: NDArray[np.uint8], part: NDArray[np.uint8]) -> tuple[NDArray[np.int32], int]:
     """Surfaces of the linked cells of each part but 0, and their number.
 
     Parameters

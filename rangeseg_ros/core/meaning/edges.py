@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
 from rangeseg_ros.core.meaning.classes import GROUND
-from rangeseg_ros.core.meaning.continuity import Steps
+from rangeseg_ros.core.meaning.steps import Steps
 
 # Cells along a column whose mean tells a level.
 _MEAN = 4

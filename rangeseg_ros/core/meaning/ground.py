@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +16,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.beside import around, sides_of
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, cells_of
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.continuity import BROAD, Steps, join_cells, noise_of, surfaces_of
+from rangeseg_ros.core.meaning.continuity import join_cells, surfaces_of
 from rangeseg_ros.core.meaning.edges import below_edges, ends_of, feet_of
 from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
@@ -25,6 +26,7 @@ from rangeseg_ros.core.meaning.ground_field import (
 )
 from rangeseg_ros.core.meaning.growth import grown, nearest_part
 from rangeseg_ros.core.meaning.pixels import Said, pixels_of
+from rangeseg_ros.core.meaning.steps import BROAD, Steps, noise_of
 from rangeseg_ros.core.meaning.under_robot import Stand, stand
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -32,6 +34,8 @@ from rangeseg_ros.core.significance import SAMPLES
 
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
+# Cells that the edge of a drop is blurred over: four pixels of VGA, twice the noise's correlation.
+_BLUR = np.ones((5, 3), np.uint8)
 # Share of the least obstacle or drop that no noise excuses.
 _EXCUSED = 0.8
 
@@ -182,23 +186,34 @@ def _terrain(
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
     measured = levels_of(cells, cells.inverse > 0)
-    field = GroundField.of(ground_field(levels_of(cells, ground), measured, under.theta), size, up)
+    seen = levels_of(cells, ground)
+    field = GroundField.of(ground_field(seen, measured, under.theta), size, up)
     height = cell_heights(cells, field, size)
     part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
     part[steep | ground] = 0
-    surface, count = join_cells(links, part)
-    beyond = np.zeros(count + 1, np.bool_)
-    beyond[surface[fallen]] = True
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
-    sizes, side, blur = sides_of(height, unsure, surface, around(ground), count)
-    large = sizes >= SAMPLES
-    # Beyond an edge, where the noise would hide a drop, it is not known what is level.
-    hidden = beyond & (blur > limits.drop - steps.least)
-    level = large & (np.abs(side) <= steps.least) & ~hidden
+    near, low = around(ground), height <= steps.least
+    for _ in range(2):
+        surface, count = join_cells(links, part)
+        beyond = np.zeros(count + 1, np.bool_)
+        beyond[surface[fallen]] = True
+        sizes, side, blur = sides_of(height, unsure, surface, near, count)
+        large = sizes >= SAMPLES
+        # Beyond an edge, where the noise would hide a drop, it is not known what is level.
+        hidden = beyond & (blur > limits.drop - steps.least)
+        level = large & (np.abs(side) <= steps.least) & ~hidden
+        # Most of the columns around have risen and the ground goes on in others: what is as low
+        # as ground may be is looked at by itself, or a box beside it would be level with it.
+        mixed = risen & low & level.take(surface)
+        if not mixed.any():
+            break
+        part[mixed] = 1
+        risen &= ~mixed
     if level.any():
         ground |= level.take(surface)  # several times faster than level[surface]
-        field = GroundField.of(ground_field(levels_of(cells, ground), measured, under.theta), size, up)
+        seen = levels_of(cells, ground)
+        field = GroundField.of(ground_field(seen, measured, under.theta), size, up)
         height = cell_heights(cells, field, size)
     # Little pieces among the ground are its noise.
     verdict = np.where(beyond, np.int8(UNKNOWN), np.int8(GROUND))
@@ -215,6 +230,9 @@ def _terrain(
     )
     said[feet_of(height, steep, rise, steps.least, turned)] = OBSTACLE
     doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
+    # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
+    deep = (said == DROP) | (said == HIDDEN) & (height < 0)
+    doubt[cv2.dilate(deep.view(np.uint8), _BLUR).view(np.bool_)] = 0
     bounds = limits.obstacle / 2, limits.drop / 2
     classes, heights = pixels_of(image, field, size, Said(said, doubt, unsure), bounds)
     if known[0] == 0:

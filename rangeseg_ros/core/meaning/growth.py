@@ -12,7 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.meaning.continuity import BROAD, Steps
+from rangeseg_ros.core.meaning.steps import BROAD, Steps
 from rangeseg_ros.core.meaning.under_robot import NEAR, solve_plane
 from rangeseg_ros.core.significance import CERTAIN
 
