@@ -90,7 +90,7 @@ def test_a_step_down_that_the_sensor_smooths_is_one(falls, blur, levels):
     flat = np.zeros((rows, columns), np.float32)
     cells = Cells(place, flat + 1, place, flat + 1e-6, np.zeros((2, rows, columns), np.float32))
     slope = float(np.tan(np.radians(13.5)))
-    count = surfaces_of(cells, Steps.of(slope, 0.05, np.ones(len(BASELINES)), blur)).count
+    count = surfaces_of(cells, Steps.of(slope, 0.05, np.ones(len(BASELINES)), blur)).number
     assert count == levels
 
 

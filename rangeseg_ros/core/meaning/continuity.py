@@ -34,7 +34,7 @@ class Surfaces(NamedTuple):
     ----------
     label : (...) int32
         1...N, 0 for none.
-    count : int
+    number : int
         N.
     steep : (...) bool
         Cells that lie in a step.
@@ -45,7 +45,7 @@ class Surfaces(NamedTuple):
     """
 
     label: NDArray[np.int32]
-    count: int
+    number: int
     steep: NDArray[np.bool_]
     broken: NDArray[np.bool_]
     links: NDArray[np.uint8]

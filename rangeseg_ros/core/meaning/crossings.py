@@ -66,7 +66,9 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
         completed = completed_rays(image)
         if completed is None:
             return np.zeros((0, 4), np.float32)
-        image = replace(image, rays=completed[0])
+        rays = completed[0]
+        rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
+        image = replace(image, rays=rays)
         opened[~completed[1]] = 0
     found = find_crossings(image, terrain, opened > 0)
     nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
