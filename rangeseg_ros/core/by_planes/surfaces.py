@@ -25,8 +25,9 @@ DISTORTION_PIXELS = 2000.0
 # Systematic variances granted between neighbouring patches, and within a surface (4 standard
 # deviations).
 _BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
-# Blocks of the smallest patch: one or two hardly determine the direction of a plane.
-_BLOCKS_OF_PATCH = 3
+# Blocks of the smallest patch, two by two: fewer hardly determine the direction of a plane, and
+# where a face is rough they are splinters of it.
+_BLOCKS_OF_PATCH = 4
 # Pixels of the largest: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
 _PATCH_LARGEST = 1504
 
