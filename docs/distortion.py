@@ -52,11 +52,15 @@ def halves(folder):
         learned = calibrate(own, camera.shape, camera).distortion
         maps.append(learned)
         v, u = (np.rint(each).astype(int) for each in pixels(other, camera))
-        error = learned.offset[v, u].astype(float)
+        alone = learned.offset[v, u].astype(float)
+        error = alone.copy()
         if learned.slope is not None:
             error += learned.slope[v, u] * (other.inverse - learned.reference)
-        before, after = (rms(residuals(other, other.inverse - e)) for e in (0, error))
+        before, after, page1 = (
+            rms(residuals(other, other.inverse - each)) for each in (0, error, alone)
+        )
         print(f'{name} half: {before:.5f} to {after:.5f} / m, {1 - after / before:.0%} less')
+        print(f'with page 1 alone to {page1:.5f} / m, {1 - page1 / before:.0%} less')
     known = (maps[0].deviation > 0) & (maps[1].deviation > 0)
     one, two = (each.offset[known] for each in maps)
     print(f'correlation of the fields {np.corrcoef(one, two)[0, 1]:.2f}')
