@@ -7,7 +7,7 @@ from calibration_frames import CAMERA, NOISE, frames, rms, true_map
 from rangeseg_ros import RangeImage
 from rangeseg_ros.core.calibration.bands import column_profile
 from rangeseg_ros.core.calibration.calibrate import CalibrationError, calibrate
-from rangeseg_ros.core.calibration.field import solve
+from rangeseg_ros.core.calibration.field import _roughness, solve
 from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import _gain, _splits, without_plane
@@ -178,6 +178,21 @@ def test_joint_solution_is_that_of_dense_least_squares():
     assert without_plane(found.reshape(grid), known) == pytest.approx(
         expected, abs=0.02 * rms(expected)
     )
+
+
+def test_smoothness_does_not_punish_what_is_free():
+    v, u = np.indices((6, 9)).astype(float)
+    offset, slope = (_roughness(u.shape, place) for place in (0, 1))
+
+    def roughness(matrix, field):
+        return field.ravel() @ (matrix @ field.ravel())
+
+    assert roughness(offset, 2 * u - v + 3) == pytest.approx(0, abs=1e-9)
+    # Second differences: none along rows and columns, 1 in each of 5 x 8 corners, counted twice.
+    assert roughness(offset, u * v) == pytest.approx(2 * 5 * 8)
+    assert roughness(offset, u * u) == pytest.approx(2**2 * 6 * 7)
+    assert roughness(slope, np.ones_like(u)) == pytest.approx(0, abs=1e-9)
+    assert roughness(slope, u) == pytest.approx(6 * 8)
 
 
 def test_noise_and_what_remains_are_measured():
