@@ -22,7 +22,7 @@ from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.by_planes import method
 from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weigh_blocks, whole_blocks
 from rangeseg_ros.core.by_planes.patches import grow_patches
-from rangeseg_ros.core.by_planes.surfaces import _PATCH_LARGEST, join_surfaces
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.calibration.calibrate import calibrate
 from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import without_plane
@@ -146,11 +146,13 @@ def stages(image, config):
 
     moments = weigh_blocks(blocks, whole, sensor)
     links = block_links(grid, size)
-    roots = grow_patches(0, len(moments), moments, *links, _PATCH_LARGEST)
+    roots = grow_patches(
+        0, len(moments), moments, *links, sensor.distortion_pixels, sensor.agreement
+    )
     patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
     alone = np.bincount(patch.ravel())[patch] == 1
     pictures['patches'] = over(image, np.where(alone, 0, patch), size)
-    surface, _ = join_surfaces(moments, links, size, least // 2)
+    surface, _ = join_surfaces(moments, links, size, sensor, least // 2)
     pictures['surfaces'] = over(image, surface, size)
 
     labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)

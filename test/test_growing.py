@@ -35,7 +35,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, 4), model)
-    return join_surfaces(blocks, block_links(edges, 4), 4, least)
+    return join_surfaces(blocks, block_links(edges, 4), 4, model, least)
 
 
 def covered(labels, label):
@@ -138,7 +138,10 @@ def test_clutter_is_no_surface():
 
 def test_nothing_to_grow_from():
     labels, moments = join_surfaces(
-        np.zeros((5, 7, 13)), (np.ones((5, 6), bool), np.ones((4, 7), bool)), 4
+        np.zeros((5, 7, 13)),
+        (np.ones((5, 6), bool), np.ones((4, 7), bool)),
+        4,
+        SensorModel.from_config(Config()),
     )
     assert not labels.any() and labels.shape == (5, 7)
     assert moments.shape == (1, 13) and not moments.any()

@@ -47,11 +47,11 @@ def random_case(seed, height, width, count=3):
     for edge in edges:
         edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
     # Half of chi-squared, one to four variances granted.
-    price = 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)])
+    half_precision = 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)])
     box = np.array([[0, 0, 0, 0]] + count * [[0, 0, -(-height // BLOCK), -(-width // BLOCK)]])
     area = box[:, 2] * box[:, 3]
     shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
-    models = Models(theta, price, Shifts(box, np.cumsum(area) - area, shift))
+    models = Models(theta, half_precision, Shifts(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
     return Problem.of(image, SENSOR, edges, BLOCK, LAMBDA), models, labels.astype(np.int32)
 
@@ -67,7 +67,7 @@ def unary(problem, models):
         shift[top : top + rows, left : left + columns] = values.reshape(rows, columns)
         level[label] *= 1 + shift[row // BLOCK, column // BLOCK]
     residual = problem.inverse - level
-    cost = np.minimum(residual**2 * problem.weight * models.price[:, None], 8.0)
+    cost = np.minimum(residual**2 * problem.weight * models.half_precision[:, None], 8.0)
     cost[0] = 10.8276 / 2  # chi-squared of one degree of freedom, quantile 0.999
     return np.where(problem.weight > 0, cost, 0).reshape(len(cost), -1, problem.width)
 
@@ -244,7 +244,7 @@ def small_room(seed=900):
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
-    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK)
+    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK, sensor)
     return Problem.of(image, sensor, edges, BLOCK, LAMBDA), (found[0], blocks, found[1]), sensor
 
 
@@ -325,5 +325,5 @@ def test_moments_of_regions_are_sums_over_their_pixels():
         square = np.einsum('n,ni,nj->ij', w, rays, rays)[np.triu_indices(3)]
         expected = [*square, *(w * y) @ rays, w @ y**2, mask.sum(), w.sum() * 0.003**2]
         np.testing.assert_allclose(moments[label, : RATIO + 1], expected, rtol=1e-9)
-    theta = Models.of(moments).theta
+    theta = Models.of(moments, problem.smooth).theta
     assert not theta[0].any() and theta[1:].any(axis=1).all()

@@ -23,7 +23,7 @@ def test_shifts_are_the_weighted_residuals_around():
         y = ray @ theta[surfaces[place]] + residual
         square = np.einsum('ni,nj->ij', ray, ray)[np.triu_indices(3)]
         blocks[place] = [*square, *(y @ ray), y @ y, 16, 32, 0]
-    found = shifts(surfaces, blocks, theta, 2, agreement)
+    found = shifts(surfaces, blocks, theta, 2, 3, agreement)
     for place in np.ndindex(rows, columns):
         for label in (1, 2):
             level, residual, ratio = [], [], 0.0

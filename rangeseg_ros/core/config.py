@@ -12,6 +12,8 @@ from rangeseg_ros.core.options import ConfigError, checked, option
 
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
 PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
+VGA = 640 * 480
+"""Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
 
 
 @dataclass(frozen=True)
@@ -193,8 +195,9 @@ class Config:
         0.0, 'smooth systematic error of the range, metres', low=0.0, high=10.0
     )
     distortion_length: float = option(
-        35.0,
-        'width of the Gaussian the distortion looks smoothed with, pixels',
+        0.0,
+        'width of the Gaussian the distortion looks smoothed with, pixels; 0 follows the size of '
+        'the image: 35 of VGA',
         low=0.0,
         high=10000.0,
     )

@@ -6,11 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import CHUNK, Grid
-
-VGA = 640 * 480
-"""Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
 
 
 def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:

@@ -214,7 +214,7 @@ class Segmenter:
 
     def _segment(self, image: RangeImage, config: Config, watch: Stopwatch) -> Segmentation:
         blocks = Blocks.of(image)
-        sensor = SensorModel.from_config(config)
+        stated = sensor = SensorModel.from_config(config, image.shape)
         if config.sensor_model == 'measured':
             sensor = measured_sensor(image, blocks, sensor)
         watch.lap('noise')
@@ -237,7 +237,7 @@ class Segmenter:
             regions, fits = by_planes.unite_regions(regions, image, blocks, sensor, grid)
         else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
-            fits = Fits.of(regions, image, SensorModel.from_config(config), blocks)
+            fits = Fits.of(regions, image, stated, blocks)
         planes = describe_regions(regions, whole, fits)
         if len(planes) < regions.max():
             # Of some no plane is known: a pixel or two, or so steep that they have no end.

@@ -7,7 +7,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.interior import fill
-from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import (
@@ -23,12 +22,13 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has
-# 0.6 of its overall standard deviation at 10^4 pixels and grows as A^0.39. Real planes stay
-# within two and a half times that, and the distortion is measured to within a tenth.
-_SHARE, _PIXELS, _EXPONENT = 1.7**2, 1e4, 0.78
-# Chi-squared of three terms of curvature, for pixels of whose noise nine agree.
-_NOISE = 9 * chi2_quantile(3, 0.99)
+# The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has a
+# quarter of its overall standard deviation over a square as wide as itself and grows as A^0.39.
+# Real planes stay within two and a half times that, and the distortion is measured to within a
+# tenth.
+_SHARE, _EXPONENT = 0.75**2, 0.78
+# Chi-squared of three terms of curvature, for pixels whose noise is independent.
+_CHI2_LIMIT = chi2_quantile(3, 0.99)
 # Rows and columns from one pixel that is looked at to the next.
 _STRIDE = 2
 # Exponents of x and y in the terms of a quadratic, in the powers of x and y up to the fourth, and
@@ -84,10 +84,10 @@ def find_curved(
     # What the quadratic explains more than its constant and linear terms do.
     whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
     bending = (whole - flat) / size
-    distortion = _SHARE * ratio * (covered / (regions.size / VGA * _PIXELS)) ** _EXPONENT
+    distortion = _SHARE * ratio * (covered / max(sensor.distortion_pixels, 1.0)) ** _EXPONENT
     # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
     noise = np.maximum((square - whole) / size, 1)
-    visible = bending > distortion + _NOISE * noise / size
+    visible = bending > distortion + sensor.correlated * _CHI2_LIMIT * noise / size
     result = visible & (bending * (scale / size) ** 2 > flatness**2 * area * covered / size)
     result[0] = False
     return result

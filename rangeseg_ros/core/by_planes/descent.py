@@ -71,7 +71,7 @@ def _take_nearest(
     for bi in range(first, after):
         top, bottom = bi * block, min((bi + 1) * block, height)
         for bj in range(columns):
-            # A plane at infinity explains nothing; one of no price explains all.
+            # A plane at infinity explains nothing; one of precision 0 explains all.
             plane = 0.0, 0.0, 0.0, 0.0, np.inf
             candidates[bj, 0] = np.int32(highest[bi, bj])
             count[bj] = candidates[bj, 0] > 0
@@ -141,13 +141,13 @@ def _take_first(
     cost: NDArray[np.float32],
 ) -> None:
     """Give each pixel of a row its first candidate, or none where that costs more."""
-    a, b, c, scale, price = planes[0], planes[1], planes[2], planes[3], planes[4]
+    a, b, c, scale, half_precision = planes[0], planes[1], planes[2], planes[3], planes[4]
     # Without branches, and the rays' components in one row, so that the compiler takes many pixels
     # at a time.
     for j in range(len(labels)):
         level = a[j] * rays[3 * j] + b[j] * rays[3 * j + 1] + c[j] * rays[3 * j + 2]
         residual = inverse[j] - scale[j] * level
-        value = np.float32(min(price[j] * weight[j] * residual * residual, CAP))
+        value = np.float32(min(half_precision[j] * weight[j] * residual * residual, CAP))
         measured, better = weight[j] > 0, value < np.float32(NO_PLANE)
         labels[j] = label[j] if measured & better else np.int32(0)
         cost[j] = (value if better else np.float32(NO_PLANE)) if measured else np.float32(0)

@@ -77,7 +77,7 @@ def refine(
         The planes the labelling was found for.
     """
     starts = surfaces.astype(np.int32)
-    models = _shifted(Models.of(moments, problem.enlarged), starts, blocks, sensor)
+    models = _shifted(Models.of(moments, problem.smooth), starts, blocks, sensor, problem.block)
     labels, cost = descended(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
@@ -87,8 +87,11 @@ def refine(
         arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
         weight = problem.weight.reshape(shape)
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
-        refitted = Models.of(moments, problem.enlarged)._replace(price=models.price)
-        refitted, better = _shifted(refitted, starts, blocks, sensor), labels.copy()
+        refitted = Models.of(moments, problem.smooth)._replace(
+            half_precision=models.half_precision
+        )
+        refitted = _shifted(refitted, starts, blocks, sensor, problem.block)
+        better = labels.copy()
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains, cuts)
         last, value = value, energy(better, problem, refitted)
         if value >= last - LEAST_GAIN:
@@ -98,10 +101,18 @@ def refine(
 
 
 def _shifted(
-    models: Models, surfaces: NDArray[np.int32], blocks: NDArray[np.float64], sensor: SensorModel
+    models: Models,
+    surfaces: NDArray[np.int32],
+    blocks: NDArray[np.float64],
+    sensor: SensorModel,
+    block: int,
 ) -> Models:
-    """Models with the shifts of their planes wherever they may be labels."""
-    local = shifts(surfaces, blocks, models.theta, _DOMAIN, sensor.agreement)
+    """Models with the shifts of their planes wherever they may be labels.
+
+    Windows as wide as the distortion tell them: where it changes, larger ones tell another's.
+    """
+    around = int(sensor.distortion_length / block - 1) // 2
+    local = shifts(surfaces, blocks, models.theta, _DOMAIN, around, sensor.agreement)
     return models._replace(shifts=local)
 
 

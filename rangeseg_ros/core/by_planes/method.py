@@ -21,7 +21,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.interior import Inside
-from rangeseg_ros.core.regions import VGA, by_falling_size, drop_regions, least_pixels, relabel
+from rangeseg_ros.core.regions import by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, block_moments, quads
@@ -100,9 +100,8 @@ def segment(
     pending = submit(Problem.of, image, sensor, grid, size, config.plane_smoothness)
     # A region may gain as much again from pixels that no block could take.
     least = max(least_pixels(config.min_pixels, image.shape) // 2, 1)
-    enlarged = image.inverse.size / VGA
     weights = weigh_blocks(blocks, whole, sensor)
-    surface, moments = join_surfaces(weights, block_links(grid, size), size, least, enlarged)
+    surface, moments = join_surfaces(weights, block_links(grid, size), size, sensor, least)
     problem = pending.result()
     lap('surfaces')
     cuts = Work.within(config.work_budget).cuts

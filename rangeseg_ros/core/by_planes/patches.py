@@ -6,11 +6,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# Chi-squared of the three degrees of freedom of a plane, for pixels of whose noise four agree.
-_NOISE = 4 * chi2_quantile(3)
+# Chi-squared of the three degrees of freedom of a plane, times what parts of a face differ by
+# beyond their errors.
+_CHI2_LIMIT = RESIDUE * chi2_quantile(3)
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
 # are merged at once: quantile 0.996.
 _CLEAR = 24.0
@@ -33,6 +35,7 @@ def grow_patches(
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
     largest: float,
+    agreement: float,
 ) -> NDArray[np.intp]:
     """Group some rows of blocks into patches.
 
@@ -46,6 +49,8 @@ def grow_patches(
         Whether a block is connected to its right, its lower neighbour.
     largest : float
         Pixels of the largest patch.
+    agreement : float
+        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
 
     Returns
     -------
@@ -63,7 +68,7 @@ def grow_patches(
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     pairs = _pairs(smooth.reshape(shape), right, below)
     parent = _quads(blocks, residual, smooth.reshape(shape), right, below, largest)
-    return _grow(blocks, residual, smooth, pairs, parent, largest) + first * shape[1]
+    return _grow(blocks, residual, smooth, pairs, parent, largest, agreement) + first * shape[1]
 
 
 @njit(cache=True)
@@ -89,7 +94,9 @@ def _pairs(
 
 
 @njit(cache=True)
-def misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float) -> float:
+def misfit(
+    extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float, agreement: float
+) -> float:
     """How far two parts leave a common plane, in what noise and distortion are granted.
 
     Parameters
@@ -102,6 +109,8 @@ def misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, granted: 
         The two.
     granted : float
         Systematic variances.
+    agreement : float
+        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
 
     Returns
     -------
@@ -111,7 +120,7 @@ def misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, granted: 
     first, second = moments[k, COUNT], moments[m, COUNT]
     pixels = first + second
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
-    return extra / (_NOISE + granted * ratio * first * second / pixels)
+    return extra / (agreement * _CHI2_LIMIT + granted * ratio * first * second / pixels)
 
 
 @njit(cache=True)
@@ -170,6 +179,7 @@ def _grow(
     pairs: NDArray[np.intp],
     parent: NDArray[np.intp],
     largest: float,
+    agreement: float,
 ) -> NDArray[np.intp]:
     """Merge blocks to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
@@ -229,7 +239,8 @@ def _grow(
                 before = e
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
                     common = common_residual(moments, a, b)
-                    apart = misfit(common - residual[a] - residual[b], moments, a, b, WITHIN_PATCH)
+                    extra = common - residual[a] - residual[b]
+                    apart = misfit(extra, moments, a, b, WITHIN_PATCH, agreement)
                     if apart < best:
                         best, partner, together = apart, b, common
             e = following

@@ -14,9 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
-from rangeseg_ros.core.by_planes.surfaces import DISTORTION_PIXELS
 from rangeseg_ros.core.graphcut.energy import link_costs
-from rangeseg_ros.core.regions import VGA
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
@@ -51,8 +49,8 @@ class Problem(NamedTuple):
         Columns of the image.
     block : int
         Rows and columns of the blocks that surfaces are grown from.
-    enlarged : float
-        Pixels of the image over those of VGA.
+    smooth : float
+        `SensorModel.distortion_pixels`.
     """
 
     inverse: NDArray[np.float32]
@@ -61,7 +59,7 @@ class Problem(NamedTuple):
     links: NDArray[np.float32]
     width: int
     block: int
-    enlarged: float = 1.0
+    smooth: float
 
     @classmethod
     def of(
@@ -80,8 +78,8 @@ class Problem(NamedTuple):
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor)
         prior = link_costs(grid, smoothness * sensor.patch)
-        enlarged = len(inverse) / VGA
-        return cls(inverse, rays, weight, prior, image.shape[1], block, enlarged)
+        width, smooth = image.shape[1], sensor.distortion_pixels
+        return cls(inverse, rays, weight, prior, width, block, smooth)
 
 
 # Divides by zero where numpy does, and without branches, so that many pixels are taken at a time.
@@ -101,23 +99,26 @@ class Models(NamedTuple):
     ----------
     theta : (K + 1, 3) float64
         theta . ray = inverse range; entry 0 is no plane.
-    price : (K + 1,) float64
-        Data cost of a residual of one random variance: the less, the more variance is granted.
+    half_precision : (K + 1,) float64
+        Half of the random variance over that which is granted: what a squared residual in random
+        variances costs.
     shifts : Shifts
         How much nearer the planes look at each block.
     """
 
     theta: NDArray[np.float64]
-    price: NDArray[np.float64]
+    half_precision: NDArray[np.float64]
     shifts: Shifts
 
     @classmethod
-    def of(cls, moments: NDArray[np.float64], enlarged: float = 1.0) -> Models:
-        """Planes of moment vectors (K + 1, 13) in an image of so many times VGA's pixels, as yet
-        without shifts."""
+    def of(cls, moments: NDArray[np.float64], smooth: float) -> Models:
+        """Planes of moment vectors (K + 1, 13), as yet without shifts.
+
+        Regions of `smooth` pixels meet half the variance of the distortion.
+        """
         theta, _ = fit_all(moments)
         count = np.maximum(moments[:, COUNT], 1)
-        ratio = moments[:, RATIO] / (count + enlarged * DISTORTION_PIXELS)
+        ratio = moments[:, RATIO] / (count + smooth)
         granted = (1 + moments[:, SLOPE] / count) * (1 + ratio)
         return cls(theta, 0.5 / granted, Shifts.none(len(theta)))
 
@@ -145,18 +146,24 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
 def shifted_plane(
     label: int, shift: float, models: Models
 ) -> tuple[float, float, float, float, float]:
-    """A plane for `plane_cost`: theta, 1 + shift and the price, read once for many pixels."""
+    """A plane for `plane_cost`: theta, 1 + shift and half its precision, read once for many."""
     theta = models.theta
-    return theta[label, 0], theta[label, 1], theta[label, 2], 1 + shift, models.price[label]
+    return (
+        theta[label, 0],
+        theta[label, 1],
+        theta[label, 2],
+        1 + shift,
+        models.half_precision[label],
+    )
 
 
 @njit(cache=True)
 def plane_cost(plane: tuple[float, float, float, float, float], p: int, problem: Problem) -> float:
     """What a plane costs a pixel; 0 where nothing was measured."""
-    a, b, c, scale, price = plane
+    a, b, c, scale, half_precision = plane
     rays = problem.rays
     residual = problem.inverse[p] - scale * (a * rays[p, 0] + b * rays[p, 1] + c * rays[p, 2])
-    return min(price * problem.weight[p] * residual * residual, CAP)
+    return min(half_precision * problem.weight[p] * residual * residual, CAP)
 
 
 @njit(cache=True)

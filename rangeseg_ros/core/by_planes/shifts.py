@@ -18,10 +18,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import RATIO
 
-# Blocks around a place that tell the shift, seven in a row: less than the width of a Kinect's
-# distortion, or where it changes they tell another's; more than noise is correlated over.
-_AROUND = 3
-
 
 class Shifts(NamedTuple):
     """Shift s of each plane at the blocks in a box around its surface; 0 elsewhere.
@@ -52,6 +48,7 @@ def shifts(
     blocks: NDArray[np.float64],
     theta: NDArray[np.float64],
     reach: int,
+    around: int,
     agreement: float,
 ) -> Shifts:
     """Shifts of planes to the blocks of their surfaces.
@@ -70,6 +67,8 @@ def shifts(
         The planes.
     reach : int
         Blocks around a surface that shifts are told for.
+    around : int
+        Blocks on each side of a place that tell its shift.
     agreement : float
         Pixels whose noise agrees, see `SensorModel.agreement`.
     """
@@ -77,7 +76,7 @@ def shifts(
     area = box[:, 2] * box[:, 3]
     values = np.zeros(area.sum(), np.float32)
     local = Shifts(box, np.cumsum(area) - area, values)
-    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, agreement)
+    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, agreement)
     return local
 
 
@@ -129,6 +128,7 @@ def _find_shifts(
     inner: NDArray[np.int32],
     blocks: NDArray[np.float64],
     theta: NDArray[np.float64],
+    around: int,
     agreement: float,
 ) -> None:
     """Shifts of some planes in their boxes."""
@@ -136,7 +136,7 @@ def _find_shifts(
         rows, columns = local.box[k, 2], local.box[k, 3]
         own = local.values[local.start[k] : local.start[k] + rows * columns]
         own = own.reshape(rows, columns)
-        _shift(k, inner, blocks, theta[k], local.box[k], agreement, own)
+        _shift(k, inner, blocks, theta[k], local.box[k], around, agreement, own)
 
 
 @njit(cache=True)
@@ -146,6 +146,7 @@ def _shift(
     blocks: NDArray[np.float64],
     theta: NDArray[np.float64],
     box: NDArray[np.intp],
+    around: int,
     agreement: float,
     result: NDArray[np.float32],
 ) -> None:
@@ -169,9 +170,9 @@ def _shift(
             total[i + 1, j + 1, 1] = total[i, j + 1, 1] + weight
             total[i + 1, j + 1, 2] = total[i, j + 1, 2] + ratio
     for i in range(rows):
-        first, after = max(i - _AROUND, 0), min(i + _AROUND + 1, rows)
+        first, after = max(i - around, 0), min(i + around + 1, rows)
         for j in range(columns):
-            start, end = max(j - _AROUND, 0), min(j + _AROUND + 1, columns)
+            start, end = max(j - around, 0), min(j + around + 1, columns)
             leaves = weight = ratio = 0.0
             for sign, u, v in (
                 (1, after, end),

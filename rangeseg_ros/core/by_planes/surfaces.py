@@ -19,25 +19,24 @@ from rangeseg_ros.core.by_planes.blocks import Links
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, common_residual, fit
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-DISTORTION_PIXELS = 2000.0
-"""Regions of this size meet half the variance of the distortion, large ones all of it."""
-# Systematic variances granted between neighbouring patches, and within a surface (4 standard
-# deviations).
-_BETWEEN_PATCHES, _WITHIN_SURFACE = 10.0, 30.0
+# Systematic variances granted between neighbouring patches, which is no chance; and within a
+# surface, whose extremes are four standard deviations apart: the variance of a difference is twice
+# that of one.
+_BETWEEN_PATCHES, _WITHIN_SURFACE = chi2_quantile(1), 2 * OUTLIER**2
 # Blocks of the smallest patch, two by two: fewer hardly determine the direction of a plane, and
 # where a face is rough they are splinters of it.
 _BLOCKS_OF_PATCH = 4
-# Pixels of the largest: the distortion of a Kinect is nearly constant over 40 x 40 pixels at VGA.
-_PATCH_LARGEST = 1504
 
 
 def join_surfaces(
     moments: NDArray[np.float64],
     links: Links,
     block: int,
+    sensor: SensorModel,
     least: int = 1,
-    enlarged: float = 1.0,
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
@@ -49,10 +48,10 @@ def join_surfaces(
         Which neighbouring blocks are connected.
     block : int
         Rows and columns of a block.
+    sensor : SensorModel
+        Its `agreement` and `distortion_pixels` are read.
     least : int
         Pixels of the smallest surface.
-    enlarged : float
-        Pixels of the image over those of VGA, which numbers of pixels are for.
 
     Returns
     -------
@@ -64,15 +63,15 @@ def join_surfaces(
     shape = moments.shape[:2]
     # No patch reaches over the middle, but neither does any reach across a large surface.
     # Not even in a small image is one smaller than four blocks.
-    largest = max(enlarged * _PATCH_LARGEST, 4.0 * block**2)
+    largest = max(sensor.distortion_pixels, 4.0 * block**2)
     smallest = float(_BLOCKS_OF_PATCH * block**2)
-    halves = map_halves(_patches, shape[0], moments, *links, largest, smallest)
+    halves = map_halves(_patches, shape[0], moments, *links, largest, smallest, sensor.agreement)
     (patch, moments), (lower, beneath) = halves
     patch = np.concatenate([patch, np.where(lower > 0, lower + len(moments) - 1, 0)])
     moments = np.concatenate([moments, beneath[1:]])
     border = _borders(patch.reshape(shape), *links, len(moments))
     surface, moments = _renumber(
-        _join(moments, border, _BETWEEN_PATCHES, enlarged), moments, float(least)
+        _join(moments, border, sensor.distortion_pixels, sensor.agreement), moments, float(least)
     )
     return surface[patch].reshape(shape), moments
 
@@ -86,10 +85,11 @@ def _patches(
     below: NDArray[np.bool_],
     largest: float,
     least: float,
+    agreement: float,
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Patches of at least so many pixels in some rows of blocks, 1...P, and their moments."""
     begin, end = first * moments.shape[1], after * moments.shape[1]
-    roots = grow_patches(first, after, moments, right, below, largest) - begin
+    roots = grow_patches(first, after, moments, right, below, largest, agreement) - begin
     return _renumber(roots, moments.reshape(-1, SIZE)[begin:end], least)
 
 
@@ -141,12 +141,12 @@ def _borders(
 
 @njit(cache=True, nogil=True)
 def _join(
-    moments: NDArray[np.float64], border: NDArray[np.float64], granted: float, enlarged: float
+    moments: NDArray[np.float64], border: NDArray[np.float64], smooth: float, agreement: float
 ) -> NDArray[np.intp]:
     """Join patches 1...P to surfaces, those that agree best first; returns the roots.
 
     The strain between two surfaces is the mean misfit of the patches on either side of their
-    border, where so many systematic variances are granted.
+    border. `smooth` is `SensorModel.distortion_pixels`, `agreement` as in `misfit`.
     """
     count = len(moments)
     moments, border = moments.copy(), border.copy()
@@ -162,7 +162,8 @@ def _join(
         for b in range(a + 1, count):
             if border[a, b] > 0:
                 extra = common_residual(moments, a, b) - residual[a] - residual[b]
-                strain[a, b] = misfit(extra, moments, a, b, granted) * border[a, b]
+                apart = misfit(extra, moments, a, b, _BETWEEN_PATCHES, agreement)
+                strain[a, b] = apart * border[a, b]
                 strain[b, a] = strain[a, b]
                 mean[a, b] = strain[a, b] / border[a, b]
         partner[a], least[a] = _smallest(mean[a], a)
@@ -175,9 +176,9 @@ def _join(
         chi2 = common_residual(moments, a, b)
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
-        within = _WITHIN_SURFACE * pixels / (pixels + enlarged * DISTORTION_PIXELS)
+        within = _WITHIN_SURFACE * pixels / (pixels + smooth)
         mean[a, b] = np.inf
-        if misfit(extra, moments, a, b, within) >= 1:
+        if misfit(extra, moments, a, b, within, agreement) >= 1:
             partner[a], least[a] = _smallest(mean[a], a)
             continue
         parent[b] = a

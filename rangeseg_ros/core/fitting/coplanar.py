@@ -16,7 +16,7 @@ from rangeseg_ros.core.sensing.sensor import FLOOR, random_variance, systematic_
 from rangeseg_ros.core.significance import chi2_quantile
 
 # Pairs of regions, and what links and cuts them, see `find_borders`.
-Stretches = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
+BorderRuns = tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]
 
 RESIDUE = 2.5
 """What the parts of a face differ by beyond their errors, as factor of variances.
@@ -32,9 +32,6 @@ _LIMIT = RESIDUE * chi2_quantile(3, 0.99)
 # apart by 0 to 56 (others, of bent or ragged parts, by more), those of faces by 119 at least.
 _TOUCHING = 6.0
 _TOUCHING_LIMIT = _TOUCHING * chi2_quantile(3, 0.99)
-# Share of its outline along which a region lies in another. Two planes meet along a line, and a
-# line is never more than half of an outline.
-_ENCLOSED = 0.6
 _LEVEL = chi2_quantile(1, 0.99)
 
 
@@ -66,7 +63,7 @@ def find_borders(
     grid: Grid,
     count: int,
     inner: NDArray[np.uint16],
-) -> Stretches:
+) -> BorderRuns:
     """Where regions touch, and whether jumps are between them.
 
     Parameters
@@ -110,18 +107,18 @@ def find_borders(
                 if m == k or min(k, m) == 0:
                     continue
                 if other[axis, k] != m:
-                    _tell(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
+                    _append_run(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
                     other[axis, k], linked[axis, k], cut[axis, k] = m, 0, 0
                 linked[axis, k] += touch
                 cut[axis, k] += not touch
     for axis in range(2):
         for k in range(count):
-            _tell(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
+            _append_run(k, other[axis, k], linked[axis, k], cut[axis, k], count, found)
     return np.array(pairs, np.intp), np.array(links, np.intp), np.array(cuts, np.intp)
 
 
 @njit(cache=True, nogil=True)
-def _tell(
+def _append_run(
     k: int,
     m: int,
     linked: int,
@@ -137,7 +134,7 @@ def _tell(
             found[2].append(cut)
 
 
-def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
+def group_coplanar(fits: Fits, runs: BorderRuns) -> NDArray[np.intp]:
     """Group regions that touch and whose planes agree, as `common_surfaces` does.
 
     What lies within a region, and on average no higher or deeper, is a part of it however its
@@ -150,7 +147,7 @@ def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     ----------
     fits : Fits
         Of M + 1 regions.
-    stretches : three (N,) int
+    runs : three (N,) int
         Of their borders, see `find_borders`.
 
     Returns
@@ -158,9 +155,9 @@ def group_coplanar(fits: Fits, stretches: Stretches) -> NDArray[np.intp]:
     (M + 1,) int
         Label of the largest region of the group; 0 where there is no plane.
     """
-    edges, place = np.unique(stretches[0], return_inverse=True)
-    links = np.bincount(place, stretches[1], len(edges))
-    balance = links - np.bincount(place, stretches[2], len(edges))
+    edges, place = np.unique(runs[0], return_inverse=True)
+    links = np.bincount(place, runs[1], len(edges))
+    balance = links - np.bincount(place, runs[2], len(edges))
     around = _around(fits, edges, balance)
     limits = np.where(balance >= 0, _TOUCHING_LIMIT, np.where(links > 0, _LIMIT, 0.0))
     return _groups_of_touching(_by_falling_size(fits), fits, edges, limits, around)
@@ -171,7 +168,8 @@ def _around(fits: Fits, edges: NDArray[np.intp], balance: NDArray[np.intp]) -> N
     count = len(fits.theta)
     result = np.zeros(count, np.intp)
     inner, outer = edges // count, edges % count
-    enclosed = balance > _ENCLOSED * fits.cells.border[inner]
+    # Two planes meet along a line, and a line is never more than half of an outline.
+    enclosed = 2 * balance > fits.cells.border[inner]
     inner, outer = inner[enclosed], outer[enclosed]
     theta, sums = fits.theta[outer], fits.explained[inner]
     normal = symmetric(sums[:, :6])

@@ -18,6 +18,7 @@ from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.sensor import length_of_distortion
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
@@ -147,7 +148,7 @@ def persistence(
 
 
 def views(
-    labels: NDArray[np.uint16], planes: Sequence[Plane], length: float
+    labels: NDArray[np.uint16], planes: Sequence[Plane], stated: float
 ) -> NDArray[np.float64]:
     """Where in the image planes are: pixels in each square cell, as unit vectors.
 
@@ -155,13 +156,15 @@ def views(
     ----------
     labels : (H, W) uint16
     planes : sequence of Plane
-    length : float
-        Pixels over which the errors of the sensor hang together: cells are twice as large.
+    stated : float
+        The parameter `distortion_length`, pixels over which the errors of the sensor hang
+        together: cells are twice as large.
 
     Returns
     -------
     (M, C) float64
     """
+    length = length_of_distortion(stated, labels.shape)
     step = max(int(2 * length // _SAMPLES), 1)
     coarse = labels[::step, ::step]
     side = max(int(2 * length / step), 1)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.config import VGA, Config
 
 
 class SensorModel(NamedTuple):
@@ -56,8 +56,8 @@ class SensorModel(NamedTuple):
     range_quantum: float = 0.0
 
     @classmethod
-    def from_config(cls, config: Config) -> SensorModel:
-        """The sensor that `config` describes."""
+    def from_config(cls, config: Config, shape: tuple[int, int] = (480, 640)) -> SensorModel:
+        """The sensor that `config` describes, of images (H, W)."""
         return cls(
             config.noise,
             config.range_noise,
@@ -65,7 +65,7 @@ class SensorModel(NamedTuple):
             config.noise_correlation,
             config.distortion,
             config.range_distortion,
-            config.distortion_length,
+            length_of_distortion(config.distortion_length, shape),
             config.pixel_noise,
             config.pixel_noise,
         )
@@ -104,11 +104,32 @@ class SensorModel(NamedTuple):
         return float(1 + 2 * alike[0] + alike[1])
 
     @property
+    def correlated(self) -> float:
+        """Pixels of a large region that count as one measurement: the sum of the correlations."""
+        return self.white + (1 - self.white) * max(4 * np.pi * self.correlation**2, 1.0)
+
+    @property
+    def distortion_pixels(self) -> float:
+        """Pixels of a square as wide as the distortion, of which a twelfth of its variance shows.
+
+        Smaller regions meet one value of it, larger ones all of it.
+        """
+        return self.distortion_length**2
+
+    @property
     def agreement(self) -> float:
         """By how much the noise of neighbouring blocks of 4 pixels exceeds that of white noise."""
         if self.correlation == 0:
             return 1.0
         return self.white + (1 - self.white) * correlated_residuals(self.correlation)[3]
+
+
+def length_of_distortion(stated: float, shape: tuple[int, int]) -> float:
+    """Width of the distortion in images (H, W), pixels: as stated, or for 0 as the image is large.
+
+    35 of VGA are 3 degrees of a Kinect.
+    """
+    return stated or 35 * float(np.sqrt(shape[0] * shape[1] / VGA))
 
 
 @cache
