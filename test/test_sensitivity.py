@@ -91,7 +91,7 @@ def test_command_resumes(tmp_path, monkeypatch):
         '| module | name | value | kind | reason |\n'
         '| `tracking/tracker` | `_GATE` | 20 | d | tried |\n'
         '| `calibration/sightings` | `_RIM` | 2 | d | tried |\n'
-        '| `fitting/cells` | `MOST` | 100 | c | memory |\n'
+        '| `fitting/cells` | `MAX_CELLS` | 100 | c | memory |\n'
     )
     arguments = ['sensitivity', tmp_path / 'set', '--output', tmp_path / 'out', '--table', table]
     arguments += ['--factor', 0.5, '--factor', 2, '--jobs', 1]

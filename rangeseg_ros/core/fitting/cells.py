@@ -1,8 +1,8 @@
 """Sums over the cells of regions: all that planes and their uncertainty need of the pixels.
 
-Each region's bounding box is cut into at most `MOST` square cells, of whole blocks unless it is
-small. What is linear in the pixels, like a fit, adds up over cells; what couples pairs of pixels,
-like correlated noise, couples pairs of cells instead.
+Each region's bounding box is cut into at most `MAX_CELLS` square cells, of whole blocks unless it
+is small. What is linear in the pixels, like a fit, adds up over cells; what couples pairs of
+pixels, like correlated noise, couples pairs of cells instead.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.blocks import BLOCK
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, NO_PIXEL, plus_pixel
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
-MOST = 100
+MAX_CELLS = 100
 """Cells of a region at most."""
 WEIGHTED_RAY, WEIGHT, POINT, SCATTER, RECORD = 12, 15, 16, 19, 25
 """Entries of a cell after its moment vector, which lacks w y^2 and the variance ratio: w r (3), w,
@@ -57,13 +57,13 @@ class Cells(NamedTuple):
     def empty(cls, box: NDArray[np.intp], border: NDArray[np.intp]) -> Cells:
         """Cells of regions with these boxes and borders, and nothing in them."""
         rows, columns = (box[:, 2:] - box[:, :2]).T
-        size = np.maximum(np.ceil(np.sqrt(rows * columns / MOST)).astype(np.intp), 1)
+        size = np.maximum(np.ceil(np.sqrt(rows * columns / MAX_CELLS)).astype(np.intp), 1)
         # From the size of a block on, cells begin and end where blocks do.
         whole = size >= BLOCK
         size[whole] = -(-size[whole] // BLOCK) * BLOCK
         origin = np.where(whole[:, None], box[:, :2] // BLOCK * BLOCK, box[:, :2])
         rows, columns = (box[:, 2:] - origin).T
-        while (large := -(-rows // size) * -(-columns // size) > MOST).any():
+        while (large := -(-rows // size) * -(-columns // size) > MAX_CELLS).any():
             size += np.where(whole, BLOCK, 1) * large
         rows, columns = -(-rows // size), -(-columns // size)
         start = np.concatenate([[0], np.cumsum(rows * columns)])
@@ -158,9 +158,8 @@ def add_pixels(
     central: bool,
 ) -> None:
     """Add pixels `first` to before `after` of row `i` to a cell."""
-    # In variables of their own: sums in an array would go through memory for every pixel.
-    a = b = c = d = e = f = p = q = r = count = w0 = w1 = w2 = weight = 0.0
-    z0 = z1 = z2 = z00 = z01 = z02 = z11 = z12 = z22 = 0.0
+    moments, points = NO_PIXEL, NO_PIXEL
+    count = w0 = w1 = w2 = weight = 0.0
     for j in range(first, after):
         y = float(inverse[i, j])
         if y == 0:
@@ -172,21 +171,20 @@ def add_pixels(
         count += 1
         weight += w
         x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
-        wx0, wx1, wx2 = w * x0, w * x1, w * x2
-        w0, w1, w2 = w0 + wx0, w1 + wx1, w2 + wx2
-        a, b, c = a + wx0 * x0, b + wx0 * x1, c + wx0 * x2
-        d, e, f = d + wx1 * x1, e + wx1 * x2, f + wx2 * x2
-        p, q, r = p + wx0 * y, q + wx1 * y, r + wx2 * y
+        w0, w1, w2 = w0 + w * x0, w1 + w * x1, w2 + w * x2
+        moments = plus_pixel(moments, x0, x1, x2, y, w)
+        # Sums of the points and of their squares.
         z = 1 / y
-        x0, x1, x2 = z * x0, z * x1, z * x2
-        z0, z1, z2 = z0 + x0, z1 + x1, z2 + x2
-        z00, z01, z02 = z00 + x0 * x0, z01 + x0 * x1, z02 + x0 * x2
-        z11, z12, z22 = z11 + x1 * x1, z12 + x1 * x2, z22 + x2 * x2
-    moments = (a, b, c, d, e, f, p, q, r, 0.0, count, 0.0, w0, w1, w2, weight)
-    for entry, value in enumerate(moments):
-        record[entry] += value
-    for entry, value in enumerate((z0, z1, z2, z00, z01, z02, z11, z12, z22)):
-        record[POINT + entry] += value
+        points = plus_pixel(points, z * x0, z * x1, z * x2, 1.0, 1.0)
+    for entry in range(CHI2):
+        record[entry] += moments[entry]
+    for entry in range(6):
+        record[SCATTER + entry] += points[entry]
+    for entry in range(3):
+        record[POINT + entry] += points[6 + entry]
+    record[COUNT] += count
+    for entry, value in enumerate((w0, w1, w2, weight)):
+        record[WEIGHTED_RAY + entry] += value
 
 
 @njit(cache=True, inline='always')

@@ -19,7 +19,7 @@ import cv2
 T = TypeVar('T')
 
 # More would wait for the memory.
-_MOST = 4
+_MAX_THREADS = 4
 # Rows that are worth the handing over.
 _ROWS = 16
 # Rows on either side of the middle of the image that are looked at again.
@@ -28,7 +28,7 @@ _SEAM = 8
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_MOST, 'rangeseg')
+    return ThreadPoolExecutor(_MAX_THREADS, 'rangeseg')
 
 
 if hasattr(os, 'register_at_fork'):  # not on Windows, which does not fork
@@ -41,7 +41,7 @@ def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     What one strip writes no other may touch: then the result is the same for any number of
     threads.
     """
-    count = max(min(cv2.getNumThreads(), _MOST, rows // _ROWS), 1)
+    count = max(min(cv2.getNumThreads(), _MAX_THREADS, rows // _ROWS), 1)
     bounds = [rows * part // count for part in range(count + 1)]
     others = [
         _pool().submit(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, SIZE, fit
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, NO_PIXEL, SIZE, fit, plus_pixel
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 BLOCK = 4
@@ -94,8 +94,7 @@ def _sum_blocks(
         bottom = min((bi + 1) * size, height)
         for bj in range(moments.shape[1]):
             right = min((bj + 1) * size, width)
-            # In variables of their own: sums in an array go through memory for every pixel.
-            a = b = c = d = e = f = p = q = r = square = count = 0.0
+            sums, count = NO_PIXEL, 0.0
             for i in range(bi * size, bottom):
                 for j in range(bj * size, right):
                     y = np.float64(inverse[i, j])
@@ -104,13 +103,11 @@ def _sum_blocks(
                     x0 = np.float64(rays[i, j, 0])
                     x1 = np.float64(rays[i, j, 1])
                     x2 = np.float64(rays[i, j, 2])
-                    a, b, c = a + x0 * x0, b + x0 * x1, c + x0 * x2
-                    d, e, f = d + x1 * x1, e + x1 * x2, f + x2 * x2
-                    p, q, r = p + x0 * y, q + x1 * y, r + x2 * y
-                    square += y * y
+                    sums = plus_pixel(sums, x0, x1, x2, y, 1.0)
                     count += 1
-            for entry, value in enumerate((a, b, c, d, e, f, p, q, r, square, count)):
+            for entry, value in enumerate(sums):
                 moments[bi, bj, entry] = value
+            moments[bi, bj, COUNT] = count
 
 
 def quads(blocks: NDArray[np.float64]) -> NDArray[np.float64]:

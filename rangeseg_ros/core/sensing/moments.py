@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 SIZE = 13
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
 """Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
+NO_PIXEL = (0.0,) * (CHI2 + 1)
+"""The sums of no pixel, see `plus_pixel`."""
 
 
 @register_jitable
@@ -35,6 +37,31 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
 
 
 @njit(cache=True, inline='always')
+def plus_pixel(
+    sums: tuple[float, ...], x: float, y: float, z: float, inverse: float, weight: float
+) -> tuple[float, ...]:
+    """The first ten sums of a moment vector with one pixel more: of its ray (x, y, z).
+
+    A tuple, which the compiler keeps in registers: sums in an array would go through memory for
+    every pixel. Begins with `NO_PIXEL`.
+    """
+    a, b, c, d, e, f, p, q, r, square = sums
+    wx, wy, wz = weight * x, weight * y, weight * z
+    return (
+        a + wx * x,
+        b + wx * y,
+        c + wx * z,
+        d + wy * y,
+        e + wy * z,
+        f + wz * z,
+        p + wx * inverse,
+        q + wy * inverse,
+        r + wz * inverse,
+        square + weight * inverse * inverse,
+    )
+
+
+@njit(cache=True, inline='always')
 def add_pixel(
     moments: NDArray[np.float64],
     ray: NDArray[np.float32],
@@ -42,10 +69,7 @@ def add_pixel(
     weight: float,
     ratio: float,
 ) -> None:
-    """Add a pixel to a moment vector (13,).
-
-    Sums of all pixels of an image, in blocks and cells, are kept in variables of their own: in an
-    array they would go through memory for every pixel.
+    """Add a pixel to a moment vector (13,), but for its count.
 
     Parameters
     ----------
@@ -57,13 +81,9 @@ def add_pixel(
     ratio : float
         Of the systematic to the random variance, times these.
     """
-    entry = 0
-    for m in range(3):
-        for n in range(m, 3):
-            moments[entry] += weight * ray[m] * ray[n]
-            entry += 1
-        moments[6 + m] += weight * ray[m] * inverse
-    moments[CHI2] += weight * inverse * inverse
+    x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
+    for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
+        moments[entry] += value
     moments[RATIO] += ratio
 
 
