@@ -68,6 +68,7 @@ def test_abw_points_lie_on_their_planes(abw):
     scan, calibration = abw
     points = abw_points(scan.values, calibration)
     depth_step = 1e-3 / calibration.scale
+    assert max(plane.count for plane in scan.planes) > 20000
     for plane in scan.planes:
         mask = scan.labels == plane.label
         assert plane.distance > 0
@@ -83,9 +84,9 @@ def test_abw_points_lie_on_their_planes(abw):
 def test_perceptron_points_lie_on_their_planes(perceptron):
     rays = geometry.perceptron_rays()
     points = geometry.perceptron_points(perceptron.values)
-    for plane in perceptron.planes:
-        if plane.count < 3000:
-            continue
+    large = [plane for plane in perceptron.planes if plane.count >= 3000]
+    assert large
+    for plane in large:
         mask = perceptron.labels == plane.label
         cosine = -rays.directions[mask] @ plane.normal
         off = (points[mask] @ plane.normal + plane.distance) / cosine / 0.0020236

@@ -318,6 +318,7 @@ def test_a_room_seen_again_from_elsewhere():
         view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(160, 120))
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, view.camera), KINECT)
         found.append(tracker.track(view.labels, planes, k))
+    assert len(found[0]) > 3 and len(found[1]) > 3
     for b in found[1]:
         for a in found[0]:
             if a.id == b.id:
