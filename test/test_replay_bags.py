@@ -167,17 +167,17 @@ def test_a_finished_recording_is_not_done_again(done, tmp_path):
     path = record_walls(tmp_path / 'recording', 2)
     out = tmp_path / 'out'
     first = replay(path, out)
-    assert (first.frames, first.found_done) == (2, False)
+    assert (first.frames, first.already_done) == (2, False)
     bag = (out / 'bag').stat()
     again = replay(path, out)
-    assert (again.frames, again.reasons, again.found_done) == (2, first.reasons, True)
+    assert (again.frames, again.reasons, again.already_done) == (2, first.reasons, True)
     assert (out / 'bag').stat() == bag
     # Other parameters, other topics and another recording are other results.
-    assert not Replay(path, out, Config(min_pixels=499)).run().found_done
-    assert not replay(path, out).found_done
-    assert not replay(path, out, topics=('planes',)).found_done
+    assert not Replay(path, out, Config(min_pixels=499)).run().already_done
+    assert not replay(path, out).already_done
+    assert not replay(path, out, topics=('planes',)).already_done
     os.utime(next(path.glob('*.mcap')), ns=(0, 0))
-    assert not replay(path, out, topics=('planes',)).found_done
+    assert not replay(path, out, topics=('planes',)).already_done
     # Frames of a longer recording do not stay behind.
     assert replay(done / 'recording', out).frames == 4
     assert replay(path, out).frames == 2

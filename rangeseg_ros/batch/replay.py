@@ -52,7 +52,7 @@ class Outcome:
         See `ReplayReport.figures`.
     damage : str
         What of the recording could not be read; empty when all of it was.
-    found_done : bool
+    already_done : bool
         The results were there already.
     mapped : int
         Number of planes in the map.
@@ -68,7 +68,7 @@ class Outcome:
     reasons: dict[str, int]
     figures: dict[str, float]
     damage: str = ''
-    found_done: bool = False
+    already_done: bool = False
     mapped: int = 0
     unlocated: dict[str, int] = field(default_factory=dict)
     tilted: int = 0
@@ -133,7 +133,7 @@ class Replay:
         key, results_folder = self._key(), ResultFolder(self.folder)
         record = read_record(results_folder.bag)
         if record.get('key') == key and results_folder.whole():
-            return Outcome(**record['outcome'], found_done=True)
+            return Outcome(**record['outcome'], already_done=True)
         self.check()
         with (
             results_folder.begun(),
@@ -203,7 +203,9 @@ class Replay:
                 tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
             )
             report.write(self.folder / 'report.html', outcome.damage, planes)
-            kept = {name: value for name, value in asdict(outcome).items() if name != 'found_done'}
+            kept = {
+                name: value for name, value in asdict(outcome).items() if name != 'already_done'
+            }
             files = results_folder.digest()
             bag.record({'key': key, 'outcome': kept, 'files': files})
         return outcome

@@ -177,7 +177,7 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
     if outcome.tilted:
         click.echo(f'rangeseg: {outcome.tilted} frames: {outcome.tilt}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
-    already = ', done before' if outcome.found_done else ''
+    already = ', done before' if outcome.already_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')
     if outcome.damage:
         click.echo(f'rangeseg: {outcome.damage}', err=True)

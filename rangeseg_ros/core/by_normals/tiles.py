@@ -9,10 +9,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals.angles import UNIT, cell_of
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
 
-# Pixels across the tiles.
-TILE = 8
+TILE = 2 * BLOCK
+"""Pixels across the tiles: they fall into quarters, blocks, and these into quarters again."""
 # What quarters may save and yet be one piece, as a share of the prior of the edges between them.
 _SPLIT_GAIN_SHARE = 0.18
 _SPLIT_GAIN = np.float32(_SPLIT_GAIN_SHARE / UNIT)

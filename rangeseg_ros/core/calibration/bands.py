@@ -11,12 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from rangeseg_ros.core.calibration.sightings import Sightings
+from rangeseg_ros.core.calibration.sightings import Sightings, cell_size
 from rangeseg_ros.core.significance import CERTAIN
-
-# Columns over which the slope of the smooth distortion is alike; many enough that their median
-# takes next to nothing off the noise of one.
-_REACH = 10
 
 
 def column_profile(seen: Sightings) -> NDArray[np.float64]:
@@ -26,7 +22,10 @@ def column_profile(seen: Sightings) -> NDArray[np.float64]:
     """
     total, count = _without_outliers(seen.jumps).sum(axis=0)
     change = total / np.maximum(count, 1)
-    change -= median_filter(change, 2 * _REACH + 1, mode='nearest')
+    # The slope of the smooth distortion is alike over a cell on either side: a field between cells
+    # is linear.
+    around = 2 * cell_size((1, len(change) + 1)) + 1
+    change -= median_filter(change, around, mode='nearest')
     # Columns seen in few rows are as much noisier.
     noise = change * np.sqrt(count / max(count.max(initial=0), 1))
     spread = 1.4826 * np.median(np.abs(noise[count > 0])) if count.any() else 0.0

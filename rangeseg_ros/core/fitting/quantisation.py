@@ -7,14 +7,13 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import ranked
+from rangeseg_ros.core.significance import CLEARLY
 
 # Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
 # one.
 _ROWS, _SMALLEST = 40, 0.1
 # Pairs of neighbours that are not the same, at least: a quantile of fewer says nothing.
 _PAIRS = 40
-# Steps of one quantum for each that is neither one nor two.
-_CLEAR = 4.0
 # Steps that are no jump, as share of the range: that of a Kinect is 2 % at 8 m.
 _COARSEST = 0.05
 # Pairs of neighbours that rounding makes the same, for each that it does not, at least.
@@ -56,7 +55,7 @@ def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
         return 0.0, 0.0
     quantum, clear = _common_step(step[:unlike])
     range_quantum, range_clear = _common_step(in_range[:unlike])
-    if max(clear, range_clear) < _CLEAR:
+    if max(clear, range_clear) < CLEARLY:
         return 0.0, 0.0
     return (quantum, 0.0) if clear > range_clear else (0.0, range_quantum)
 

@@ -12,10 +12,11 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from rangeseg_ros.core.mapping.map_outlines import areas
 
-# Log-odds of a ray that ends at a cell and of one that passes through it, and the bounds of their
-# sum, so that a cell follows a change within ten looks: Hornung et al., "OctoMap", Autonomous
-# Robots 2013.
-_HIT, _MISS, _MOST, _LEAST = 0.85, -0.4, 3.5, -2.0
+HIT, MISS, _MOST, LEAST = 0.85, -0.4, 3.5, -2.0
+"""Log-odds of a ray that ends at a cell and of one that passes through it, and the bounds of their
+sum, so that a cell follows a change within ten looks: Hornung et al., "OctoMap", Autonomous
+Robots 2013.
+"""
 # Cells of a plane at most; the side of a cell is a power of two.
 _CELLS = 64
 
@@ -39,7 +40,7 @@ class Evidence:
         self.centres = np.zeros((1, 2))
         self._side = 0.0
         self._keys = np.zeros(1, np.int64)
-        self.odds = np.full(1, _HIT)
+        self.odds = np.full(1, HIT)
         self.middle, self.reach = np.zeros(2), 0.0
 
     def follow(self, outline: Polygon | MultiPolygon) -> None:
@@ -61,7 +62,7 @@ class Evidence:
             cells = np.floor([[point.x / side, point.y / side]]).astype(np.int64)
         # In ascending order, as the cells are.
         keys = cells[:, 0] * 2**32 + cells[:, 1]
-        odds = np.full(len(keys), _HIT)
+        odds = np.full(len(keys), HIT)
         if len(self._keys):
             place = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
             known = self._keys[place] == keys
@@ -107,8 +108,8 @@ def see(
         Numbers of the planes with cells that rays pass through.
     """
     odds = np.concatenate([one.odds for one in evidence])
-    odds += np.where(found > 0, _HIT, np.where(found < 0, _MISS, 0))
-    np.clip(odds, _LEAST, _MOST, out=odds)
+    odds += np.where(found > 0, HIT, np.where(found < 0, MISS, 0))
+    np.clip(odds, LEAST, _MOST, out=odds)
     begin = 0
     for one in evidence:
         end = begin + len(one.odds)

@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.core.mapping.evidence import Evidence
+from rangeseg_ros.core.mapping.evidence import HIT, LEAST, MISS, Evidence
 from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
 from rangeseg_ros.core.mapping.transforms import quaternion
-
-# Observations that make a plane of the map, and their least share of the frames in which rays
-# ended where it is: what is found less often is what clutter looks like now and then.
-_CONFIRMED, _REGULAR = 3, 0.25
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -76,8 +72,14 @@ class Record:
 
     @property
     def confirmed(self) -> bool:
-        """Whether it was seen often enough to be part of the map."""
-        return self.frames >= max(_CONFIRMED, _REGULAR * self.looks)
+        """Whether it was seen often enough to be part of the map.
+
+        It is to be as surely there as what is forgotten is not, by the frames it was found in and
+        those in which rays ended where it is and it was not: clutter looks like planes now and
+        then.
+        """
+        missed = max(self.looks - self.frames, 0)
+        return HIT * self.frames + MISS * missed >= -LEAST
 
     def add(self, plane: Plane, stamp: int, now: int) -> None:
         """Take in a plane of a frame."""
@@ -106,7 +108,7 @@ class Record:
         self.roles += other.roles
 
 
-def described(
+def describe(
     record: Record,
     normal: NDArray[np.float64],
     point: NDArray[np.float64],

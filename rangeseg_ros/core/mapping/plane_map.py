@@ -19,7 +19,7 @@ from rangeseg_ros.core.mapping.map_outlines import (
     valid,
     widened,
 )
-from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, described
+from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
@@ -119,7 +119,7 @@ class PlaneMap:
         filters = self._filters
         covariance = filters.plane_covariance(np.arange(len(self._records)))
         found = [
-            described(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
+            describe(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
             for k, record in enumerate(self._records)
             if record.confirmed and not record.outline.is_empty
         ]

@@ -18,9 +18,9 @@ from rangeseg_ros.core.sensing.moments import cofactors
 
 # Cells of a block, which is about square.
 _ROWS, _COLUMNS = 8, 2
-# The prior counts as so much of a window full of ground: each of the about five levels leaves a
-# fifth of what the one before has left.
-_PRIOR = 0.25
+# The prior counts as so much of a window full of ground: as much as the window is of the one twice
+# as wide that the prior is from.
+_PRIOR = 1 / 4
 
 
 def ground_field(

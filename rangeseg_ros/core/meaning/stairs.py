@@ -21,10 +21,12 @@ from rangeseg_ros.core.meaning.classes import GROUND
 from rangeseg_ros.core.meaning.ground import CellTerrain, Terrain
 from rangeseg_ros.core.significance import SAMPLES
 
-RISE, _RUN = (0.08, 0.25), (0.2, 0.42)
-"""Rise and run of stairs, metres: what people climb, with a margin.
+RISE, _RUN = (0.1, 0.24), (0.22, 0.4)
+"""Rise and run of stairs, metres: the widest that codes of building allow.
 
-ISO 21542 asks for 0.15 to 0.18 and 0.26 to 0.30.
+The rise from the International Building Code (1011.5.2, four inches at least) to OSHA 1910.25(c)
+(24 cm at most), the run from private stairs to those of general access in the British Approved
+Document K, table 1.1.
 """
 # Tangents of the flattest and the steepest stairs: what is flatter is level.
 _FLATTEST, _STEEPEST = RISE[0] / _RUN[1], RISE[1] / _RUN[0]

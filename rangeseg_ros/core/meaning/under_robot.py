@@ -28,7 +28,7 @@ _RAMP = 0.02
 # The squared deviation, in variances, from which what is known and what is seen contradict.
 _MISFIT = 25.0
 # Largest surfaces that are looked at.
-_MOST = 32
+_MAX_SURFACES = 32
 
 
 class Stand(NamedTuple):
@@ -91,7 +91,7 @@ def stand(
     """
     height, doubt = known
     sizes, reach, steepest = _reaches(cells, surface, count + 1)
-    order = np.argsort(-sizes, kind='stable')[:_MOST]
+    order = np.argsort(-sizes, kind='stable')[:_MAX_SURFACES]
     order = order[sizes[order] >= SAMPLES]
     if not len(order):
         return Stand(0, np.zeros(3), 0.0)

@@ -10,14 +10,12 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.significance import OUTLIER
 
 _WINDOW = 3
 # The farthest window that a boundary looks at, and rows of means that those of one row need.
 _MARGIN = 2 * _WINDOW - 1
 _ROWS = 2 * _MARGIN
-# A step between two pixels that needs no look at their surroundings, in units of `step`
-# and of the slope: steeper than all but planes seen edge-on from centimetres away.
-_CLEAR = 5
 
 
 def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) -> GridEdges:
@@ -46,7 +44,9 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     height, width = image.shape
     blocks = -(-height // BLOCK), -(-width // BLOCK)
     limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
-    clear = _CLEAR * limits + 2 * np.asarray(slope, np.float32)
+    # Steps between two pixels that need no look at their surroundings: steeper than all but planes
+    # seen edge-on from centimetres away.
+    clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
     horizontal = np.zeros((height, width - 1), np.bool_)
     vertical = np.zeros((height - 1, width), np.bool_)
     run_rows(_find_jumps, height, image.inverse, limits, clear, horizontal, vertical)

@@ -43,10 +43,7 @@ _TRIAL, _ON_TRIAL = 0.32, _UNSEEN_OVERLAP / 2
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# Least intersection over union of planes the motion is estimated from. The equations are linear in
-# it, and larger changes than a turn of `SURE_TURN`, and a shift in the time of such a turn, are
-# rather another plane.
-_SURE_OVERLAP = 0.3
+# The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
 
 
@@ -203,10 +200,10 @@ def _camera_motion(
 
     With a small rotation w and a shift v, a plane's normal n changes by w x n and the centroid c
     of the plane that is seen comes to lie n.c + d + w.(n x c) - n.v off it: linear least squares
-    over the planes that overlap most with each other, weighted by their variances, and those
-    that fit badly (things that move by themselves) less. Directions in which the planes leave
-    the motion open are held by a prior of zero, with standard deviations of `reach` seconds at
-    `speed`, radians and metres per second.
+    over the planes that have most of their pixels in common, weighted by their variances, and
+    those that fit badly (things that move by themselves) less. Directions in which the planes
+    leave the motion open are held by a prior of zero, with standard deviations of `reach` seconds
+    at `speed`, radians and metres per second.
     """
     t, s = np.nonzero(_sure_pairs(known, seen, shared, speed))
     angle, offset = (variance[t, s] for variance in variances(known, seen))
@@ -234,13 +231,15 @@ def _camera_motion(
 def _sure_pairs(
     known: Tracks, seen: Tracks, shared: NDArray[np.intp], speed: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """(T, N) whether planes overlap most with each other and agree."""
-    overlap = overlaps(known, seen, shared) * (known.unseen == 0)[:, None]
-    best = overlap == np.maximum(
-        overlap.max(axis=0, initial=0)[None], overlap.max(axis=1, initial=0)[:, None]
-    )
+    """(T, N) whether planes have half of their pixels in common, and agree.
+
+    Larger changes than a turn of `SURE_TURN`, and a shift in the time of such a turn, are rather
+    another plane.
+    """
+    most = 2 * shared > np.maximum(known.size[:, None], seen.size)
+    most &= (known.unseen == 0)[:, None]
     shift = SURE_TURN / speed[0] * speed[1]
-    sure = best & (overlap > _SURE_OVERLAP) & (np.abs(offsets(known, seen)) < shift)
+    sure = most & (np.abs(offsets(known, seen)) < shift)
     result: NDArray[np.bool_] = sure & (known.normal @ seen.normal.T > np.cos(SURE_TURN))
     return result
 
