@@ -160,7 +160,9 @@ def group_coplanar(fits: Fits, runs: BorderRuns) -> NDArray[np.intp]:
     balance = links - np.bincount(place, runs[2], len(edges))
     around = _around(fits, edges, balance)
     limits = np.where(balance >= 0, _TOUCHING_LIMIT, np.where(links > 0, _LIMIT, 0.0))
-    return _groups_of_touching(_by_falling_size(fits), fits, edges, limits, around)
+    regions = len(fits.theta)
+    start = np.searchsorted(edges, np.arange(regions + 1) * regions)
+    return _groups_of_touching(_by_falling_size(fits), fits, edges, start, limits, around)
 
 
 def _around(fits: Fits, edges: NDArray[np.intp], balance: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -209,12 +211,12 @@ def _groups_of_touching(
     order: NDArray[np.intp],
     fits: Fits,
     edges: NDArray[np.intp],
+    start: NDArray[np.intp],
     limits: NDArray[np.float64],
     around: NDArray[np.intp],
 ) -> NDArray[np.intp]:
     count = len(fits.theta)
     group = np.zeros(count, np.intp)
-    start = np.searchsorted(edges, np.arange(count + 1) * count)
     for k in order:
         # 0 while the region around, then the smaller one, has had no turn.
         group[k] = group[around[k]]

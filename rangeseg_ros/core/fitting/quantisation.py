@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import ranked
+from rangeseg_ros.core.fitting.alike import median, ranked
 from rangeseg_ros.core.significance import CLEARLY
 
 # Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
@@ -64,8 +64,13 @@ def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
 def _common_step(steps: NDArray[np.float64]) -> tuple[float, float]:
     """The step of which the smaller ones of these are multiples, and how clearly they are."""
     small = ranked(steps.copy(), _SMALLEST)
-    # What was rounded twice is off by a little.
-    near = steps[np.abs(steps - small) < 0.2 * small]
-    beside = int(np.count_nonzero(steps < 1.8 * small)) - len(near)
-    clear = len(near) / max(beside, 1)
-    return float(np.median(near)), clear
+    near = np.empty(len(steps))
+    count = below = 0
+    for step in steps:
+        # What was rounded twice is off by a little.
+        if abs(step - small) < 0.2 * small:
+            near[count] = step
+            count += 1
+        if step < 1.8 * small:
+            below += 1
+    return median(near[:count]), count / max(below - count, 1)
