@@ -29,7 +29,7 @@ def value_in(folder, constant):
     return float(value)
 
 
-@pytest.mark.parametrize('name', ['tracking/tracker._GATE', 'tracking/tracker._SURE_OVERLAP'])
+@pytest.mark.parametrize('name', ['tracking/tracker._GATE', 'tracking/tracker._UNSEEN_OVERLAP'])
 def test_one_constant_of_a_copy_is_changed(name, tmp_path):
     constant = CONSTANTS[name]
     sensitivity.write_changed(constant, 0.5, tmp_path)

@@ -79,7 +79,8 @@ def test_planes_are_those_of_the_scene(image, room, results, budget):
 def test_the_sensor_is_said_in_pixels_of_the_image(results):
     full, coarse = results[1.0].sensor, results[0.7].sensor
     assert coarse.noise == pytest.approx(full.noise, rel=0.5)
-    assert coarse.distortion_length == full.distortion_length
+    # Half of an odd number of rows is rounded up.
+    assert coarse.distortion_length == pytest.approx(full.distortion_length, rel=0.01)
 
 
 def test_no_jump_beside_what_was_not_measured(image, results):
