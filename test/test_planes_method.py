@@ -186,5 +186,16 @@ def test_absurd_depths_disturb_nothing(value, where):
         assert ((result.labels > 0) == (expected.labels > 0))[away].mean() > 0.9
 
 
+def test_faces_of_twenty_pixels_are_planes_of_their_own():
+    """Of 300 pixels of VGA in blocks, before a wall."""
+    camera = kinect_camera()
+    depth = np.full(camera.shape, 2000, np.uint16)
+    for size, left in ((20, 100), (30, 300), (16, 500)):
+        depth[200 : 200 + size, left : left + size] = 1800
+    result = segmented(depth, camera)
+    assert [int(result.labels[205, left]) > 1 for left in (105, 305, 505)] == [True, True, False]
+    assert len(result.planes) == 3
+
+
 if __name__ == '__main__':
     print(json.dumps(small_fingerprint()))

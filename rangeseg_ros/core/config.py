@@ -150,7 +150,7 @@ class Config:
     )
     min_pixels: int = option(
         0,
-        'smallest region that makes a plane, pixels; 0 follows the size of the image: 500 of VGA',
+        'smallest region that makes a plane, pixels; 0 follows the size of the image: 300 of VGA',
         low=0,
         high=100000000,
     )

@@ -14,9 +14,9 @@ from rangeseg_ros.core.sensing.grid import CHUNK, Grid
 def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
     """Pixels of the smallest plane: `min_pixels`, or for 0 what follows the size of the image.
 
-    500 of VGA are a face of 22 x 22 pixels, 2 degrees wide for most cameras.
+    300 of VGA are a face of 17 x 17 pixels, 1.7 degrees wide for most cameras.
     """
-    return min_pixels or max(round(500 * shape[0] * shape[1] / VGA), 1)
+    return min_pixels or max(round(300 * shape[0] * shape[1] / VGA), 1)
 
 
 def plane_regions(

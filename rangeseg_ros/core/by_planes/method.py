@@ -98,8 +98,8 @@ def segment(
     whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)
     lap('blocks')
     pending = submit(Problem.of, image, sensor, grid, size, config.plane_smoothness)
-    # A region may gain as much again from pixels that no block could take.
-    least = max(least_pixels(config.min_pixels, image.shape) // 2, 1)
+    # Surfaces as large as regions: smaller ones are clutter.
+    least = least_pixels(config.min_pixels, image.shape)
     weights = weigh_blocks(blocks, whole, sensor)
     surface, moments = join_surfaces(weights, block_links(grid, size), size, sensor, least)
     problem = pending.result()
