@@ -180,6 +180,15 @@ def test_joint_solution_is_that_of_dense_least_squares():
     )
 
 
+@pytest.mark.parametrize('grid', [(1, 1), (1, 8), (2, 3)])
+def test_images_of_one_or_two_rows_of_cells_have_a_smoothness(grid):
+    v, u = np.indices(grid).astype(float)
+    for place, free in ((0, 2 * u - v + 3), (1, np.ones(grid))):
+        smoothness = _roughness(grid, place)
+        assert smoothness.shape == (u.size, u.size)
+        assert free.ravel() @ smoothness @ free.ravel() == pytest.approx(0, abs=1e-9)
+
+
 def test_smoothness_does_not_punish_what_is_free():
     v, u = np.indices((6, 9)).astype(float)
     offset, slope = (_roughness(u.shape, place) for place in (0, 1))

@@ -115,9 +115,9 @@ def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
     Second differences for the offset, which a plane leaves as it is, and first ones for the slope,
     which a constant does: neither punishes what is free.
     """
-    one_v, one_u = (sparse.eye(n) for n in grid)
-    first_v, first_u = (sparse.diags([-1.0, 1.0], [0, 1], (n - 1, n)) for n in grid)
-    second_v, second_u = (sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], (n - 2, n)) for n in grid)
+    (one_v, first_v, second_v), (one_u, first_u, second_u) = (
+        [sparse.csr_matrix(np.diff(np.eye(n), order, axis=0)) for order in range(3)] for n in grid
+    )
     if place == 0:
         parts = [
             sparse.kron(second_v, one_u),
