@@ -34,8 +34,9 @@ from rangeseg_ros.core.significance import SAMPLES
 
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
-# Cells that the edge of a drop is blurred over: four pixels of VGA, twice the noise's correlation.
-_BLUR = np.ones((5, 3), np.uint8)
+# Cells that the edge of a drop is blurred over: two rows on either side, as many as a Kinect's
+# noise is correlated over, and the next column of cells.
+_BLUR = (5, 3)
 # Share of the least obstacle or drop that no noise excuses.
 _EXCUSED = 0.8
 
@@ -232,7 +233,7 @@ def _terrain(
     doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
     # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
     deep = (said == DROP) | (said == HIDDEN) & (height < 0)
-    doubt[cv2.dilate(deep.view(np.uint8), _BLUR).view(np.bool_)] = 0
+    doubt[cv2.dilate(deep.view(np.uint8), np.ones(_BLUR, np.uint8)).view(np.bool_)] = 0
     bounds = limits.obstacle / 2, limits.drop / 2
     classes, heights = pixels_of(image, field, size, Said(said, doubt, unsure), bounds)
     if known[0] == 0:
