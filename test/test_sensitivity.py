@@ -60,12 +60,14 @@ def test_ranges_end_at_the_first_factor_that_costs_too_much(tmp_path):
         b: {1: 0.9, 0.5: None, 2: 0.9, 0.25: 0.9, 4: 0.9},
     }
     trials = [
-        Trial(constant, factor, tmp_path, (), tmp_path)
+        Trial(constant, factor, (tmp_path,), (), tmp_path)
         for constant, by_factor in ious.items()
         for factor in by_factor
     ]
     results = [
-        iou and {'mean_iou': iou} for by_factor in ious.values() for iou in by_factor.values()
+        iou and {'rooms': 0.9, 'frames': iou}
+        for by_factor in ious.values()
+        for iou in by_factor.values()
     ]
     rows = ranges(trials, results)
     assert [(row['constant'], row['low'], row['high']) for row in rows] == [
@@ -73,6 +75,7 @@ def test_ranges_end_at_the_first_factor_that_costs_too_much(tmp_path):
         ('m.A', 0.25, 1),
     ]
     assert [row['loss'] for row in rows] == pytest.approx([1.0, 0.4])
+    assert [row['set'] for row in rows] == ['', 'frames']
 
 
 def test_command_resumes(tmp_path, monkeypatch):
@@ -82,7 +85,7 @@ def test_command_resumes(tmp_path, monkeypatch):
         measured.append((str(trial.constant), trial.factor))
         if len(measured) == 4:
             raise OSError('the disk is full')
-        return {'mean_iou': 0.9 if trial.factor < 2 else 0.8, 'correct': 3, 'regions': 4}
+        return {'set': 0.9 if trial.factor < 2 else 0.8}
 
     monkeypatch.setattr(Trial, '_measure', measure)
     (tmp_path / 'set').mkdir()

@@ -1,8 +1,8 @@
 """How far a constant of the core may move before results get worse.
 
 A constant is compiled into the kernels that read it, and into those that call them. So each trial
-runs `rangeseg evaluate` in a copy of the package in which that one expression is changed, with all
-compiled code: the copy itself sees which of it is outdated.
+runs `rangeseg evaluate` on all sets in a copy of the package in which that one expression is
+changed, with all compiled code: the copy itself sees which of it is outdated.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from rangeseg_ros.io.files import replacing
 PACKAGE = Path(__file__).parents[1]
 TOLERATED_LOSS = 0.003
 """Mean IoU that a constant may cost within its range."""
+_FOUND = 'ground_kept', 'obstacle_found', 'drop_found'
 
 
 class Constant(NamedTuple):
@@ -111,14 +112,14 @@ def _scaled(value: Any, factor: float) -> Any:
 
 @dataclass(frozen=True)
 class Trial:
-    """A constant times a factor, on one set; `factor` 1 is the package as it is.
+    """A constant times a factor, on some sets; `factor` 1 is the package as it is.
 
     Attributes
     ----------
     constant : Constant
     factor : float
-    folder : Path
-        A set that `rangeseg evaluate` knows.
+    folders : tuple of Path
+        Sets that `rangeseg evaluate` knows.
     arguments : tuple of str
         More of its arguments.
     cache : Path
@@ -127,12 +128,16 @@ class Trial:
 
     constant: Constant
     factor: float
-    folder: Path
+    folders: tuple[Path, ...]
     arguments: tuple[str, ...]
     cache: Path
 
     def run(self) -> dict[str, float] | None:
-        """Mean IoU and regions correct at tolerance 0.8; None where the segmenter fails."""
+        """How good each set is, by its path; None where the segmenter fails.
+
+        That is the mean IoU at tolerance 0.8, and of terrains the mean of what is found of ground,
+        obstacles and drops.
+        """
         path = self.cache / f'{self._key()}.json'
         if not path.exists():
             figures = self._measure()
@@ -144,26 +149,35 @@ class Trial:
 
     def _measure(self) -> dict[str, float] | None:
         with tempfile.TemporaryDirectory() as temporary:
-            folder, result = Path(temporary), Path(temporary, 'figures.json')
-            write_changed(self.constant, self.factor, folder)
+            copy, result = Path(temporary), Path(temporary, 'figures.json')
+            write_changed(self.constant, self.factor, copy)
             code = 'from rangeseg_ros.cli.main import main; main()'
-            command = [sys.executable, '-c', code, 'evaluate', str(self.folder.resolve())]
-            command += ['--jobs', '1', '--tolerance', '0.8', '--json', str(result)]
-            environment = {**os.environ, 'PYTHONPATH': str(folder)}
+            command = [sys.executable, '-c', code, 'evaluate', '--jobs', '1', '--tolerance', '0.8']
+            command += ['--json', str(result), *self.arguments]
+            environment = {**os.environ, 'PYTHONPATH': str(copy)}
             environment.pop('NUMBA_CACHE_DIR', None)
-            done = subprocess.run(
-                [*command, *self.arguments], env=environment, cwd=folder, capture_output=True
-            )
-            if done.returncode:
-                return None
-            row = json.loads(result.read_text())['tolerances']['0.8']
-            return {key: row[key] for key in ('mean_iou', 'correct', 'regions')}
+            found = {}
+            for folder in self.folders:
+                words = [*command, str(folder.resolve())]
+                done = subprocess.run(words, env=environment, cwd=copy, capture_output=True)
+                if done.returncode:
+                    return None
+                found[str(folder)] = _quality(json.loads(result.read_text()))
+            return found
 
     def _key(self) -> str:
         # Without a change, all constants are alike.
         constant = '' if self.factor == 1 else str(self.constant)
-        words = constant, self.factor, str(self.folder.resolve()), self.arguments
+        sets = [str(folder.resolve()) for folder in self.folders]
+        words = constant, self.factor, sets, self.arguments
         return hashlib.sha256(code_digest() + repr(words).encode()).hexdigest()[:16]
+
+
+def _quality(figures: dict[str, Any]) -> float:
+    if 'pooled' in figures:
+        shares = figures['pooled']
+        return sum(shares[name] for name in _FOUND) / len(_FOUND)
+    return float(figures['tolerances']['0.8']['mean_iou'])
 
 
 def ranges(
@@ -177,17 +191,11 @@ def ranges(
         `constant`, `value`, `low`, `high` (factors), `loss`: the largest of any factor tried (1
         where the segmenter failed), `set`: where; the constants that matter most first.
     """
-    plain = {
-        trial.folder: result['mean_iou']
-        for trial, result in zip(trials, results, strict=True)
-        if trial.factor == 1 and result
-    }
+    plain = next(r for t, r in zip(trials, results, strict=True) if t.factor == 1 and r)
     losses: dict[Constant, dict[float, tuple[float, str]]] = {}
     for trial, result in zip(trials, results, strict=True):
-        loss = plain[trial.folder] - result['mean_iou'] if result else 1.0
-        by_factor = losses.setdefault(trial.constant, {})
-        worst = by_factor.get(trial.factor, (-1.0, ''))
-        by_factor[trial.factor] = max(worst, (loss, trial.folder.name))
+        worst = max((plain[name] - result[name], name) for name in plain) if result else (1.0, '')
+        losses.setdefault(trial.constant, {})[trial.factor] = worst
     rows = []
     for constant, by_factor in losses.items():
         low = high = 1.0
