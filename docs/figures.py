@@ -4,6 +4,8 @@ docs/terrain.png, the picture in the README: depth, planes, and what they are to
 docs/normals.png: observed normals, jump edges, and the normals that both methods reconstruct.
 docs/figures/distortion.png: the fixed pattern of a simulated Kinect, what is learned of it, and
 what is left.
+docs/figures/ground.png: what pixels are to a robot, and their height above the ground.
+docs/figures/map.png: the map of a walk through a room, from above and from a side.
 The other docs/figures/*.png, one picture for each stage of method `planes`: of a Kinect's frame of
 a room and, on the right, of a stereo camera's.
 """
@@ -28,6 +30,7 @@ from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.sensing.blocks import Blocks, quads
 from rangeseg_ros.core.sensing.bridges import bridge_holes
@@ -35,9 +38,11 @@ from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.params import read_config
+from rangeseg_ros.report.replay import plans
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
@@ -63,6 +68,8 @@ def main():
         pair = [fitted(pictures[name]) for pictures in both]
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
     write_image(folder / 'figures' / 'distortion.png', distortion(sensor_seed=1))
+    write_image(folder / 'figures' / 'ground.png', heights('clutter', 1))
+    write_image(folder / 'figures' / 'map.png', room_map(scene=8, seed=1))
 
 
 def distortion(sensor_seed):
@@ -98,18 +105,54 @@ def normals(image):
 
 def terrain(kind, seed):
     """A Kinect on a robot: depth, planes, and ground green, obstacles red, drops blue."""
+    image, result = on_robot(kind, seed)
+    planes = overlay(image.inverse, result.labels, result.planes)
+    return np.hstack([fitted(p) for p in (in_grey(image), planes, classes(image, result))])
+
+
+def heights(kind, seed):
+    """A Kinect on a robot: ground, obstacles, drops; heights from -0.5 m, dark, to 1.5 m."""
+    image, result = on_robot(kind, seed)
+    shown = 255 * colormaps['viridis'](np.clip((result.height + 0.5) / 2, 0, 1))[..., :3]
+    shown = np.where(np.isfinite(result.height)[..., None], shown, 0).astype(np.uint8)
+    return np.hstack([fitted(classes(image, result)), fitted(shown)])
+
+
+def on_robot(kind, seed):
+    """Range image of a terrain, and what is found in it."""
     scene, sensor = terrain_scene(kind, seed), SENSORS['kinect'](seed)
     up, height = stated(scene, seed)
     config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=height)
     seen = simulate_terrain(scene, sensor, seed=seed)
     image = RangeImage.from_depth(seen.depth, sensor.camera)
-    result = Segmenter(config).segment(image)
+    return image, Segmenter(config).segment(image)
+
+
+def classes(image, result):
+    """Ground green, obstacles red, drops blue, over the depth."""
     colour = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [40, 80, 255]], np.uint8)
     base = in_grey(image)
     tinted = cv2.addWeighted(base, 0.45, colour[result.terrain], 0.55, 0)
-    classes = np.where((result.terrain > 0)[..., None], tinted, base)
-    planes = overlay(image.inverse, result.labels, result.planes)
-    return np.hstack([fitted(picture) for picture in (base, planes, classes)])
+    return np.where((result.terrain > 0)[..., None], tinted, base)
+
+
+def room_map(scene, seed):
+    """Every eighth frame of a walk of eight seconds, as one map."""
+    room, camera = kinect_room(scene), kinect_camera(640, 480)
+    poses = walk(room.poses[0], seed, 240)
+    up = poses[0].rotation.T @ (0, 0, 1)
+    sequence = SequenceSegmenter(Config(up_x=up[0], up_y=up[1], up_z=up[2]))
+    for k in range(0, len(poses), 8):
+        view = simulate_kinect(Scene(room.solids, poses, room.dark), camera, frame=k, seed=scene)
+        image = RangeImage.from_depth(view.depth, camera)
+        pose = Transform(poses[k].rotation, poses[k].position)
+        sequence.segment(image, k * 10**9 // 30, poses[k].rotation.T @ (0, 0, 1), pose)
+    pictures = [picture for _, picture in plans(sequence.map.planes)]
+    height = max(len(picture) for picture in pictures)
+    padded = [
+        np.pad(p, ((0, height - len(p)), (0, 0), (0, 0)), constant_values=255) for p in pictures
+    ]
+    return cv2.resize(np.hstack(padded), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
 
 
 def frame(sensor, scene, seed):
