@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.outlines import Outline, lies_ahead
 from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
-from rangeseg_ros.core.fitting.cells import POINT, SCATTER, WEIGHT, WEIGHTED_RAY
+from rangeseg_ros.core.fitting.cells import POINT, SCATTER, is_empty, level_of
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
-from rangeseg_ros.core.fitting.fits import Fits, symmetric
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwich
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -133,7 +134,7 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     list of Plane
         In the order of the labels.
     """
-    theta, sums = fits.theta, fits.explained
+    theta = fits.theta
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []
@@ -141,24 +142,14 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     distance = np.zeros(len(theta))
     distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
     normal = -theta * distance[:, None]
-    jacobian = plane_jacobians(normal, distance)
-    covariance = sandwich(jacobian, fits.covariance)
+    covariance = sandwiches(plane_jacobians(normal, distance), fits.covariance)
 
-    inliers = np.maximum(sums[:, COUNT], 1)
-    centroid = sums[:, POINT:SCATTER] / inliers[:, None]
-    scatter = symmetric(sums[:, SCATTER:]) / inliers[:, None, None]
-    offset = (normal * centroid).sum(axis=1)
-    square = np.einsum('ki,kij,kj->k', normal, scatter, normal)
-    square += distance * (2 * offset + distance)
-    rms = np.sqrt(np.maximum(square, 0))
-    centroid = centroid - (offset + distance)[:, None] * normal
-    expected = distance**2 * _expected_square(fits)
-    share = 1 - fits.outliers / np.maximum(fits.pixels, 1)
-    confidence = share * np.minimum(1, expected / np.maximum(square, 1e-18))
+    centroid, rms, confidence = _scatter(fits, normal, distance)
 
     shapes = Shapes(labels, image, theta, fits.inner)
     boxes = fits.boxes()
-    outlines = {k: _outline(k, labels, image, boxes[k], theta[k]) for k in found.tolist()}
+    places = boxes.tolist()
+    outlines = {k: _outline(k, labels, image, places[k], theta[k]) for k in found.tolist()}
     # Of steep planes neither need be finite.
     doubtful = found[~lies_ahead(boxes[found], theta[found], image.camera)]
     if len(doubtful):
@@ -166,46 +157,86 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
         found = np.setdiff1d(found, doubtful[~kept])
     surface = surfaces.result()
+    # Numbers of Python, all at once: one by one, taking them out of the arrays takes longer.
+    numbers = zip(
+        surface[found].tolist(),
+        distance[found].tolist(),
+        fits.pixels[found].tolist(),
+        rms[found].tolist(),
+        confidence[found].tolist(),
+        strict=True,
+    )
     return [
         Plane(
-            label=int(k),
-            id=int(k),
-            surface=int(surface[k]),
+            label=k,
+            id=k,
+            surface=of_surface,
             normal=normal[k],
-            distance=float(distance[k]),
+            distance=away,
             covariance=covariance[k],
             centroid=centroid[k],
-            count=int(fits.pixels[k]),
-            rms=float(rms[k]),
-            confidence=float(confidence[k]),
-            shape=RegionShape(shapes, int(k)),
-            outline=outlines[int(k)],
+            count=count,
+            rms=off,
+            confidence=sure,
+            shape=RegionShape(shapes, k),
+            outline=outlines[k],
         )
-        for k in found
+        for k, (of_surface, away, count, off, sure) in zip(found.tolist(), numbers, strict=True)
     ]
 
 
-def _expected_square(fits: Fits) -> NDArray[np.float64]:
-    """Mean square distance from the planes, over distance^2, that the sensor's errors make."""
-    cells, theta, sensor = fits.cells, fits.theta, fits.sensor
-    region = np.repeat(fits.regions_of_parts(), np.diff(cells.start))
-    count, weight = cells.sums[:, COUNT], cells.sums[:, WEIGHT]
-    ray = cells.sums[:, WEIGHTED_RAY:WEIGHT]
-    level = (ray * theta[region]).sum(axis=1) / np.where(count > 0, weight, 1)
-    # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
-    squared = np.where(level > 0, level, 1) ** 2
-    variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-    total = np.bincount(region, count * variance / squared, len(theta))
-    return total / np.maximum(np.bincount(region, count, len(theta)), 1)
+@njit(cache=True)
+def _scatter(
+    fits: Fits, normal: NDArray[np.float64], distance: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Centroid (M + 1, 3), rms and confidence of regions 0...M; see `Plane`."""
+    regions = len(normal)
+    centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
+    for k in range(regions):
+        sums, n, inliers = fits.explained[k], normal[k], max(fits.explained[k, COUNT], 1.0)
+        offset = square = 0.0
+        for a in range(3):
+            centroid[k, a] = sums[POINT + a] / inliers
+            offset += n[a] * centroid[k, a]
+        entry = SCATTER
+        for a in range(3):
+            for b in range(a, 3):
+                square += (1 if a == b else 2) * n[a] * n[b] * sums[entry] / inliers
+                entry += 1
+        square += distance[k] * (2 * offset + distance[k])
+        rms[k] = np.sqrt(max(square, 0.0))
+        centroid[k] -= (offset + distance[k]) * n
+        expected = distance[k] ** 2 * _expected_square(fits, k)
+        share = 1 - fits.outliers[k] / max(fits.pixels[k], 1)
+        confidence[k] = share * min(1.0, expected / max(square, 1e-18))
+    return centroid, rms, confidence
+
+
+@njit(cache=True)
+def _expected_square(fits: Fits, k: int) -> float:
+    """Mean square distance from a plane, over distance^2, that the sensor's errors make."""
+    cells, theta, total, pixels = fits.cells, fits.theta[k], 0.0, 0.0
+    for part in fits.parts[fits.start[k] : fits.start[k + 1]]:
+        for c in range(cells.start[part], cells.start[part + 1]):
+            if is_empty(cells.sums[c]):
+                continue
+            level, count = level_of(cells.sums[c], theta), cells.sums[c, COUNT]
+            # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
+            squared = level * level if level > 0 else 1.0
+            variance = random_variance(fits.sensor, squared)
+            variance += systematic_variance(fits.sensor, squared)
+            total += count * variance / squared
+            pixels += count
+    return total / max(pixels, 1.0)
 
 
 def _outline(
     label: int,
     labels: NDArray[np.uint16],
     image: RangeImage,
-    box: NDArray[np.intp],
+    box: list[int],
     theta: NDArray[np.float64],
 ) -> Outline:
-    top, left, bottom, right = (int(edge) for edge in box)
+    top, left, bottom, right = box
     crop = slice(top, bottom), slice(left, right)
     return Outline(labels[crop], label, top, left, theta, image.camera or image.rays[crop])

@@ -56,30 +56,48 @@ class Cells(NamedTuple):
     @classmethod
     def empty(cls, box: NDArray[np.intp], border: NDArray[np.intp]) -> Cells:
         """Cells of regions with these boxes and borders, and nothing in them."""
-        rows, columns = (box[:, 2:] - box[:, :2]).T
-        size = np.maximum(np.ceil(np.sqrt(rows * columns / MAX_CELLS)).astype(np.intp), 1)
-        # From the size of a block on, cells begin and end where blocks do.
-        whole = size >= BLOCK
-        size[whole] = -(-size[whole] // BLOCK) * BLOCK
-        origin = np.where(whole[:, None], box[:, :2] // BLOCK * BLOCK, box[:, :2])
-        rows, columns = (box[:, 2:] - origin).T
-        while (large := -(-rows // size) * -(-columns // size) > MAX_CELLS).any():
-            size += np.where(whole, BLOCK, 1) * large
-        rows, columns = -(-rows // size), -(-columns // size)
-        start = np.concatenate([[0], np.cumsum(rows * columns)])
+        origin, size, columns, start = _cut(box)
         return cls(box, border, origin, size, columns, start, np.zeros((start[-1], RECORD)))
-
-    def of_blocks(self) -> NDArray[np.bool_]:
-        """Which regions have cells of whole blocks, (M + 1,)."""
-        return self.size % BLOCK == 0
 
     def regions(self) -> NDArray[np.float64]:
         """Sums over whole regions, (M + 1, 25)."""
-        total = np.zeros((len(self.size), RECORD))
-        filled = np.flatnonzero(np.diff(self.start))
-        if len(filled):
-            total[filled] = np.add.reduceat(self.sums, self.start[filled])
-        return total
+        return _regions(self.start, self.sums)
+
+
+@njit(cache=True)
+def _cut(
+    box: NDArray[np.intp],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Origin, size, columns and start of the cells of regions with these boxes, see `Cells`."""
+    count = len(box)
+    origin, start = np.empty((count, 2), np.intp), np.zeros(count + 1, np.intp)
+    size, columns = np.empty(count, np.intp), np.empty(count, np.intp)
+    for k in range(count):
+        top, left, bottom, right = box[k]
+        side = max(int(np.ceil(np.sqrt((bottom - top) * (right - left) / MAX_CELLS))), 1)
+        step = 1
+        if side >= BLOCK:
+            # From the size of a block on, cells begin and end where blocks do.
+            step = BLOCK
+            side = -(-side // BLOCK) * BLOCK
+            top, left = top // BLOCK * BLOCK, left // BLOCK * BLOCK
+        while -((top - bottom) // side) * -((left - right) // side) > MAX_CELLS:
+            side += step
+        origin[k, 0], origin[k, 1] = top, left
+        size[k], columns[k] = side, -((left - right) // side)
+        start[k + 1] = start[k] - (top - bottom) // side * columns[k]
+    return origin, size, columns, start
+
+
+@njit(cache=True)
+def _regions(start: NDArray[np.intp], sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums over the cells of each region."""
+    total = np.zeros((len(start) - 1, RECORD))
+    for k in range(len(total)):
+        for c in range(start[k], start[k + 1]):
+            for entry in range(RECORD):
+                total[k, entry] += sums[c, entry]
+    return total
 
 
 @njit(cache=True, nogil=True)
@@ -144,6 +162,24 @@ def cell_of(cells: Cells, label: int, i: int, j: int) -> int:
     size = cells.size[label]
     row, column = (i - cells.origin[label, 0]) // size, (j - cells.origin[label, 1]) // size
     return int(cells.start[label] + row * cells.columns[label] + column)
+
+
+@njit(cache=True)
+def is_empty(cell: NDArray[np.float64]) -> bool:
+    """Whether no pixel is in a cell, or rounding has left nothing of what weighs next to nothing.
+
+    Of pixels whose weights differ by 1e16, where others were taken off again.
+    """
+    return cell[COUNT] == 0 or cell[WEIGHT] <= 0
+
+
+@njit(cache=True)
+def level_of(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """Inverse range of a plane at the middle of a cell."""
+    total = 0.0
+    for a in range(3):
+        total += theta[a] * cell[WEIGHTED_RAY + a]
+    return total / cell[WEIGHT]
 
 
 @njit(cache=True, inline='always')

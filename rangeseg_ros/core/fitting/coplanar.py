@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import WEIGHT
-from rangeseg_ros.core.fitting.fits import Fits, symmetric
+from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import pairs
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
@@ -158,31 +160,37 @@ def group_coplanar(fits: Fits, runs: BorderRuns) -> NDArray[np.intp]:
     edges, place = np.unique(runs[0], return_inverse=True)
     links = np.bincount(place, runs[1], len(edges))
     balance = links - np.bincount(place, runs[2], len(edges))
-    around = _around(fits, edges, balance)
+    around = _around(fits, edges, balance, fits.sensor.agreement)
     limits = np.where(balance >= 0, _TOUCHING_LIMIT, np.where(links > 0, _LIMIT, 0.0))
     regions = len(fits.theta)
     start = np.searchsorted(edges, np.arange(regions + 1) * regions)
     return _groups_of_touching(_by_falling_size(fits), fits, edges, start, limits, around)
 
 
-def _around(fits: Fits, edges: NDArray[np.intp], balance: NDArray[np.intp]) -> NDArray[np.intp]:
+@njit(cache=True)
+def _around(
+    fits: Fits, edges: NDArray[np.intp], balance: NDArray[Any], agreement: float
+) -> NDArray[np.intp]:
     """Region (M + 1,) that each lies in, neither before nor behind it; 0 for none."""
     count = len(fits.theta)
     result = np.zeros(count, np.intp)
-    inner, outer = edges // count, edges % count
-    # Two planes meet along a line, and a line is never more than half of an outline.
-    enclosed = 2 * balance > fits.cells.border[inner]
-    inner, outer = inner[enclosed], outer[enclosed]
-    theta, sums = fits.theta[outer], fits.explained[inner]
-    normal = symmetric(sums[:, :6])
-    square = np.einsum('na,nab,nb->n', theta, normal, theta)
-    share = np.einsum('na,na->n', theta, sums[:, 6:9]) / np.maximum(square, FLOOR) - 1
-    level = square / np.maximum(sums[:, WEIGHT], FLOOR)
-    doubt = fits.sensor.agreement / np.maximum(sums[:, COUNT], 1)
-    variance = systematic_variance(fits.sensor, level)
-    variance += doubt * random_variance(fits.sensor, level)
-    same = share**2 * level < _LEVEL * variance
-    result[inner[same]] = outer[same]
+    for e in range(len(edges)):
+        inner, outer = edges[e] // count, edges[e] % count
+        # Two planes meet along a line, and a line is never more than half of an outline.
+        if 2 * balance[e] <= fits.cells.border[inner]:
+            continue
+        theta, sums = fits.theta[outer], fits.explained[inner]
+        a, b, c = theta
+        square = a * (a * sums[0] + 2 * (b * sums[1] + c * sums[2]))
+        square += b * (b * sums[3] + 2 * c * sums[4]) + c * c * sums[5]
+        along = a * sums[6] + b * sums[7] + c * sums[8]
+        share = along / max(square, FLOOR) - 1
+        level = square / max(sums[WEIGHT], FLOOR)
+        doubt = agreement / max(sums[COUNT], 1.0)
+        variance = systematic_variance(fits.sensor, level)
+        variance += doubt * random_variance(fits.sensor, level)
+        if share**2 * level < _LEVEL * variance:
+            result[inner] = outer
     return result
 
 

@@ -130,21 +130,12 @@ def sums_without_doubtful(
         Sums over whole regions, with their rims.
     """
     central = image.camera is not None
-    # Points of a cloud have rays without a z of 1, which blocks do not tell the sums of.
-    taken = np.where((cells.of_blocks() & central)[inner], inner, np.uint16(0))
-    arrays = labels, image.inverse, image.rays, blocks, taken, cells, sensor, theta, central
-    parts = map_halves(_sort, len(labels), *arrays)
-    (counts, sums), (lower_counts, lower_sums) = parts
-    pixels, outliers, rims = counts + lower_counts
-    sums += lower_sums
-    sure, outlying, rim = (cells._replace(sums=part) for part in sums)
-    kept, few = 2 * outliers > pixels, 2 * (outliers + rims) <= pixels
-    explained = sure.regions() + rim.regions() + kept[:, None] * outlying.regions()
-    region = np.repeat(np.arange(len(cells.size)), np.diff(cells.start))
-    for part, chosen in ((outlying, kept), (rim, ~few)):
-        added = np.flatnonzero(chosen[region])
-        sure.sums[added] += part.sums[added]
-    return sure, pixels, outliers, explained
+    arrays = labels, image.inverse, image.rays, blocks, inner, cells, sensor, theta, central
+    (count, upper), (lower_count, lower) = map_halves(_sort, len(labels), *arrays)
+    count += lower_count
+    explained = np.zeros((len(theta), RECORD))
+    map_halves(_leave_out, len(theta), cells, count, upper, lower, explained)
+    return cells, count[0], count[_OUTLYING], explained
 
 
 @njit(cache=True, nogil=True)
@@ -218,7 +209,8 @@ def _sort(
     for bi in range(max(first_block - 1, 0), after_block):
         for bj in range(inner.shape[1]):
             label, squared = inner[bi, bj], blocks.squared[bi, bj]
-            if label == 0:
+            # Points of a cloud have rays without a z of 1, which blocks do not tell the sums of.
+            if label == 0 or not central or cells.size[label] % BLOCK > 0:
                 continue
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             # No pixel is farther off than all together.
@@ -257,6 +249,43 @@ def _sort(
             record = sums[kind, cell_of(cells, label, i, first)]
             add_pixels(record, i, first, j, inverse, rays, sensor, central)
     return count, sums
+
+
+@njit(cache=True, nogil=True)
+def _leave_out(
+    first: int,
+    after: int,
+    cells: Cells,
+    count: NDArray[np.intp],
+    upper: NDArray[np.float64],
+    lower: NDArray[np.float64],
+    explained: NDArray[np.float64],
+) -> None:
+    """Sums of some regions, to `cells` and `explained`: what `sums_without_doubtful` returns.
+
+    Of what `_sort` found in the upper and in the lower rows, and the numbers of both.
+    """
+    total = np.empty((3, RECORD))
+    for k in range(first, after):
+        pixels, outliers = count[0, k], count[_OUTLYING, k]
+        kept, few = 2 * outliers > pixels, 2 * (outliers + count[_AT_RIM, k]) <= pixels
+        total[:] = 0
+        for c in range(cells.start[k], cells.start[k + 1]):
+            for entry in range(RECORD):
+                sure = upper[_SURE, c, entry] + lower[_SURE, c, entry]
+                outlying = upper[_OUTLYING, c, entry] + lower[_OUTLYING, c, entry]
+                rim = upper[_AT_RIM, c, entry] + lower[_AT_RIM, c, entry]
+                total[_SURE, entry] += sure
+                total[_OUTLYING, entry] += outlying
+                total[_AT_RIM, entry] += rim
+                if kept:
+                    sure += outlying
+                if not few:
+                    sure += rim
+                cells.sums[c, entry] = sure
+        explained[k] = total[_SURE] + total[_AT_RIM]
+        if kept:
+            explained[k] += total[_OUTLYING]
 
 
 @njit(cache=True)

@@ -6,6 +6,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
@@ -18,13 +19,13 @@ from rangeseg_ros.core.fitting.interior import Inside
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
-    sandwich,
+    sandwiches,
     systematic_field,
     theta_covariances,
 )
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.moments import COUNT, SIZE, fit_all
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE, cofactors, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -152,7 +153,7 @@ class Fits(NamedTuple):
             explained=_total(self.explained, group, count),
             theta=theta,
             inverse=inverse,
-            covariance=sandwich(inverse, middle),
+            covariance=sandwiches(inverse, middle),
             middle=middle,
             inner=group.astype(np.uint16)[self.inner],
         )
@@ -187,10 +188,23 @@ def _solved(
     theta = _theta(sums)
     if not central:
         theta = _total_least_squares(sums, theta)
-    found = theta.any(axis=1)
+    return theta, _inverses(sums, theta)
+
+
+@njit(cache=True)
+def _inverses(sums: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses (M + 1, 3, 3) of the normal matrices where there is a plane; zeros elsewhere."""
     inverse = np.zeros((len(theta), 3, 3))
-    inverse[found] = np.linalg.inv(symmetric(sums[found, :6]))
-    return theta, inverse
+    for k in range(len(theta)):
+        if theta[k].any():
+            a, b, c, d, e, f = sums[k, :6]
+            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+            inverse[k, 0, 0], inverse[k, 1, 1], inverse[k, 2, 2] = aa, dd, ff
+            inverse[k, 0, 1] = inverse[k, 1, 0] = bb
+            inverse[k, 0, 2] = inverse[k, 2, 0] = cc
+            inverse[k, 1, 2] = inverse[k, 2, 1] = ee
+            inverse[k] /= determinant
+    return inverse
 
 
 def symmetric(triangle: NDArray[np.float64]) -> NDArray[np.float64]:

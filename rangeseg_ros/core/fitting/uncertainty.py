@@ -19,7 +19,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells
+from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells, is_empty, level_of
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import (
@@ -80,20 +80,62 @@ def theta_covariances(
         sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
     )
     fields = random, systematic_field(sensor)
-    middle = np.add(*map_halves(_middles, len(theta), cells, theta, sensor, *fields))
-    return sandwich(inverse, middle), middle
-
-
-def sandwich(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """outer middle outer^T, (N, m, m), of covariances `middle` (N, n, n).
-
-    By a root of them, so that no rounding that `outer` magnifies makes a variance negative.
-    """
-    values, vectors = np.linalg.eigh(middle)
-    root = outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None, :])
-    product = root @ root.transpose(0, 2, 1)
-    result: NDArray[np.float64] = (product + product.transpose(0, 2, 1)) / 2
+    result = np.zeros_like(inverse), np.zeros_like(inverse)
+    map_halves(_covariances, len(theta), cells, theta, inverse, sensor, *fields, *result)
     return result
+
+
+@njit(cache=True, nogil=True)
+def sandwiches(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """outer middle outer^T, (N, m, m), of `outer` (N, m, 3) and covariances `middle` (N, 3, 3)."""
+    result = np.empty((len(outer), outer.shape[1], outer.shape[1]))
+    for k in range(len(outer)):
+        sandwich(outer[k], middle[k], result[k])
+    return result
+
+
+@njit(cache=True)
+def sandwich(
+    outer: NDArray[np.float64], middle: NDArray[np.float64], result: NDArray[np.float64]
+) -> None:
+    """outer middle outer^T, to `result` (m, m), of `outer` (m, 3) and a covariance (3, 3).
+
+    By a root of it, so that no rounding that `outer` magnifies makes a variance negative.
+    """
+    root = _root(middle)
+    along = np.zeros((len(outer), 3))
+    for a in range(len(outer)):
+        for b in range(3):
+            for c in range(3):
+                along[a, b] += outer[a, c] * root[c, b]
+    for a in range(len(outer)):
+        for b in range(a, len(outer)):
+            result[a, b] = result[b, a] = (along[a] * along[b]).sum()
+
+
+@njit(cache=True)
+def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A matrix that makes a covariance (3, 3) times its transpose (Cholesky, with pivots).
+
+    What rounding has made of directions without variance is left out.
+    """
+    left, root = covariance.copy(), np.zeros((3, 3))
+    for step in range(3):
+        pivot = 0
+        for a in range(1, 3):
+            if left[a, a] > left[pivot, pivot]:
+                pivot = a
+        if left[pivot, pivot] <= 0:
+            break
+        scale = 1 / np.sqrt(left[pivot, pivot])
+        for a in range(3):
+            root[a, step] = scale * left[a, pivot]
+        for a in range(3):
+            for b in range(3):
+                left[a, b] -= root[a, step] * root[b, step]
+        for a in range(3):
+            left[a, pivot] = left[pivot, a] = 0
+    return root
 
 
 def plane_jacobians(
@@ -108,20 +150,23 @@ def plane_jacobians(
 
 
 @njit(cache=True, nogil=True)
-def _middles(
+def _covariances(
     first: int,
     after: int,
     cells: Cells,
     theta: NDArray[np.float64],
+    inverse: NDArray[np.float64],
     sensor: SensorModel,
     random: Field,
     systematic: Field,
-) -> NDArray[np.float64]:
-    """Sums over pairs of pixels of w_i w_j r_i r_j^T cov(e_i, e_j), (M + 1, 3, 3).
+    covariance: NDArray[np.float64],
+    middle: NDArray[np.float64],
+) -> None:
+    """What `theta_covariances` returns, of the regions from the first to before the second.
 
-    Of the regions from the first to before the second; zeros for others.
+    More than seven parameters: the first two are the share of a thread, and the errors of the
+    sensor are two fields.
     """
-    result = np.zeros((len(theta), 3, 3))
     white = sensor.white if sensor.correlation > 0 else 1.0
     part = np.empty((3, 3))
     for k in range(max(first, 1), after):
@@ -132,11 +177,11 @@ def _middles(
         systematic_square = np.zeros((3, 3))
         count = 0.0
         for c in range(len(own)):
-            if _is_empty(own[c]):
+            if is_empty(own[c]):
                 continue
             count += own[c, COUNT]
             # Squares of the same scale as the rays: variance times weight.
-            level = _level(own[c], theta[k])
+            level = level_of(own[c], theta[k])
             mean = own[c, WEIGHT] / own[c, COUNT]
             entry = 0
             for a in range(3):
@@ -145,32 +190,15 @@ def _middles(
                     entry += 1
             random_square += mean * random_variance(sensor, level**2) * part
             systematic_square += mean * systematic_variance(sensor, level**2) * part
-        result[k] = white * random_square
+        result = white * random_square
         # Sides of pixels overstate the length of a border by 4 / pi on average.
         share = np.pi / 4 * cells.border[k] / max(count, 1.0)
         if white < 1:
-            result[k] += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
+            result += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
         if systematic.constant + systematic.quartic > 0:
-            result[k] += _field(cells, k, theta[k], systematic, systematic_square, share)
-    return result
-
-
-@njit(cache=True)
-def _is_empty(cell: NDArray[np.float64]) -> bool:
-    """Whether no pixel is in a cell, or rounding has left nothing of what weighs next to nothing.
-
-    Of pixels whose weights differ by 1e16, where others were taken off again.
-    """
-    return cell[COUNT] == 0 or cell[WEIGHT] <= 0
-
-
-@njit(cache=True)
-def _level(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-    """Inverse range of a plane at the middle of a cell."""
-    total = 0.0
-    for a in range(3):
-        total += theta[a] * cell[WEIGHTED_RAY + a]
-    return total / cell[WEIGHT]
+            result += _field(cells, k, theta[k], systematic, systematic_square, share)
+        middle[k] = result
+        sandwich(inverse[k], result, covariance[k])
 
 
 @njit(cache=True)
@@ -241,8 +269,8 @@ def _scaled_rays(
     columns = cells.columns[k]
     rays = np.zeros((len(own) // columns, columns, 3))
     for c in range(len(own)):
-        if not _is_empty(own[c]):
-            level = _level(own[c], theta)
+        if not is_empty(own[c]):
+            level = level_of(own[c], theta)
             deviation = np.sqrt(field.constant + field.quartic * level**4)
             for p in range(3):
                 rays[c // columns, c % columns, p] = deviation * own[c, WEIGHTED_RAY + p]
