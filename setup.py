@@ -1,8 +1,13 @@
+import os
 import re
+import subprocess
+import sys
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
+from setuptools.command.develop import develop
+from setuptools.command.install import install
 
 package_name = 'rangeseg_ros'
 share = f'share/{package_name}'
@@ -11,6 +16,44 @@ share = f'share/{package_name}'
 (version,) = re.findall(
     r"^__version__ = '(.+)'$", Path(package_name, '__init__.py').read_text('utf-8'), re.MULTILINE
 )
+
+
+def compile_kernels(folder):
+    """Have the package in `folder` compile its kernels, so that its first start need not.
+
+    They are kept in the package. An installation without them is one all the same.
+    """
+    if os.environ.get('RANGESEG_COMPILE') == '0':
+        return
+    start = 'from rangeseg_ros.start import rangeseg; rangeseg()'
+    # There, as Python looks for packages first where it is started: not beside the sources.
+    made = subprocess.run(
+        [sys.executable, '-c', start, 'compile'],
+        cwd=folder,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    if made.returncode:
+        *_, why = made.stderr.strip().splitlines() or [f'exit code {made.returncode}']
+        print(f'kernels are left for the first start to compile: {why}', file=sys.stderr)
+
+
+# What `colcon build` runs; pip makes a wheel, for whatever machine.
+class Install(install):
+    def run(self):
+        super().run()
+        # Wheels and Debian packages are put together in a folder of their own.
+        if not self.root:
+            compile_kernels(self.install_lib)
+
+
+# What `colcon build --symlink-install` runs, where setuptools still has it.
+class Develop(develop):
+    def run(self):
+        super().run()
+        if not getattr(self, 'uninstall', False):
+            compile_kernels(os.getcwd())
+
 
 setup(
     name=package_name,
@@ -98,6 +141,7 @@ setup(
         ],
     },
     zip_safe=True,
+    cmdclass={'install': Install, 'develop': Develop},
     entry_points={
         'console_scripts': [
             'rangeseg = rangeseg_ros.start:rangeseg',

@@ -1,5 +1,6 @@
 """What the package says of itself in several places agrees."""
 
+import os
 import re
 import runpy
 import shutil
@@ -126,3 +127,41 @@ def test_the_digest_follows_every_source_of_the_package(tmp_path):
             file.write('\n')
         seen.add(digest())
     assert len(seen) == 4
+
+
+def build_as_colcon_does(folder, *options, **environment):
+    """Install into `folder` where importing numba fails; what that said on stderr."""
+    pytest.importorskip('setuptools')
+    (folder / 'numba.py').write_text("raise ImportError('numba is not for this test')\n")
+    commands = ['egg_info', '--egg-base', folder, 'build', '--build-base', folder / 'build']
+    commands += ['install', '--prefix', folder / 'install', '--record', folder / 'installed']
+    before = {name: value for name, value in os.environ.items() if name != 'RANGESEG_COMPILE'}
+    done = subprocess.run(
+        [sys.executable, 'setup.py', *commands, '--single-version-externally-managed', *options],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env={**before, 'PYTHONPATH': os.fspath(folder), **environment},
+    )
+    assert done.returncode == 0, done.stderr
+    assert (folder / 'install').relative_to('/').as_posix() in (folder / 'installed').read_text()
+    return done.stderr
+
+
+def test_colcon_builds_without_numba_and_says_that_nothing_is_compiled(tmp_path):
+    errors = build_as_colcon_does(tmp_path)
+    (line,) = (line for line in errors.splitlines() if 'kernels' in line)
+    assert line == (
+        'kernels are left for the first start to compile: ImportError: numba is not for this test'
+    )
+
+
+@pytest.mark.parametrize(
+    'options, environment',
+    [
+        pytest.param((), {'RANGESEG_COMPILE': '0'}, id='where it is switched off'),
+        pytest.param(('--root', '/'), {}, id='into packages for other machines'),
+    ],
+)
+def test_nothing_is_compiled(tmp_path, options, environment):
+    assert 'kernels' not in build_as_colcon_does(tmp_path, *options, **environment)
