@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.transforms import Transform, TransformError, quaternion
+from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.io.files import replacing
 
 
@@ -88,7 +89,7 @@ def write_trajectory(path: Path, poses: Sequence[tuple[int, Transform]]) -> None
     """
     rows = [
         f'{stamp // 10**9}.{stamp % 10**9:09d} '
-        + ' '.join(f'{value:.9g}' for value in (*pose.shift, *quaternion(pose.rotation)))
+        + ' '.join(f'{value:.9g}' for value in (*pose.shift, *quaternions(pose.rotation)))
         for stamp, pose in poses
     ]
     with replacing(path) as partial:

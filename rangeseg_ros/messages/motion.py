@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rangeseg_ros.core.mapping.odometry import Motion
-from rangeseg_ros.core.mapping.transforms import quaternion
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.messages.make import Make
 
 ODOMETRY = 'nav_msgs/msg/Odometry'
@@ -31,7 +31,7 @@ def odometry_message(make: Make, header: Any, motion: Motion) -> Any:
     pose = make(
         'geometry_msgs/msg/Pose',
         position=vector('Point', shift),
-        orientation=vector('Quaternion', quaternion(turn)),
+        orientation=vector('Quaternion', quaternions(turn)),
     )
     twist = make(
         'geometry_msgs/msg/Twist',

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.description.extents import areas_and_axes, rectangles
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
@@ -113,9 +113,7 @@ def _measure(
     centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes) - distance[:, None] * normal
     frames = np.stack([axes[:, 0], axes[:, 1], normal], axis=2)
     frames[slope == 0] = np.eye(3)
-    orientation = Rotation.from_matrix(frames).as_quat()
-    orientation *= np.where(orientation[:, 3:] < 0, -1.0, 1.0)
-    return list(map(Shape, area.tolist(), extents, centre, orientation)), finite
+    return list(map(Shape, area.tolist(), extents, centre, quaternions(frames))), finite
 
 
 def _tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.tracking.tracker import PERSISTENCE
 
 
@@ -57,7 +57,7 @@ def predict(
     turn, shift = pose
     part = elapsed / PERSISTENCE
     kept, reach = np.exp(-part), PERSISTENCE * -np.expm1(-part)
-    turned = Rotation.from_rotvec(reach * velocity[:3]).as_matrix()
+    turned = rotation_by(reach * velocity[:3])
     change = np.eye(12)
     change[:3, :3] = turned.T
     change[:3, 6:9] = reach * np.eye(3)

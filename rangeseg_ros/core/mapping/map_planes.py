@@ -13,7 +13,7 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.evidence import HIT, LEAST, MISS, Evidence
 from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
-from rangeseg_ros.core.mapping.transforms import quaternion
+from rangeseg_ros.core.rotations import quaternions
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -145,7 +145,7 @@ def describe(
             area=shape.area,
             extents=shape.limits[:, 1] - shape.limits[:, 0],
             centre=point + shape.limits.mean(axis=1) @ frame,
-            orientation=quaternion(np.stack([*frame, normal], axis=1)),
+            orientation=quaternions(np.stack([*frame, normal], axis=1)),
         ),
         outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
         role=record.roles.most_common(1)[0][0],

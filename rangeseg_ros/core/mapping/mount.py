@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.transforms import quaternion
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Largest angle between up and -y of the camera, so that no wall is taken for the floor.
@@ -45,7 +45,7 @@ class Mount(NamedTuple):
     @property
     def quaternion(self) -> NDArray[np.float64]:
         """x, y, z, w of `rotation`."""
-        return quaternion(self.rotation)
+        return quaternions(self.rotation)
 
     @property
     def rpy(self) -> NDArray[np.float64]:

@@ -28,7 +28,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
@@ -41,6 +40,7 @@ from rangeseg_ros.core.mapping.observations import (
 )
 from rangeseg_ros.core.mapping.plane_errors import shifted, tangents, to_errors
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.tracker import NOMINAL
 
@@ -242,7 +242,7 @@ class PlaneOdometry:
         """Take the estimated errors off the state."""
         assert self._pose is not None
         turn, shift = self._pose
-        twist = Rotation.from_rotvec(step[:3]).as_matrix()
+        twist = rotation_by(step[:3])
         self._pose = Transform(turn @ twist, shift + step[3:6])
         self._velocity = self._velocity + step[6:12]
         own = step[_CAMERA:].reshape(-1, _OWN)[:, :3]

@@ -7,13 +7,13 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.rotations import quaternions, rotation_matrix
 
 Lookup = Callable[[str, str], Transform]
 """(target, source) -> the motion between two frames at the stamp of an image; TransformError."""
@@ -110,11 +110,9 @@ def moved_planes(planes: Sequence[Plane], motion: Transform) -> list[Plane]:
     turn, shift = motion
     jacobian = np.eye(4)
     jacobian[:3, :3], jacobian[3, :3] = turn, -shift @ turn
-    rotation = Rotation.from_matrix(turn)
     moved = []
     for plane in planes:
         normal = turn @ plane.normal
-        orientation = (rotation * Rotation.from_quat(plane.orientation)).as_quat()
         outline = MapOutline(
             [[ring @ turn.T + shift for ring in part] for part in plane.outline.parts]
         )
@@ -129,7 +127,7 @@ def moved_planes(planes: Sequence[Plane], motion: Transform) -> list[Plane]:
                     area=plane.area,
                     extents=plane.extents,
                     centre=turn @ plane.centre + shift,
-                    orientation=orientation if orientation[3] >= 0 else -orientation,
+                    orientation=quaternions(turn @ rotation_matrix(plane.orientation)),
                 ),
                 outline=outline,  # type: ignore[arg-type]
             )

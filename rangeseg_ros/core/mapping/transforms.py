@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.rotations import rotation_matrix
 
 CACHE_TIME = 10 * 10**9
 """Nanoseconds that the past of a frame is kept, as by default in tf2."""
@@ -289,21 +290,3 @@ def slerp(
     mixed = np.sin((1 - share) * angle) * first + np.sin(share * angle) * second
     unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
     return unit
-
-
-def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternion x, y, z, w, with w >= 0, of a rotation (3, 3)."""
-    turn: NDArray[np.float64] = Rotation.from_matrix(rotation).as_quat()
-    return turn if turn[3] >= 0 else -turn
-
-
-def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation (3, 3) of a unit quaternion x, y, z, w."""
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

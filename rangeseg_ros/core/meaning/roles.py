@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.meaning.stairs import RISE
+from rangeseg_ros.core.rotations import rotation_matrix
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
@@ -137,7 +137,7 @@ def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
 
 def _corners(plane: Plane) -> NDArray[np.float64]:
     """(4, 3) corners of the rectangle around a plane."""
-    axes = Rotation.from_quat(plane.orientation).as_matrix()[:, :2]
+    axes = rotation_matrix(plane.orientation)[:, :2]
     half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2
     corners: NDArray[np.float64] = plane.centre + half @ axes.T
     return corners

@@ -14,7 +14,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
@@ -251,6 +250,9 @@ def _assign(
     distance: NDArray[np.float64],
 ) -> NDArray[np.intp]:
     """(N,) number of the known plane that each plane is, -1 for none."""
+    # Here, as it takes as long to import as a frame and is for sequences only.
+    from scipy.optimize import linear_sum_assignment
+
     # Little without overlap, or two bad pairs would be worth more than one that is sure.
     affinity = (overlaps(known, seen, shared) + _UNSEEN_OVERLAP) * np.exp(-distance / 8)
     affinity[known.age < _TRIAL] *= _ON_TRIAL
