@@ -32,7 +32,7 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.regions import least_pixels, plane_regions
-from rangeseg_ros.core.sensing.blocks import Blocks, quads
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
@@ -180,7 +180,7 @@ def stages(image, config):
     pictures['edges'] = with_edges(image, jumps)
 
     size, least = block_size(image.shape), least_pixels(config.min_pixels, image.shape)
-    blocks = fine if size == 4 else Blocks.planes(quads(fine.moments), image.rays, size)
+    blocks = fine if size == 4 else fine.merged(image.rays, size)
     whole = whole_blocks(bridges.inverse, grid, size)
     count = np.maximum(blocks.moments[..., COUNT] - 3, 1)[whole]
     shown = np.sqrt(blocks.squared[whole]), blocks.residual[whole] / count

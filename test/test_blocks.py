@@ -5,9 +5,10 @@ import pytest
 
 from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.sensing.blocks import Blocks, block_moments
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
@@ -26,7 +27,7 @@ def grid(height, width, seed=0):
 
 def test_blocks_are_sums_over_their_pixels():
     inverse, rays, edges = grid(12, 14)
-    blocks = block_moments(inverse, rays, 4)
+    blocks = Blocks.of(RangeImage(rays, inverse)).moments
     assert blocks.shape == (3, 4, SIZE)
     part = slice(4, 8), slice(8, 12)
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
@@ -35,6 +36,26 @@ def test_blocks_are_sums_over_their_pixels():
     assert (blocks[:, :3, COUNT] == 16).all()
     assert (blocks[:, 3, COUNT] == 8).all(), 'half a block at the border'
     assert not whole_blocks(inverse, edges, 4)[:, 3].any()
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
+@pytest.mark.parametrize('size', [3, 4])
+def test_blocks_of_any_size_add_up(shape, size):
+    """Of images wider than what is summed at a time, with holes where no ray is."""
+    inverse, rays, _ = grid(*shape)
+    holes = np.random.default_rng(1).random(shape) < 0.3
+    inverse[holes], rays[holes] = 0, np.nan
+    blocks = Blocks.of(RangeImage(rays, inverse), size)
+    y = np.where(holes, 0, inverse).astype(float)
+    for i, j in np.ndindex(blocks.squared.shape):
+        part = np.s_[size * i : size * (i + 1), size * j : size * (j + 1)]
+        assert blocks.moments[i, j, COUNT] == np.count_nonzero(~holes[part])
+        np.testing.assert_allclose(blocks.moments[i, j, 9], (y[part] ** 2).sum(), rtol=1e-12)
+    whole = blocks.merged(rays, 2 * size)
+    assert whole.squared.shape == tuple(-(-n // (2 * size)) for n in shape)
+    for i, j in np.ndindex(whole.squared.shape):
+        parts = blocks.moments[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(-1, SIZE)
+        np.testing.assert_allclose(whole.moments[i, j], parts.sum(axis=0), rtol=1e-12)
 
 
 def test_blocks_that_jumps_cross_are_left_out():
@@ -79,7 +100,7 @@ def test_blocks_touch_along_half_of_their_border(shape):
 def test_slopes_and_residuals_are_those_of_the_planes():
     random = np.random.default_rng(5)
     inverse, rays, _ = grid(40, 60)
-    blocks = Blocks.planes(block_moments(inverse, rays, 4), rays, 4)
+    blocks = Blocks.of(RangeImage(rays, inverse))
     i, j = random.integers(0, (10, 15))
     part = slice(4 * i, 4 * i + 4), slice(4 * j, 4 * j + 4)
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
@@ -94,12 +115,12 @@ def test_slopes_and_residuals_are_those_of_the_planes():
 def test_weights_count_in_variances_of_the_sensor():
     inverse, rays, _ = grid(80, 80, seed=4)
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
-    plain = block_moments(inverse, rays, 4)
-    flat = np.zeros(plain.shape[:2])
-    facing = Blocks.planes(plain, rays, 4)._replace(across=flat, down=flat)
-    blocks = weigh_blocks(facing, np.ones(plain.shape[:2], bool), sensor)
+    plain = Blocks.of(RangeImage(rays, inverse))
+    flat = np.zeros(plain.squared.shape)
+    facing = plain._replace(across=flat, down=flat)
+    blocks = weigh_blocks(facing, np.ones(flat.shape, bool), sensor)
     theta, residual = fit_all(blocks.reshape(-1, SIZE))
-    unweighted, _ = fit_all(plain.reshape(-1, SIZE))
+    unweighted, _ = fit_all(plain.moments.reshape(-1, SIZE))
     np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)
     # Chi-squared of 16 - 3 degrees of freedom each; 400 blocks: 2 % of standard error.
     assert residual.mean() == pytest.approx(13, rel=0.08)

@@ -24,7 +24,7 @@ from rangeseg_ros.core.fitting.interior import Inside
 from rangeseg_ros.core.regions import by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, block_moments, quads
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -89,10 +89,10 @@ def segment(
     """
     size = block_size(image.shape)
     if size == 2 * BLOCK:
-        blocks = Blocks.planes(quads(blocks.moments), image.rays, size)
+        blocks = blocks.merged(image.rays, size)
     elif size != BLOCK:
         # With what was bridged: a row of three pixels alone determines no plane.
-        blocks = Blocks.planes(block_moments(image.inverse, image.rays, size), image.rays, size)
+        blocks = Blocks.of(image, size)
     # Of a block of holes, a quarter measured will do.
     whole = whole_blocks(image.inverse, grid, size)
     whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)

@@ -22,7 +22,7 @@ from rangeseg_ros.core.fitting.errors import BOTH, Errors, by_turn, explaining, 
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.scale import ENOUGH, MOST, QUANTILE, Scale
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, quads
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
@@ -55,7 +55,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     quanta = submit(quantisation, image.inverse)
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
-    coarse = Blocks.planes(quads(blocks.moments), image.rays, 2 * BLOCK)
+    coarse = blocks.merged(image.rays, 2 * BLOCK)
     count = coarse.moments[..., COUNT]
     used = 2 * count >= count.max(initial=0)
     if np.count_nonzero(used) < SAMPLES:
@@ -87,9 +87,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         whole, apart, level = _of_four(flat, parts.residual, level)
         if np.count_nonzero(whole) < SAMPLES:
             break
-        parts = (
-            coarse if side == BLOCK else Blocks.planes(quads(parts.moments), image.rays, 2 * side)
-        )
+        parts = coarse if side == BLOCK else parts.merged(image.rays, 2 * side)
         scale = Scale.of(parts, whole, way, ENOUGH)
         if side == BLOCK:
             # What is new in every pixel shows in the smallest blocks.

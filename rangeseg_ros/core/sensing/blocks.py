@@ -9,7 +9,19 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, NO_PIXEL, SIZE, fit, plus_pixel
+from rangeseg_ros.core.sensing.block_rows import (
+    LANES,
+    add_moments,
+    add_row,
+    block_plane,
+    clear_sums,
+    fit_sums,
+    new_lanes,
+    set_height,
+    set_rays,
+    store_sums,
+)
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 BLOCK = 4
@@ -44,123 +56,105 @@ class Blocks(NamedTuple):
         return way[0] * self.across + way[1] * self.down
 
     @classmethod
-    def of(cls, image: RangeImage) -> Blocks:
-        """Blocks of 4 x 4 pixels."""
-        return cls.planes(block_moments(image.inverse, image.rays), image.rays, BLOCK)
+    def of(cls, image: RangeImage, size: int = BLOCK) -> Blocks:
+        """Blocks of `size` pixels, 3 or 4."""
+        height, width = image.shape
+        blocks = cls._empty(-(-height // size), -(-width // size))
+        rays = image.inverse, image.rays, image.pinhole
+        run_rows(_sum_pixels, len(blocks.moments), *rays, size, blocks)
+        return blocks
+
+    def merged(self, rays: NDArray[np.float32], size: int) -> Blocks:
+        """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
+        rows, columns = self.squared.shape
+        blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
+        run_rows(_sum_blocks, len(blocks.moments), self.moments, rays, size, blocks)
+        return blocks
 
     @classmethod
-    def planes(cls, moments: NDArray[np.float64], rays: NDArray[np.float32], size: int) -> Blocks:
-        """Planes of the blocks of `size` pixels with these moments."""
-        squared = moments[..., CHI2] / np.maximum(moments[..., COUNT], 1)
-        across, down, residual = (np.zeros_like(squared) for _ in range(3))
-        run_rows(_fit_blocks, len(moments), moments, rays, size, across, down, residual)
-        return cls(moments, squared, across, down, residual)
+    def _empty(cls, rows: int, columns: int) -> Blocks:
+        """To be filled in."""
+        moments = np.zeros((rows, columns, SIZE))
+        return cls(moments, *(np.zeros((rows, columns)) for _ in range(4)))
 
 
-def block_moments(
-    inverse: NDArray[np.float32], rays: NDArray[np.float32], size: int = BLOCK
-) -> NDArray[np.float64]:
-    """Moments, with unit weights, of the measured pixels of every block.
-
-    Parameters
-    ----------
-    inverse, rays : (H, W), (H, W, 3) float32
-        Range image; inverse is 0 where nothing was measured.
-    size : int
-        Rows and columns of a block.
-
-    Returns
-    -------
-    (ceil(H / size), ceil(W / size), 13) float64
-    """
-    height, width = inverse.shape
-    moments = np.zeros((-(-height // size), -(-width // size), SIZE))
-    run_rows(_sum_blocks, len(moments), inverse, rays, size, moments)
-    return moments
+@njit(cache=True, nogil=True)
+def _sum_pixels(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    pinhole: bool,
+    size: int,
+    blocks: Blocks,
+) -> None:
+    """Fill in rows of blocks of pixels."""
+    lanes = new_lanes()
+    for begin in range(0, blocks.squared.shape[1], LANES):
+        left = begin * size
+        for axis in range(0, 3, 2):
+            set_rays(lanes, axis, rays[0, left:, axis], size)
+        for bi in range(first, after):
+            clear_sums(lanes)
+            for i in range(bi * size, min((bi + 1) * size, len(inverse))):
+                if pinhole:
+                    set_height(lanes, rays[i, 0, 1])
+                else:
+                    for axis in range(3):
+                        set_rays(lanes, axis, rays[i, left:, axis], size)
+                add_row(lanes, inverse[i, left:], size)
+            _store(bi, begin, lanes, rays, size, blocks)
 
 
 @njit(cache=True, nogil=True)
 def _sum_blocks(
     first: int,
     after: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    size: int,
-    moments: NDArray[np.float64],
-) -> None:
-    """Moments of rows of blocks."""
-    height, width = inverse.shape
-    for bi in range(first, after):
-        bottom = min((bi + 1) * size, height)
-        for bj in range(moments.shape[1]):
-            right = min((bj + 1) * size, width)
-            sums, count = NO_PIXEL, 0.0
-            for i in range(bi * size, bottom):
-                for j in range(bj * size, right):
-                    y = np.float64(inverse[i, j])
-                    if y == 0:
-                        continue
-                    x0 = np.float64(rays[i, j, 0])
-                    x1 = np.float64(rays[i, j, 1])
-                    x2 = np.float64(rays[i, j, 2])
-                    sums = plus_pixel(sums, x0, x1, x2, y, 1.0)
-                    count += 1
-            for entry, value in enumerate(sums):
-                moments[bi, bj, entry] = value
-            moments[bi, bj, COUNT] = count
-
-
-def quads(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Moments (ceil(rows / 2), ceil(columns / 2), 13) of every 2 x 2 blocks."""
-    rows, columns = blocks.shape[:2]
-    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, SIZE))
-    run_rows(_sum_quads, len(result), blocks, result)
-    return result
-
-
-@njit(cache=True, nogil=True)
-def _sum_quads(
-    first: int, after: int, blocks: NDArray[np.float64], result: NDArray[np.float64]
-) -> None:
-    """The same for some of its rows."""
-    rows, columns = blocks.shape[:2]
-    for i in range(2 * first, min(2 * after, rows)):
-        for j in range(columns):
-            for k in range(SIZE):
-                result[i // 2, j // 2, k] += blocks[i, j, k]
-
-
-@njit(cache=True, nogil=True)
-def _fit_blocks(
-    first: int,
-    after: int,
     moments: NDArray[np.float64],
     rays: NDArray[np.float32],
     size: int,
-    across: NDArray[np.float64],
-    down: NDArray[np.float64],
-    residual: NDArray[np.float64],
+    blocks: Blocks,
 ) -> None:
-    """Slopes and residuals of rows of blocks."""
-    theta = np.zeros(3)
+    """Fill in rows of blocks of 2 x 2 that have these moments."""
+    lanes = new_lanes()
+    for begin in range(0, blocks.squared.shape[1], LANES):
+        for bi in range(first, after):
+            clear_sums(lanes)
+            for i in range(2 * bi, min(2 * bi + 2, len(moments))):
+                add_moments(lanes, moments[i, 2 * begin :])
+            _store(bi, begin, lanes, rays, size, blocks)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _store(
+    bi: int,
+    begin: int,
+    lanes: NDArray[np.float64],
+    rays: NDArray[np.float32],
+    size: int,
+    blocks: Blocks,
+) -> None:
+    """Fill in as many blocks as there are lanes, or fewer at the border: sums, planes, slopes."""
+    fit_sums(lanes)
+    after = min(begin + LANES, blocks.squared.shape[1])
+    squared, residual = blocks.squared[bi, begin:after], blocks.residual[bi, begin:after]
+    store_sums(lanes, blocks.moments[bi, begin:after], squared, residual)
     # Variance of the slope in both directions together, of noise of unit variance.
     doubt = 2 * 12 / (size * size - 1)
     # The pixel in the middle of a block and its neighbours; the last block may be cut off.
-    for bi in range(first, after):
-        i = min(bi * size + size // 2, len(rays) - 2)
-        for bj in range(moments.shape[1]):
-            j = min(bj * size + size // 2, rays.shape[1] - 2)
-            count = moments[bi, bj, COUNT]
-            if count == 0:
-                continue
-            residual[bi, bj] = fit(moments[bi, bj], theta)
-            if i < 0 or j < 0 or count <= 3:
-                continue
-            right, below = 0.0, 0.0
-            for k in range(3):
-                right += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
-                below += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
-            square = right * right + below * below
-            noise = residual[bi, bj] / (count - 3) * doubt / count
-            share = max(square - noise, 0.0) / max(square, 1e-300)
-            across[bi, bj], down[bi, bj] = share * right * right, share * below * below
+    i = min(bi * size + size // 2, len(rays) - 2)
+    for bj in range(begin, after):
+        j = min(bj * size + size // 2, rays.shape[1] - 2)
+        count = blocks.moments[bi, bj, COUNT]
+        if i < 0 or j < 0 or count <= 3:
+            continue
+        theta = block_plane(lanes, bj - begin)
+        right, below = 0.0, 0.0
+        for k in range(3):
+            right += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
+            below += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+        square = right * right + below * below
+        noise = blocks.residual[bi, bj] / (count - 3) * doubt / count
+        share = max(square - noise, 0.0) / max(square, 1e-300)
+        blocks.across[bi, bj] = share * right * right
+        blocks.down[bi, bj] = share * below * below

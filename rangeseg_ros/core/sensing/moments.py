@@ -87,7 +87,24 @@ def add_pixel(
     moments[RATIO] += ratio
 
 
-@njit(cache=True)
+@njit(cache=True, inline='always')
+def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
+    """Least-squares plane of the first ten sums of a moment vector, and the squares it leaves.
+
+    Zeros and all squares where the pixels do not determine one. For kernels of the error model
+    'numpy': without branches, so that the compiler takes many at a time.
+    """
+    a, b, c, d, e, f, p, q, r, square = sums
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+    known = determinant > 1e-13 * a * d * f
+    x = (aa * p + bb * q + cc * r) / determinant if known else 0.0
+    y = (bb * p + dd * q + ee * r) / determinant if known else 0.0
+    z = (cc * p + ee * q + ff * r) / determinant if known else 0.0
+    left = square - x * p - y * q - z * r
+    return x, y, z, left if left > 0 else 0.0
+
+
+@njit(cache=True, error_model='numpy')
 def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     """Least-squares plane of a moment vector.
 
@@ -102,16 +119,10 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     float
         Weighted sum of the squared residuals.
     """
-    a, b, c, d, e, f = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    p, q, r = moments[6], moments[7], moments[8]
-    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-    if determinant <= 1e-13 * a * d * f:
-        theta[:] = 0
-        return moments[CHI2]
-    theta[0] = (aa * p + bb * q + cc * r) / determinant
-    theta[1] = (bb * p + dd * q + ee * r) / determinant
-    theta[2] = (cc * p + ee * q + ff * r) / determinant
-    return max(moments[CHI2] - theta[0] * p - theta[1] * q - theta[2] * r, 0.0)
+    matrix = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
+    right = moments[6], moments[7], moments[8], moments[CHI2]
+    theta[0], theta[1], theta[2], left = plane_of(matrix + right)
+    return left
 
 
 @njit(cache=True)
