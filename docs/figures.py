@@ -195,7 +195,7 @@ def stages(image, config):
     patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
     alone = np.bincount(patch.ravel())[patch] == 1
     pictures['patches'] = over(image, np.where(alone, 0, patch), size)
-    surface, _ = join_surfaces(moments, links, size, sensor, least)
+    surface, _ = join_surfaces(moments, links, size, sensor, config.plane_smoothness, least)
     pictures['surfaces'] = over(image, surface, size)
 
     labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)

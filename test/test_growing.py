@@ -19,6 +19,7 @@ ROWS, COLUMNS = np.indices(CAMERA.shape)
 QUANTUM = 0.0029
 """Of the disparity of a Kinect, 1/m."""
 NOISE = 0.45 * QUANTUM
+SMOOTHNESS = Config().plane_smoothness
 WALL = np.array([0.05, 0.02, 0.5])
 
 
@@ -35,7 +36,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, 4), model)
-    return join_surfaces(blocks, block_links(edges, 4), 4, model, least)
+    return join_surfaces(blocks, block_links(edges, 4), 4, model, SMOOTHNESS, least)
 
 
 def covered(labels, label):
@@ -142,6 +143,7 @@ def test_nothing_to_grow_from():
         (np.ones((5, 6), bool), np.ones((4, 7), bool)),
         4,
         SensorModel.from_config(Config()),
+        SMOOTHNESS,
     )
     assert not labels.any() and labels.shape == (5, 7)
     assert moments.shape == (1, 13) and not moments.any()

@@ -244,7 +244,7 @@ def small_room(seed=900):
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
-    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK, sensor)
+    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK, sensor, LAMBDA)
     return Problem.of(image, sensor, edges, BLOCK, LAMBDA), (found[0], blocks, found[1]), sensor
 
 

@@ -101,7 +101,8 @@ def segment(
     # Surfaces as large as regions: smaller ones are clutter.
     least = least_pixels(config.min_pixels, image.shape)
     weights = weigh_blocks(blocks, whole, sensor)
-    surface, moments = join_surfaces(weights, block_links(grid, size), size, sensor, least)
+    links = block_links(grid, size)
+    surface, moments = join_surfaces(weights, links, size, sensor, config.plane_smoothness, least)
     problem = pending.result()
     lap('surfaces')
     cuts = Work.within(config.work_budget).cuts

@@ -6,13 +6,11 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-# Chi-squared of the three degrees of freedom of a plane, times what parts of a face differ by
-# beyond their errors.
-_CHI2_LIMIT = RESIDUE * chi2_quantile(3)
+# Chi-squared of the three degrees of freedom of a plane.
+_CHI2_LIMIT = chi2_quantile(3)
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
 # are merged at once: quantile 0.996.
 _CLEAR = 24.0

@@ -7,6 +7,10 @@ off by the distortion where the wall ends, yet the patch beside it agrees. Hence
 merge to patches small enough for the distortion to be nearly constant; patches join where they
 agree with their neighbours, averaged along the common border, and the surface as a whole stays
 within the distortion.
+
+Where noise is strong, chance alone leaves parts of a face apart, and looser tests would join faces
+that meet. What decides then is the energy that the labelling minimises: surfaces unite as long as
+one plane costs their pixels less than their common border does.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.blocks import Links
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import COUNT, SIZE, common_residual, fit
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
@@ -36,6 +40,7 @@ def join_surfaces(
     links: Links,
     block: int,
     sensor: SensorModel,
+    smoothness: float,
     least: int = 1,
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
@@ -49,7 +54,9 @@ def join_surfaces(
     block : int
         Rows and columns of a block.
     sensor : SensorModel
-        Its `agreement` and `distortion_pixels` are read.
+        Its `agreement`, `patch` and `distortion_pixels` are read.
+    smoothness : float
+        Of the energy's prior, see `Problem.of`.
     least : int
         Pixels of the smallest surface.
 
@@ -69,11 +76,15 @@ def join_surfaces(
     (patch, moments), (lower, beneath) = halves
     patch = np.concatenate([patch, np.where(lower > 0, lower + len(moments) - 1, 0)])
     moments = np.concatenate([moments, beneath[1:]])
-    border = _borders(patch.reshape(shape), *links, len(moments))
-    surface, moments = _renumber(
-        _join(moments, border, sensor.distortion_pixels, sensor.agreement), moments, float(least)
-    )
-    return surface[patch].reshape(shape), moments
+    patch, smooth = patch.reshape(shape), sensor.distortion_pixels
+    border = _borders(patch, *links, len(moments))
+    part, moments = _renumber(_join(moments, border, smooth, sensor.agreement), moments, 1.0)
+    parts = part[patch]
+    border = _borders(parts, *links, len(moments))
+    # What a block's side of border costs.
+    side = smoothness * sensor.patch * block
+    surface, moments = _renumber(_unite(moments, side * border, smooth), moments, float(least))
+    return surface[parts], moments
 
 
 @njit(cache=True, nogil=True)
@@ -199,6 +210,68 @@ def _join(
                     partner[c], least[c] = _smallest(mean[c], c)
         partner[a], least[a] = _smallest(mean[a], a)
     return find_roots(parent)
+
+
+@njit(cache=True, nogil=True)
+def _unite(
+    moments: NDArray[np.float64], border: NDArray[np.float64], smooth: float
+) -> NDArray[np.intp]:
+    """Unite surfaces 1...K as long as the energy falls, those first by which it falls most.
+
+    `border` is what their borders cost, `smooth` is `SensorModel.distortion_pixels`. Returns the
+    roots.
+    """
+    count = len(moments)
+    moments, border = moments.copy(), border.copy()
+    theta = np.zeros(3)
+    residual = np.zeros(count)
+    for a in range(count):
+        residual[a] = fit(moments[a], theta)
+    # By how much the energy changes if surfaces a < b that touch unite. Of each a: the b with
+    # which it falls most, and by how much.
+    change = np.zeros((count, count))
+    partner, least = np.arange(count), np.zeros(count)
+    for a in range(count):
+        for b in range(a + 1, count):
+            if border[a, b] > 0:
+                change[a, b] = _energy_change(moments, residual, a, b, smooth) - border[a, b]
+        partner[a], least[a] = _smallest(change[a], a)
+    parent = np.arange(count)
+    while True:
+        a, falls = _smallest(least, 0)
+        if not falls < 0:
+            break
+        b = partner[a]
+        parent[b] = a
+        residual[a] = common_residual(moments, a, b)
+        moments[a] += moments[b]
+        border[a, b] = border[b, a] = 0
+        change[a, b] = least[b] = 0
+        for c in range(count):
+            if border[b, c] > 0:
+                border[a, c] += border[b, c]
+                border[c, a] = border[a, c]
+                border[b, c] = border[c, b] = 0
+                change[min(b, c), max(b, c)] = 0
+            if border[a, c] > 0:
+                apart = _energy_change(moments, residual, a, c, smooth)
+                change[min(a, c), max(a, c)] = apart - border[a, c]
+            if c != a and parent[c] == c:
+                partner[c], least[c] = _smallest(change[c], c)
+        partner[a], least[a] = _smallest(change[a], a)
+    return find_roots(parent)
+
+
+@njit(cache=True)
+def _energy_change(
+    moments: NDArray[np.float64], residual: NDArray[np.float64], a: int, b: int, smooth: float
+) -> float:
+    """What one plane costs the pixels of two surfaces beyond their own planes."""
+    extra = common_residual(moments, a, b) - residual[a] - residual[b]
+    # The distortion that a region so large is granted, as in `Models`.
+    pixels = moments[a, COUNT] + moments[b, COUNT]
+    granted = 1 + (moments[a, RATIO] + moments[b, RATIO]) / (pixels + smooth)
+    return 0.5 * extra / granted
 
 
 @njit(cache=True)
