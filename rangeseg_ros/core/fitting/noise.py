@@ -17,10 +17,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import median
 from rangeseg_ros.core.fitting.errors import BOTH, Errors, by_turn, explaining, turning, variances
+from rangeseg_ros.core.fitting.nested import compare, over_scales
 from rangeseg_ros.core.fitting.quantisation import quantisation
-from rangeseg_ros.core.fitting.scale import ENOUGH, MOST, QUANTILE, Scale
+from rangeseg_ros.core.fitting.scale import (
+    ENOUGH,
+    MOST,
+    QUANTILE,
+    Ratio,
+    Scale,
+    choose,
+    mean_of_sets,
+    share,
+    variance_ratio,
+)
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -30,13 +40,9 @@ from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13
 """Chi-squared of 13 degrees of freedom over its mean: what is rougher is no part of a plane."""
-# The same with 9 degrees of freedom, of what one plane through four blocks leaves.
-_BENT = chi2_quantile(9) / 9
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
-# Median of chi-squared of 9 degrees of freedom over its mean.
-_MEDIAN = chi2_quantile(9, 0.5) / 9
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
@@ -56,14 +62,11 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
     coarse = blocks.merged(image.rays, 2 * BLOCK)
-    count = coarse.moments[..., COUNT]
-    used = 2 * count >= count.max(initial=0)
-    if np.count_nonzero(used) < SAMPLES:
+    used, scale, across, down, ratio = _telling(coarse)
+    if used < SAMPLES:
         return prior
-    scale = Scale.of(coarse, used, BOTH, MOST)
-    variance = scale.variance_ratio(coarse, 1.0)
-    slopes = coarse.across.ravel()[scale.place], coarse.down.ravel()[scale.place]
-    sets = submit(by_turn, scale.squared, *slopes, variance, QUANTILE)
+    variance = ratio.values / share(ratio.freedom)
+    sets = submit(by_turn, scale.squared, across, down, variance, QUANTILE)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
@@ -73,50 +76,22 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     each = len(variance) / len(sets.result().variance)
     tilt, way = turning(sets.result(), each, noise, rounded)
     noise = noise._replace(tilt=tilt)
-    level, flat = _flat_blocks(blocks, variances(noise, coarse.squared, coarse.slope(way)))
+    level, flat = _flat_blocks(blocks, coarse, noise, way)
     if not flat.any():
         return prior
     smallest = submit(_within, blocks, flat, way, level)
-    within: list[float] = []
-    between = filled = 1.0
-    distortion = none
-    # Lasers err in range alone.
-    in_range = noise.quartic > 0
-    side, parts = BLOCK, blocks
-    while True:
-        whole, apart, level = _of_four(flat, parts.residual, level)
-        if np.count_nonzero(whole) < SAMPLES:
-            break
-        parts = coarse if side == BLOCK else parts.merged(image.rays, 2 * side)
-        scale = Scale.of(parts, whole, way, ENOUGH)
-        if side == BLOCK:
-            # What is new in every pixel shows in the smallest blocks.
-            within.append(smallest.result())
-            shown = noise.times(within[0])
-        excess = np.maximum(parts.residual - apart, 0) / (9 * _MEDIAN)
-        bending = explaining(scale, excess.ravel()[scale.place], 0.5, in_range, none, shown)
-        within.append(scale.mean(scale.variance_ratio(parts, level), QUANTILE))
-        # Measured in each of the four blocks: s^2 where there are no holes.
-        pixels = median(scale.pixels(parts)) / 4
-        if side == BLOCK:
-            between = scale.mean((excess / level).ravel()[scale.place], 0.5)
-            filled = pixels / side**2
-        # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
-        smooth = bending.times(8 / pixels)._replace(tilt=0.0)
-        slope = parts.slope(way)
-        expected = variances(shown, parts.squared, slope)
-        expected += variances(bending, parts.squared, slope)
-        flat = whole & (excess < _BENT * expected)
-        typical = [
-            median(variances(errors, scale.squared, scale.slope))
-            for errors in (distortion, smooth)
-        ]
-        if typical[1] > typical[0]:
-            distortion = smooth
-        side = 2 * side
-    if not within:
+    compared = compare(flat, blocks.residual, level, coarse, way)
+    if not compared.enough:
         return prior
-    total, white, width = _random(within, between, filled)
+    quantile, freedom = smallest.result()
+    # What is new in every pixel shows in the smallest blocks.
+    shown = noise.times(quantile / share(freedom))
+    # Lasers err in range alone.
+    nested = over_scales(compared, coarse, image.rays, way, noise.quartic > 0, shown)
+    shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
+    within = list(np.array([quantile, *nested.within]) / shares)
+    distortion = nested.distortion
+    total, white, width = _random(within, nested.between, nested.filled)
     # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
     # blocks hide nothing of it.
     turned = np.sqrt(noise.tilt * (total if way == BOTH else 1.0)) * np.array(way)
@@ -135,46 +110,64 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     )
 
 
+@njit(cache=True, nogil=True)
+def _telling(
+    blocks: Blocks,
+) -> tuple[int, Scale, NDArray[np.float64], NDArray[np.float64], Ratio]:
+    """Those blocks of a scale that tell the kind of the noise.
+
+    How many there are, those that are looked at, their squared slopes (N,) along the row and down
+    the column, and what they show of a variance of 1.
+    """
+    count = blocks.moments[..., COUNT]
+    rows, columns = count.shape
+    most = 0.0
+    for i in range(rows):
+        for j in range(columns):
+            most = max(most, count[i, j])
+    used, found = np.empty((rows, columns), np.bool_), 0
+    for i in range(rows):
+        for j in range(columns):
+            used[i, j] = 2 * count[i, j] >= most
+            found += used[i, j]
+    scale = choose(blocks, used, BOTH, MOST)
+    across, down = np.empty(len(scale.place)), np.empty(len(scale.place))
+    for k, place in enumerate(scale.place):
+        across[k] = blocks.across[place // columns, place % columns]
+        down[k] = blocks.down[place // columns, place % columns]
+    return found, scale, across, down, variance_ratio(scale, blocks, np.ones((rows, columns)))
+
+
+@njit(cache=True, nogil=True)
 def _within(
     blocks: Blocks, flat: NDArray[np.bool_], way: tuple[float, float], level: NDArray[np.float64]
-) -> float:
-    """What the flat ones of the smallest blocks show of the variances `level`."""
-    scale = Scale.of(blocks, flat, way, ENOUGH)
-    return scale.mean(scale.variance_ratio(blocks, level), QUANTILE)
+) -> tuple[float, float]:
+    """What a quantile of the flat blocks shows of the variances `level`, and their freedom.
+
+    See `Ratio`.
+    """
+    scale = choose(blocks, flat, way, ENOUGH)
+    ratio = variance_ratio(scale, blocks, level)
+    return mean_of_sets(scale, ratio.values, QUANTILE), ratio.freedom
 
 
 @njit(cache=True, nogil=True)
 def _flat_blocks(
-    blocks: Blocks, variance: NDArray[np.float64]
+    blocks: Blocks, coarse: Blocks, noise: Errors, way: tuple[float, float]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Variances of blocks (rows, columns) from those of blocks of four, and which they explain."""
+    """Variances of blocks (rows, columns), those of blocks of four, and which they explain."""
     rows, columns = blocks.squared.shape
     level, flat = np.empty((rows, columns)), np.empty((rows, columns), np.bool_)
     for i in range(rows):
         for j in range(columns):
-            level[i, j] = variance[i // 2, j // 2]
+            squared = coarse.squared[i // 2, j // 2]
+            slope = way[0] * coarse.across[i // 2, j // 2] + way[1] * coarse.down[i // 2, j // 2]
+            level[i, j] = variances(noise, squared, slope)
             count = blocks.moments[i, j, COUNT]
             # Six pixels leave three degrees of freedom.
             limit = ROUGH * level[i, j] * max(count - 3, 1.0)
             flat[i, j] = (count >= 6) & (blocks.residual[i, j] < limit)
     return level, flat
-
-
-@njit(cache=True, nogil=True)
-def _of_four(
-    flat: NDArray[np.bool_], residual: NDArray[np.float64], level: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Of every 2 x 2 blocks (rows, columns): whether there are four, all of them flat; the sums
-    of their residuals; a fourth of that of their variances `level`."""
-    rows, columns = flat.shape
-    shape = (rows + 1) // 2, (columns + 1) // 2
-    count, apart, mean = np.zeros(shape, np.uint8), np.zeros(shape), np.zeros(shape)
-    for i in range(rows):
-        for j in range(columns):
-            count[i // 2, j // 2] += flat[i, j]
-            apart[i // 2, j // 2] += residual[i, j]
-            mean[i // 2, j // 2] += level[i, j] / 4
-    return count == 4, apart, mean
 
 
 def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import Sets, alike, median, quantiles
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.moments import COUNT, SIZE
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.significance import chi2_quantile
 
 QUANTILE = 0.4
@@ -43,42 +43,26 @@ class Scale(NamedTuple):
     slope: NDArray[np.float64]
     sets: Sets
 
-    @classmethod
-    def of(
-        cls, blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], most: int
-    ) -> Scale:
-        """Of the blocks `used` (rows, columns), every n-th: about as many as `most`."""
-        return cls(*_chosen(blocks.squared, blocks.across, blocks.down, used, way, most))
 
-    def pixels(self, blocks: Blocks) -> NDArray[np.float64]:
-        """Measured pixels (N,) of each."""
-        pixels: NDArray[np.float64] = blocks.moments.reshape(-1, SIZE)[self.place, COUNT]
-        return pixels
+class Ratio(NamedTuple):
+    """Mean square residuals of the blocks of a scale over variances, but for a common factor.
 
-    def variance_ratio(
-        self, blocks: Blocks, level: NDArray[np.float64] | float
-    ) -> NDArray[np.float64]:
-        """Mean square residuals (N,) of what the quantile of those of a variance `level` is."""
-        freedom = np.maximum(self.pixels(blocks) - 3, 1)
-        ratio = blocks.residual.ravel()[self.place]
-        ratio /= level if isinstance(level, float) else level.ravel()[self.place]
-        return ratio / (freedom * _share(median(freedom)))
+    Attributes
+    ----------
+    values : (N,) float64
+        For each degree of freedom.
+    freedom : float
+        Of most of them. The `share` of that is the common factor: what a `QUANTILE` of the values
+        is where the variances are right.
+    """
 
-    def mean(self, ratio: NDArray[np.float64], quantile: float) -> float:
-        """Mean over the sets of a quantile of what their blocks show of what was expected."""
-        return float(np.mean(quantiles(ratio, self.sets, quantile)))
+    values: NDArray[np.float64]
+    freedom: float
 
 
 @njit(cache=True, nogil=True)
-def _chosen(
-    squared: NDArray[np.float64],
-    across: NDArray[np.float64],
-    down: NDArray[np.float64],
-    used: NDArray[np.bool_],
-    way: tuple[float, float],
-    most: int,
-) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64], Sets]:
-    """The attributes of a `Scale`."""
+def choose(blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], most: int) -> Scale:
+    """Of the blocks `used` (rows, columns), every n-th: about as many as `most`."""
     rows, columns = used.shape
     count = 0
     for i in range(rows):
@@ -88,21 +72,50 @@ def _chosen(
     stride = max(count // most, 1) | 1
     count = (count + stride - 1) // stride
     place = np.empty(count, np.intp)
-    levels, slopes = np.empty(count), np.empty(count)
+    squared, slope = np.empty(count), np.empty(count)
     seen = k = 0
     for i in range(rows):
         for j in range(columns):
             if not used[i, j]:
                 continue
             if seen % stride == 0:
-                place[k], levels[k] = i * columns + j, squared[i, j]
-                slopes[k] = way[0] * across[i, j] + way[1] * down[i, j]
+                place[k], squared[k] = i * columns + j, blocks.squared[i, j]
+                slope[k] = way[0] * blocks.across[i, j] + way[1] * blocks.down[i, j]
                 k += 1
             seen += 1
-    return place, levels, slopes, alike(levels, slopes)
+    return Scale(place, squared, slope, alike(squared, slope))
+
+
+@njit(cache=True, nogil=True)
+def pixels_of(scale: Scale, blocks: Blocks) -> NDArray[np.float64]:
+    """Measured pixels (N,) of each."""
+    columns = blocks.squared.shape[1]
+    pixels = np.empty(len(scale.place))
+    for k, place in enumerate(scale.place):
+        pixels[k] = blocks.moments[place // columns, place % columns, COUNT]
+    return pixels
+
+
+@njit(cache=True, nogil=True)
+def variance_ratio(scale: Scale, blocks: Blocks, level: NDArray[np.float64]) -> Ratio:
+    """What blocks show of the variances `level` (rows, columns)."""
+    columns = blocks.squared.shape[1]
+    freedom = pixels_of(scale, blocks)
+    values = np.empty(len(freedom))
+    for k, place in enumerate(scale.place):
+        freedom[k] = max(freedom[k] - 3, 1.0)
+        i, j = place // columns, place % columns
+        values[k] = blocks.residual[i, j] / level[i, j] / freedom[k]
+    return Ratio(values, median(freedom))
+
+
+@njit(cache=True, nogil=True)
+def mean_of_sets(scale: Scale, values: NDArray[np.float64], quantile: float) -> float:
+    """Mean over the sets of a quantile of the values (N,) of their blocks."""
+    return float(quantiles(values, scale.sets, quantile).mean())
 
 
 @cache
-def _share(freedom: float) -> float:
+def share(freedom: float) -> float:
     """Quantile of chi-squared of so many degrees of freedom over its mean."""
     return chi2_quantile(freedom, QUANTILE) / freedom

@@ -125,6 +125,17 @@ def _sum_blocks(
             _store(bi, begin, lanes, rays, size, blocks)
 
 
+@njit(cache=True, nogil=True)
+def merged_alone(blocks: Blocks, rays: NDArray[np.float32], size: int) -> Blocks:
+    """What `Blocks.merged` returns, for kernels and on one thread."""
+    rows, columns = (blocks.squared.shape[0] + 1) // 2, (blocks.squared.shape[1] + 1) // 2
+    shape = rows, columns
+    squared, across, down = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    result = Blocks(np.zeros((rows, columns, SIZE)), squared, across, down, np.zeros(shape))
+    _sum_blocks(0, rows, blocks.moments, rays, size, result)
+    return result
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def _store(
     bi: int,
