@@ -158,7 +158,8 @@ def group_coplanar(fits: Fits, runs: BorderRuns) -> NDArray[np.intp]:
         Label of the largest region of the group; 0 where there is no plane.
     """
     edges, place = np.unique(runs[0], return_inverse=True)
-    links = np.bincount(place, runs[1], len(edges))
+    # Of no edges at all NumPy would count in integers, and another kernel be compiled for them.
+    links = np.bincount(place, runs[1], len(edges)).astype(np.float64)
     balance = links - np.bincount(place, runs[2], len(edges))
     around = _around(fits, edges, balance, fits.sensor.agreement)
     limits = np.where(balance >= 0, _TOUCHING_LIMIT, np.where(links > 0, _LIMIT, 0.0))
