@@ -143,14 +143,15 @@ def _add_halves(
 ) -> None:
     """Sums of half cells from those of columns."""
     half = size.columns // 2
-    for c in range(sums.shape[2]):
+    for k in range(2):
+        source = total if k == 0 else number
         for side in range(2):
-            left = c * size.columns + side * half
-            value = count = np.float32(0)
-            for j in range(left, left + half):
-                value += total[j]
-                count += number[j]
-            sums[3, side, c], sums[4, side, c] = value, count
+            result = sums[3 + k, side]
+            result[:] = 0
+            for j in range(half):
+                part = source[side * half + j :: size.columns]
+                for c in range(len(result)):
+                    result[c] += part[c]
 
 
 @njit(cache=True, inline='always')
@@ -186,13 +187,16 @@ def _add_single(
     """Sums of the rays of half cells, one by one where not all or none are measured."""
     half, width = size.columns // 2, inverse.shape[1]
     whole, none = np.float32(size.rows * half), np.float32(0)
-    for k in range(3):
-        for side in range(2):
-            for c in range(sums.shape[2]):
-                sums[k, side, c] = all_rays[k, side, c] if sums[4, side, c] == whole else none
-    for c in range(sums.shape[2]):
-        for side in range(2):
-            if sums[4, side, c] == whole or sums[4, side, c] == none:
+    for side in range(2):
+        number = sums[4, side]
+        for k in range(3):
+            total, whole_total = sums[k, side], all_rays[k, side]
+            for c in range(len(total)):
+                total[c] = whole_total[c] if number[c] == whole else none
+    for side in range(2):
+        number = sums[4, side]
+        for c in range(len(number)):
+            if number[c] == whole or number[c] == none:
                 continue
             left = c * size.columns + side * half
             x = y = z = none

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
 from rangeseg_ros.core.meaning.steps import BASELINES, DIFFERENCE, GAP, Steps, is_step
+from rangeseg_ros.core.runtime.threads import run_rows
 
 # Rows of cells that an image must have for each row of a baseline: as a whole image has for the
 # longest one, to the nearest power of two. Across a small one, it would span wall and floor.
@@ -53,25 +54,48 @@ class Surfaces(NamedTuple):
 
 def surfaces_of(cells: Cells, steps: Steps) -> Surfaces:
     """Surfaces of an image."""
-    steep, broken = (np.zeros(cells.error.shape, np.bool_) for _ in range(2))
-    _mark(cells, steps, steep, broken)
+    steep, broken = np.empty((2, *cells.error.shape), np.bool_)
+    links = np.empty(cells.error.shape, np.uint8)
+    run_rows(_divide, len(steep), cells, steps, steep, broken, links)
     # Noise hides parts of a step.
     closed = cv2.morphologyEx(steep.view(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 7), np.uint8))
     steep = closed.view(np.bool_)
-    links = _links_of(cells, steps, broken)
     return Surfaces(*join_cells(links, (~steep).view(np.uint8)), steep, broken, links)
 
 
 @njit(cache=True, nogil=True)
-def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[np.bool_]) -> None:
+def _divide(
+    first: int,
+    after: int,
+    cells: Cells,
+    steps: Steps,
+    steep: NDArray[np.bool_],
+    broken: NDArray[np.bool_],
+    links: NDArray[np.uint8],
+) -> None:
+    """Rows first...after of what divides cells, and of what does not."""
+    _mark(first, after, cells, steps, steep, broken)
+    _link(first, after, cells, steps, broken, links)
+
+
+@njit(cache=True, nogil=True)
+def _mark(
+    first: int,
+    after: int,
+    cells: Cells,
+    steps: Steps,
+    steep: NDArray[np.bool_],
+    broken: NDArray[np.bool_],
+) -> None:
     """Mark steps along the columns of cells."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
     slope, factor = np.float32(steps.slope), np.float32(DIFFERENCE * steps.noise[_HALF])
-    for i in range(rows):
+    for i in range(first, after):
         for c in range(columns):
             bound = slope * cells.kink[1, i, c] + factor * error[i, c]
             steep[i, c] = cells.kink[0, i, c] > bound
+            broken[i, c] = False
     # Rows before which the cells of a column lie in a step.
     within = np.empty(columns, np.int64)
     step = np.empty(columns, np.bool_)
@@ -86,8 +110,9 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
             up = down = np.float32(np.inf)
         within[:] = 0
         last = 0
-        for i in range(rows):
-            if i < last:
+        # A step that begins in the rows before reaches into these.
+        for i in range(max(first - k, 0), after):
+            if i < last and i >= first:
                 for c in range(columns):
                     if i < within[c]:
                         steep[i, c] = broken[i, c] = True
@@ -99,11 +124,12 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
             for c in range(columns):
                 if not step[c]:
                     continue
-                broken[i, c] = True
                 # Between the two, and as far as the measurement goes where it ends there.
                 end = i + k
-                if k > 1 and (i == 0 or np.isnan(place[0, i - 1, c])):
-                    steep[i, c] = True
+                if i >= first:
+                    broken[i, c] = True
+                    if k > 1 and (i == 0 or np.isnan(place[0, i - 1, c])):
+                        steep[i, c] = True
                 if k > 1 and (end + 1 == rows or np.isnan(place[0, end + 1, c])):
                     end += 1
                 within[c] = max(within[c], end)
@@ -111,31 +137,35 @@ def _mark(cells: Cells, steps: Steps, steep: NDArray[np.bool_], broken: NDArray[
 
 
 @njit(cache=True, nogil=True)
-def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _link(
+    first: int,
+    after: int,
+    cells: Cells,
+    steps: Steps,
+    broken: NDArray[np.bool_],
+    links: NDArray[np.uint8],
+) -> None:
     """What no step is between: see `join_cells`."""
     place, error = cells.place, cells.error
     rows, columns = error.shape
     slope, up, down = np.float32(steps.slope), np.float32(steps.least), np.float32(steps.beside)
     factors = (DIFFERENCE * steps.noise).astype(np.float32)
-    links = np.zeros((rows, columns), np.uint8)
-    # Whether a step is between a cell and the one below, the next, and the next but one.
-    below, beside, across = np.zeros((3, columns), np.bool_)
-    for i in range(rows):
+    # Whether a step is between a cell and the next, and the next but one.
+    beside, across = np.zeros((2, columns), np.bool_)
+    for i in range(first, after):
         # As vector instructions.
-        if i + 1 < rows:
-            for c in range(columns):
-                below[c] = is_step(place, error, factors[0], slope, up, down, i, c, i + 1, c)
         for c in range(columns - 1):
             beside[c] = is_step(place, error, factors[_NEXT], slope, up, down, i, c, i, c + 1)
         for c in range(columns - 2):
             across[c] = is_step(place, error, factors[_SECOND], slope, up, down, i, c, i, c + 2)
         for c in range(columns):
+            links[i, c] = 0
             if np.isnan(place[0, i, c]):
                 continue
             link = np.uint8(0)
             if not broken[i, c] and i + 1 < rows:
                 if not np.isnan(place[0, i + 1, c]):
-                    link |= np.uint8(0) if below[c] else _BELOW
+                    link |= _BELOW
                 # The next measured cell below.
                 elif i + 2 < rows and not np.isnan(place[0, i + 2, c]):
                     apart = is_step(place, error, factors[0], slope, up, down, i, c, i + 2, c)
@@ -145,7 +175,6 @@ def _links_of(cells: Cells, steps: Steps, broken: NDArray[np.bool_]) -> NDArray[
                 apart = beside[c] or (c + 2 < columns and across[c]) or (c > 0 and across[c - 1])
                 link |= np.uint8(0) if apart else _RIGHT
             links[i, c] = link | _MEASURED
-    return links
 
 
 @njit(cache=True, nogil=True)

@@ -165,11 +165,16 @@ def feet_of(
     height: NDArray[np.float32],
     steep: NDArray[np.bool_],
     error: NDArray[np.float32],
+    rise: tuple[float, float],
     least: float,
     turned: bool,
 ) -> NDArray[np.bool_]:
-    """Cells of a steep surface that rises to an obstacle above them in the image."""
+    """Cells of a steep surface that rises to an obstacle above them in the image.
+
+    By more than `rise`: so many times their `error`, and metres.
+    """
     rows, columns = height.shape
+    chance, fewest = np.float32(rise[0]), np.float32(rise[1])
     foot = np.zeros((rows, columns), np.bool_)
     above = np.zeros(columns, np.bool_)
     for m in range(rows):
@@ -179,7 +184,7 @@ def feet_of(
                 continue
             if height[i, c] > least:
                 above[c] = True
-            elif above[c] and steep[i, c] and height[i, c] > error[i, c]:
+            elif above[c] and steep[i, c] and height[i, c] > max(chance * error[i, c], fewest):
                 foot[i, c] = True
             else:
                 above[c] = False

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,18 +24,16 @@ from rangeseg_ros.core.meaning.ground_field import (
     levels_of,
 )
 from rangeseg_ros.core.meaning.growth import grown, nearest_part
-from rangeseg_ros.core.meaning.pixels import Said, pixels_of
+from rangeseg_ros.core.meaning.pixels import Said, decide, pixels_of
 from rangeseg_ros.core.meaning.steps import BROAD, Steps, noise_of
 from rangeseg_ros.core.meaning.under_robot import Stand, stand
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import SAMPLES
 
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
-# Cells that the edge of a drop is blurred over: two rows on either side, as many as a Kinect's
-# noise is correlated over, and the next column of cells.
-_BLUR = (5, 3)
 # Share of the least obstacle or drop that no noise excuses.
 _EXCUSED = 0.8
 
@@ -168,6 +165,7 @@ def _terrain(
     """The same for an image whose columns are along up; `turned` where up is down in it."""
     size = CellSize.of(image.shape)
     cells = cells_of(image, size, up, sensor)
+    measured = submit(levels_of, cells, cells.inverse > 0)
     noise = noise_of(cells, sensor)
     least = min(limits.obstacle, limits.drop)
     slope = float(np.tan(limits.slope + limits.tilt))
@@ -178,17 +176,17 @@ def _terrain(
         return _without_ground(image, cells, size, steep, up, known, limits)
     flat = GroundField.of(under.theta[None, None], size, up)
     height = cell_heights(cells, flat, size)
+    # The top of a step may hang together with the ground beside it just as well as the bottom.
+    risen_too = submit(below_edges, height, cells, steps, steep, broken, turned, True)
     start = nearest_part(height, cells.place, surface, under.surface, steps.least)
     own = surface == under.surface
     fallen = below_edges(height, cells, steps, steep, broken, turned) & own
-    # The top of a step may hang together with the ground beside it just as well.
-    risen = below_edges(height, cells, steps, steep, broken, turned, rise=True) & own & ~fallen
+    risen = risen_too.result() & own & ~fallen
     own &= ~(fallen | risen)
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
-    measured = levels_of(cells, cells.inverse > 0)
     seen = levels_of(cells, ground)
-    field = GroundField.of(ground_field(seen, measured, under.theta), size, up)
+    field = GroundField.of(ground_field(seen, measured.result(), under.theta), size, up)
     height = cell_heights(cells, field, size)
     part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
     part[steep | ground] = 0
@@ -214,7 +212,7 @@ def _terrain(
     if level.any():
         ground |= level.take(surface)  # several times faster than level[surface]
         seen = levels_of(cells, ground)
-        field = GroundField.of(ground_field(seen, measured, under.theta), size, up)
+        field = GroundField.of(ground_field(seen, measured.result(), under.theta), size, up)
         height = cell_heights(cells, field, size)
     # Little pieces among the ground are its noise.
     verdict = np.where(beyond, np.int8(UNKNOWN), np.int8(GROUND))
@@ -223,25 +221,19 @@ def _terrain(
     # A surface of far cells is as sure as each of them, as their errors are alike.
     verdict[large & (np.abs(side) <= blur)] = HIDDEN
     verdict[level] = GROUND
-    said = np.where(ground, np.int8(GROUND), verdict.take(surface))
-    said[fallen & (said == UNKNOWN)] = HIDDEN
     # What rises less than is never excused is no foot, however precise the sensor.
-    rise = np.maximum(
-        np.float32(_CERTAIN * noise[0]) * cells.error, np.float32((1 - _EXCUSED) * least)
-    )
-    said[feet_of(height, steep, rise, steps.least, turned)] = OBSTACLE
-    doubt = np.minimum(unsure, np.float32(_EXCUSED * least))
-    # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
-    deep = (said == DROP) | (said == HIDDEN) & (height < 0)
-    doubt[cv2.dilate(deep.view(np.uint8), np.ones(_BLUR, np.uint8)).view(np.bool_)] = 0
+    rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
+    foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
+    kind = np.where(ground, np.int8(GROUND), verdict.take(surface))
+    doubt = decide(kind, fallen, foot, height, unsure, _EXCUSED * least)
     bounds = limits.obstacle / 2, limits.drop / 2
-    classes, heights = pixels_of(image, field, size, Said(said, doubt, unsure), bounds)
+    classes, heights = pixels_of(image, field, size, Said(kind, doubt, unsure), bounds)
     if known[0] == 0:
-        stands, falls = ends_of(said, height, steps.least, turned)
+        stands, falls = ends_of(kind, height, steps.least, turned)
         # The rule of succession: nothing but the edge of a surface tells a table from a floor.
         ends = (stands + 1) / (stands + falls + 2)
         under = under._replace(confidence=under.confidence * ends)
-    below = CellTerrain(cells.place, height, said, unsure, turned)
+    below = CellTerrain(cells.place, height, kind, unsure, turned)
     return Terrain(classes, heights, under, field, below)
 
 

@@ -214,7 +214,7 @@ def cell_heights(cells: Cells, field: GroundField, size: CellSize) -> NDArray[np
 @njit(cache=True, nogil=True, error_model='numpy')
 def _cell_heights(cells: Cells, field: GroundField, result: NDArray[np.float32]) -> None:
     planes = np.empty((4, result.shape[1]), np.float32)
-    spread = spread_planes(field, result.shape[1])
+    spread = spread_planes(field, result.shape[1], 0.0, float(len(result)))
     ray = cells.ray
     for i in range(len(result)):
         planes_of_row(spread, (i + 0.5) / field.rows - 0.5, planes)
@@ -230,8 +230,13 @@ def _cell_heights(cells: Cells, field: GroundField, result: NDArray[np.float32])
 
 
 @njit(cache=True, nogil=True)
-def spread_planes(field: GroundField, width: int) -> NDArray[np.float32]:
-    """Planes of the ground at the columns of an image, (M, 4, width): theta, and theta . up."""
+def spread_planes(
+    field: GroundField, width: int, top: float, bottom: float
+) -> NDArray[np.float32]:
+    """Planes of the ground at the columns of an image, (M, 4, width): theta, and theta . up.
+
+    Only of those that rows top...bottom of the image lie between.
+    """
     theta, up = field.theta, field.up
     last = theta.shape[1] - 1
     # Blocks beside a column, and how near it is to the right one. As they are not signed, the
@@ -244,7 +249,8 @@ def spread_planes(field: GroundField, width: int) -> NDArray[np.float32]:
         left[j], right[j], share[j] = k, min(k + 1, last), x - k
     result = np.empty((theta.shape[0], 4, width), np.float32)
     planes = np.empty((4, theta.shape[1]))
-    for i in range(theta.shape[0]):
+    first = max(int(top / field.rows - 0.5), 0)
+    for i in range(first, min(int(bottom / field.rows + 0.5) + 1, theta.shape[0])):
         for k in range(theta.shape[1]):
             x, y, z = theta[i, k]
             planes[0, k], planes[1, k], planes[2, k] = x, y, z

@@ -161,7 +161,7 @@ def _started(
     return sums, rest, distance
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _grow(
     order: NDArray[np.int64],
     height: NDArray[np.float32],
@@ -185,7 +185,7 @@ def _grow(
                 _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline='always')
 def _grow_tile(
     m: int,
     n: int,

@@ -9,11 +9,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import CellSize
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.ground_field import GroundField, planes_of_row, spread_planes
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
+
+# Rows and columns of cells on either side that the edge of a drop is blurred over: as many rows as
+# a Kinect's noise is correlated over, and the next column.
+_BLUR = (2, 1)
 
 
 class Said(NamedTuple):
@@ -33,6 +37,53 @@ class Said(NamedTuple):
     kind: NDArray[np.int8]
     doubt: NDArray[np.float32]
     unsure: NDArray[np.float32]
+
+
+@njit(cache=True, nogil=True)
+def decide(
+    kind: NDArray[np.int8],
+    fallen: NDArray[np.bool_],
+    foot: NDArray[np.bool_],
+    height: NDArray[np.float32],
+    unsure: NDArray[np.float32],
+    most: float,
+) -> NDArray[np.float32]:
+    """Complete what the surfaces of cells are said to be, and how far that may be doubted.
+
+    Parameters
+    ----------
+    kind : (rows, columns) int8
+        Changed: what is unknown beyond an edge is hidden, feet of obstacles are obstacles.
+    fallen, foot : (rows, columns) bool
+        Beyond an edge that the ground falls from, and feet.
+    height, unsure : (rows, columns) float32
+        Above the ground, and its noise, metres.
+    most : float
+        No noise excuses more, metres.
+
+    Returns
+    -------
+    (rows, columns) float32
+        `doubt` of `Said`.
+    """
+    rows, columns = kind.shape
+    doubt = np.empty(kind.shape, np.float32)
+    bound = np.float32(most)
+    for i in range(rows):
+        for c in range(columns):
+            if foot[i, c]:
+                kind[i, c] = OBSTACLE
+            elif fallen[i, c] and kind[i, c] == UNKNOWN:
+                kind[i, c] = HIDDEN
+            doubt[i, c] = min(unsure[i, c], bound)
+    # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
+    for i in range(rows):
+        for c in range(columns):
+            if kind[i, c] == DROP or (kind[i, c] == HIDDEN and height[i, c] < 0):
+                for k in range(max(i - _BLUR[0], 0), min(i + _BLUR[0] + 1, rows)):
+                    for m in range(max(c - _BLUR[1], 0), min(c + _BLUR[1] + 1, columns)):
+                        doubt[k, m] = 0
+    return doubt
 
 
 def pixels_of(
@@ -89,7 +140,7 @@ def _classify(
     same for every pixel, so that the compiler makes them vector instructions.
     """
     width = inverse.shape[1]
-    spread = spread_planes(field, width)
+    spread = spread_planes(field, width, first * size.rows, after * size.rows)
     # Heights between which a pixel is ground, and beyond which it is a drop or an obstacle.
     limits = np.empty((4, width), np.float32)
     planes = np.empty((4, width), np.float32)

@@ -91,8 +91,8 @@ def stand(
     """
     height, doubt = known
     sizes, reach, steepest = _reaches(cells, surface, count + 1)
-    order = np.argsort(-sizes, kind='stable')[:_MAX_SURFACES]
-    order = order[sizes[order] >= SAMPLES]
+    order = np.flatnonzero(sizes >= SAMPLES)
+    order = order[np.argsort(-sizes[order], kind='stable')[:_MAX_SURFACES]]
     if not len(order):
         return Stand(0, np.zeros(3), 0.0)
     rank = np.full(len(sizes), -1)
