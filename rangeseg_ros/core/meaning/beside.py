@@ -23,15 +23,23 @@ def sides_of(
     surface: NDArray[np.int32],
     near: NDArray[np.uint8],
     count: int,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Sizes of surfaces, how far they lie above the ground, and the noise of that, metres.
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Sizes of surfaces, and how far they lie above the ground.
 
-    Medians of the cells beside the ground, or of all; NaN for surfaces that are too small.
+    Returns
+    -------
+    sizes : (count + 1,) int64
+    side, noise : (count + 1,) float64
+        Medians of the height of the cells beside the ground, or of all, and of what a pixel of
+        them may err by, metres; NaN for surfaces that are too small.
+    width : (count + 1,) int64
+        Columns that these cells are in.
     """
+    rows, columns = surface.shape
     sizes = np.zeros(count + 1, np.int64)
     beside = np.zeros(count + 1, np.int64)
-    for i in range(surface.shape[0]):
-        for c in range(surface.shape[1]):
+    for i in range(rows):
+        for c in range(columns):
             sizes[surface[i, c]] += 1
             beside[surface[i, c]] += near[i, c]
     sizes[0] = 0
@@ -42,17 +50,21 @@ def sides_of(
     heights = np.empty(start[-1], np.float32)
     noises = np.empty(start[-1], np.float32)
     filled = np.zeros(count + 1, np.int64)
-    for i in range(surface.shape[0]):
-        for c in range(surface.shape[1]):
+    width = np.zeros(count + 1, np.int64)
+    last = np.full(count + 1, -1)
+    for c in range(columns):
+        for i in range(rows):
             k = surface[i, c]
             if sizes[k] >= SAMPLES and (near[i, c] or beside[k] < SAMPLES):
                 heights[start[k] + filled[k]] = height[i, c]
                 noises[start[k] + filled[k]] = unsure[i, c]
                 filled[k] += 1
+                width[k] += last[k] != c
+                last[k] = c
     side = np.full(count + 1, np.nan)
     noise = np.full(count + 1, np.nan)
     for k in range(count + 1):
         if filled[k]:
             side[k] = np.median(heights[start[k] : start[k] + filled[k]])
             noise[k] = np.median(noises[start[k] : start[k] + filled[k]])
-    return sizes, side, noise
+    return sizes, side, noise, width

@@ -6,8 +6,10 @@ grown from there, the ground continued everywhere, and every pixel's height abov
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,7 @@ from rangeseg_ros.core.meaning.ground_field import (
     levels_of,
 )
 from rangeseg_ros.core.meaning.growth import grown, nearest_part
-from rangeseg_ros.core.meaning.pixels import Said, decide, pixels_of
+from rangeseg_ros.core.meaning.pixels import BLUR, Said, decide, pixels_of
 from rangeseg_ros.core.meaning.steps import BROAD, Steps, noise_of
 from rangeseg_ros.core.meaning.under_robot import Stand, stand
 from rangeseg_ros.core.runtime.threads import submit
@@ -197,7 +199,7 @@ def _terrain(
         surface, count = join_cells(links, part)
         beyond = np.zeros(count + 1, np.bool_)
         beyond[surface[fallen]] = True
-        sizes, side, blur = sides_of(height, unsure, surface, near, count)
+        sizes, side, blur, width = sides_of(height, unsure, surface, near, count)
         large = sizes >= SAMPLES
         # Beyond an edge, where the noise would hide a drop, it is not known what is level.
         hidden = beyond & (blur > limits.drop - steps.least)
@@ -218,9 +220,19 @@ def _terrain(
     verdict = np.where(beyond, np.int8(UNKNOWN), np.int8(GROUND))
     verdict[0] = UNKNOWN
     verdict[large] = np.where(side[large] > 0, OBSTACLE, DROP)
-    # A surface of far cells is as sure as each of them, as their errors are alike.
+    # A surface of far cells is as sure as each of them, as their errors are alike; beyond an edge
+    # as all patches of the distortion along it together, as the ground before it errs likewise.
+    patch = max(math.sqrt(4 * math.pi) * sensor.distortion_length / size.columns, 1.0)
+    blur[beyond] /= np.sqrt(np.maximum(width[beyond] / patch, 1.0))
     verdict[large & (np.abs(side) <= blur)] = HIDDEN
     verdict[level] = GROUND
+    # Little pieces beside a drop may be its own.
+    low = (verdict == DROP).take(surface).view(np.uint8)
+    if low.any():
+        near = cv2.dilate(low, np.ones(BLUR, np.uint8))
+        beside = np.zeros(count + 1, np.bool_)
+        beside[surface[near.view(np.bool_)]] = True
+        verdict[beside & ~large & (verdict == GROUND)] = HIDDEN
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
     foot = feet_of(height, steep, cells.error, rise, steps.least, turned)

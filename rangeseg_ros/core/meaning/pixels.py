@@ -15,9 +15,9 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 
-# Rows and columns of cells on either side that the edge of a drop is blurred over: as many rows as
-# a Kinect's noise is correlated over, and the next column.
-_BLUR = (2, 1)
+BLUR = (5, 3)
+"""Cells that the edge of a drop is blurred over: two rows on either side, as many as a Kinect's
+noise is correlated over, and the next column."""
 
 
 class Said(NamedTuple):
@@ -69,6 +69,7 @@ def decide(
     rows, columns = kind.shape
     doubt = np.empty(kind.shape, np.float32)
     bound = np.float32(most)
+    high, wide = BLUR[0] // 2, BLUR[1] // 2
     for i in range(rows):
         for c in range(columns):
             if foot[i, c]:
@@ -80,8 +81,8 @@ def decide(
     for i in range(rows):
         for c in range(columns):
             if kind[i, c] == DROP or (kind[i, c] == HIDDEN and height[i, c] < 0):
-                for k in range(max(i - _BLUR[0], 0), min(i + _BLUR[0] + 1, rows)):
-                    for m in range(max(c - _BLUR[1], 0), min(c + _BLUR[1] + 1, columns)):
+                for k in range(max(i - high, 0), min(i + high + 1, rows)):
+                    for m in range(max(c - wide, 0), min(c + wide + 1, columns)):
                         doubt[k, m] = 0
     return doubt
 

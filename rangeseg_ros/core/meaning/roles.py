@@ -31,7 +31,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
       `role_height`; without a height, the one that reaches nearest to below the sensor; and all
       that face up and continue it within `role_height`
     - ramp: planes that rise or fall from the floor, by no more than `ground_slope` against it
-    - step: other planes facing up that lie no more than a step, 0.25 m, above the floor
+    - step: other planes facing up that lie no more than a step, 0.24 m, above the floor
     - table: planes facing up that lie higher
     - lower: planes facing up that lie below the floor
     - ceiling: of the large surfaces facing down the one farthest above the sensor, and all that
