@@ -8,11 +8,14 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.meaning.ramps import ramps_of
 from rangeseg_ros.core.meaning.roles import ROLES, RolesError, roles
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sequence import with_roles
+from rangeseg_ros.messages.markers import of_ramps
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -92,6 +95,26 @@ def test_a_ramp_rises_from_the_floor():
         ramp, distance = (slice(65, 96), slice(0, 160)), -np.dot(normal, (0, 1.2, 5))
         found = planes(((slice(97, 120), slice(0, 160)), UP, 1.2), (ramp, normal, distance))
         assert roles(found, LEVEL) == ['floor', role]
+
+
+def test_a_ramp_says_how_steep_it_is_and_where_it_climbs():
+    """Up ahead, and down ahead, where it climbs towards the robot."""
+    for degrees in (8, -8):
+        angle = np.radians(degrees)
+        normal = np.array((0, -np.cos(angle), -np.sin(angle)))
+        ground = (slice(97, 120), slice(0, 160)), UP, 1.2
+        ramp = (slice(85, 90), slice(0, 160)), normal, -normal @ (0, 1.2, 6)
+        found = with_roles(planes(ground, ramp), LEVEL)
+        assert found[1].role == 'ramp'
+        (told,) = ramps_of(found, np.array((0, -1.0, 0)))
+        assert told.plane == found[1].id and str(told) == 'ramp 8 degrees'
+        assert told.slope == pytest.approx(8, abs=0.01)
+        ahead = np.sign(degrees)
+        climb = 0, -np.sin(abs(angle)), ahead * np.cos(angle)
+        np.testing.assert_allclose(told.climb, climb, atol=1e-4)
+        arrow, text = of_ramps([told])
+        np.testing.assert_allclose(arrow.points[1] - arrow.points[0], 0.4 * told.climb)
+        assert (arrow.namespace, text.namespace, text.text) == ('climbs', 'ramps', str(told))
 
 
 def test_small_planes_are_no_floor_wall_or_ceiling():

@@ -208,3 +208,18 @@ def test_little_is_called_ground_that_the_noise_nearly_hides(kind, seed, class_)
     there = (frame.terrain == class_) & (frame.crossing < 2.5)
     inside = cv2.erode(there.view(np.uint8), np.ones((7, 7), np.uint8)) > 0
     assert inside.sum() > 2000 and (terrain[inside] == GROUND).mean() < 0.008
+
+
+@pytest.mark.parametrize(('seed', 'most'), [(1710099, 0.014), (1710061, 0.0)])
+def test_a_level_beyond_an_edge_is_told_as_a_whole(seed, most):
+    """5 cm down at more than 2 m: no pixel of a stereo camera tells, all of them together do."""
+    scene, sensor = terrain_scene('drop', seed), SENSORS['realsense'](seed)
+    frame = simulate_terrain(scene, sensor, seed=seed)
+    up, height = stated(scene, seed)
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=height)
+    terrain = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera)).terrain
+    inner = cv2.erode((frame.terrain == DROP).view(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    drop = terrain[inner & (frame.crossing <= 2.5)]
+    assert np.mean(drop == DROP) >= 0.95
+    # Nor are little pieces beside the edge noise of the ground.
+    assert np.mean(drop == GROUND) <= most

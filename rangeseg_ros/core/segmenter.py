@@ -17,6 +17,7 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.meaning.ramps import Ramp, ramps_of
 from rangeseg_ros.core.meaning.stairs import Stairs, stairs_of
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
@@ -141,6 +142,14 @@ class Segmentation:
         if not isinstance(self.survey, Survey) or self.ground is None:
             return []
         return stairs_of(self.ground)
+
+    @property
+    def ramps(self) -> list[Ramp]:
+        """Ramps among planes that have roles."""
+        if self.survey is None:
+            return []
+        known = self.survey.up if isinstance(self.survey, Survey) else self.survey.field.up
+        return ramps_of(self.planes, known)
 
     @property
     def terrain(self) -> NDArray[np.uint8]:

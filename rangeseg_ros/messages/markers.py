@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.ramps import Ramp
 from rangeseg_ros.core.meaning.stairs import Stairs
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.make import Make
@@ -100,6 +101,19 @@ def of_stairs(staircases: Sequence[Stairs]) -> list[Marker]:
         markers += [
             Marker('edges', number, LINE_STRIP, size, orange, stairs.edge),
             _text('stairs', number, str(stairs), stairs.edge.mean(axis=0)),
+        ]
+    return markers
+
+
+def of_ramps(ramps: Sequence[Ramp]) -> list[Marker]:
+    """Where ramps climb and how steeply: namespaces `climbs`, of type ARROW, and `ramps`."""
+    markers = []
+    thin, orange = (0.03, 0.06, 0.1), (1.0, 0.6, 0.0, 1.0)
+    for ramp in ramps:
+        arrow = np.array((ramp.centre, ramp.centre + 2 * ARROW_LENGTH * ramp.climb))
+        markers += [
+            Marker('climbs', ramp.plane, ARROW, thin, orange, arrow),
+            _text('ramps', ramp.plane, str(ramp), ramp.centre),
         ]
     return markers
 

@@ -27,6 +27,7 @@ from rangeseg_ros.messages.markers import (
     markers_message,
     of_outline,
     of_planes,
+    of_ramps,
     of_stairs,
 )
 from rangeseg_ros.messages.status import status_message
@@ -125,6 +126,10 @@ def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
     return of_outline([] if result.ground is None else outlines(image, result.ground))
 
 
+def _stairs(image: RangeImage, result: Segmentation) -> list[Marker]:
+    return [*of_stairs(result.stairs), *of_ramps(result.ramps)]
+
+
 def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
     return status_message(make, header, result)
 
@@ -142,7 +147,7 @@ OUTPUTS = {
     'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
     'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': _of_markers(_outline),
-    'stairs': _of_markers(lambda image, result: of_stairs(result.stairs)),
+    'stairs': _of_markers(_stairs),
     'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
 }
 
