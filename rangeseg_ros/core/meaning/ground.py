@@ -229,9 +229,9 @@ def _terrain(
     # Little pieces beside a drop may be its own.
     low = (verdict == DROP).take(surface).view(np.uint8)
     if low.any():
-        near = cv2.dilate(low, np.ones(BLUR, np.uint8))
+        by_it = cv2.dilate(low, np.ones(BLUR, np.uint8)) > 0
         beside = np.zeros(count + 1, np.bool_)
-        beside[surface[near.view(np.bool_)]] = True
+        beside[surface[by_it]] = True
         verdict[beside & ~large & (verdict == GROUND)] = HIDDEN
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
