@@ -24,6 +24,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
 from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import message_class
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
@@ -33,6 +34,7 @@ from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.gravity import IMU_TOPIC
 from rangeseg_ros.ros.parameters import bind
 from rangeseg_ros.ros.pipeline import Pipeline
+from rangeseg_ros.ros.seldom import SeldomCallbackGroup
 from rangeseg_ros.ros.settings import Settings
 
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
@@ -40,6 +42,8 @@ _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
 # Parameters that decide what the node subscribes to.
 _SUBSCRIBED_FOR = ('input', 'raw', 'use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
+# Seconds until a listener is noticed while frames come: none that a person would.
+_EVENT_INTERVAL = 0.1
 
 
 class SegmentPlanes(Node):
@@ -56,6 +60,7 @@ class SegmentPlanes(Node):
         self._config = config
         self._input: DepthInput | None = None
         self._statistics = FrameStatistics()
+        self._seldom = SeldomCallbackGroup(_EVENT_INTERVAL)
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
         overriding = QoSOverridingOptions.with_default_policies()
         self._outputs = {
@@ -64,6 +69,7 @@ class SegmentPlanes(Node):
                 f'~/{name}',
                 QoSProfile(depth=5),
                 event_callbacks=events,
+                callback_group=self._seldom,
                 qos_overriding_options=overriding,
             )
             for name, output in OUTPUTS.items()
@@ -76,6 +82,7 @@ class SegmentPlanes(Node):
                 f'~/{name}',
                 latched,
                 event_callbacks=events,
+                callback_group=self._seldom,
                 qos_overriding_options=overriding,
             )
             for name, (kind, _) in MAP_OUTPUTS.items()
@@ -85,9 +92,12 @@ class SegmentPlanes(Node):
             '~/odometry',
             QoSProfile(depth=5),
             event_callbacks=events,
+            callback_group=self._seldom,
             qos_overriding_options=overriding,
         )
-        self._diagnostics = self.create_publisher(DiagnosticArray, '/diagnostics', 10)
+        self._diagnostics = self.create_publisher(
+            DiagnosticArray, '/diagnostics', 10, callback_group=self._seldom
+        )
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = self.create_timer(1.0, self._look_around, clock=steady)
@@ -135,11 +145,15 @@ class SegmentPlanes(Node):
         listeners = sum(publisher.get_subscription_count() for publisher in publishers)
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses
-            self._input = DepthInput(self, config.input, config.raw, self._pipeline.put, losses)
+            self._input = DepthInput(self, config.input, config.raw, self._accept, losses)
             self._pipeline.locator.subscribe(config)
             self._statistics.problem = ''
         elif not listeners and self._input:
             self._unsubscribe()
+
+    def _accept(self, frame: DepthFrame) -> None:
+        self._seldom.message_came()
+        self._pipeline.put(frame)
 
     def _unsubscribe(self) -> None:
         if self._input:
@@ -149,6 +163,7 @@ class SegmentPlanes(Node):
 
     def _look_around(self) -> None:
         """Once a second: follow the publishers, report."""
+        self._seldom.look()
         if self._input:
             self._input.follow_publishers()
             if lost := self._statistics.lost(self._input):
