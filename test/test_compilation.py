@@ -15,9 +15,10 @@ from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.discovery import Kernel
 from rangeseg_ros.compilation.preparation import needs, prepare
-from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
+from rangeseg_ros.compilation.rehearsal import FIRST, KINDS, rehearse
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 
@@ -72,7 +73,7 @@ def test_less_of_the_work_needs_nothing_more(budget):
 
 
 def test_what_is_found_is_what_a_run_compiles(worker):
-    found = ask(worker, ('discover', Config(), KINDS))
+    found = ask(worker, ('discover', (Config(), KINDS)))
     assert len(found) > 20
     # None twice only because an array may be written to here and not there.
     kinds = [(k.name, str(pickle.loads(k.signature)).replace('True', 'False')) for k in found]
@@ -81,6 +82,19 @@ def test_what_is_found_is_what_a_run_compiles(worker):
     for kernel in found:
         dispatcher = getattr(import_module(kernel.module), kernel.name)
         assert pickle.loads(kernel.signature) in dispatcher.overloads, kernel.name
+
+
+def test_labels_and_planes_need_less():
+    """They come first: without the terrain, and all that they need."""
+    found = []
+    for outputs in (FIRST, tuple(OUTPUTS)):
+        with subprocess.Popen(WORKER, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+            kernels = ask(process, ('discover', (Config(), ('image',), outputs)))
+            found.append({(k.module, k.name, k.signature) for k in kernels})
+            process.kill()
+    first, every = found
+    assert first < every
+    assert not any('.meaning.' in module for module, *_ in first)
 
 
 def test_two_processes_compile_a_kernel_once(tmp_path):
@@ -118,7 +132,7 @@ def test_without_processes_it_is_compiled_all_the_same(monkeypatch):
 def test_what_cannot_be_kept_is_compiled_here_and_told(monkeypatch):
     kernels = [njit(lambda x, k=k: x + k) for k in range(2)]
     monkeypatch.setattr(
-        preparation, 'rehearse', lambda config, kinds: [kernel(1.0) for kernel in kernels]
+        preparation, 'rehearse', lambda *rehearsed: [kernel(1.0) for kernel in kernels]
     )
     monkeypatch.setattr(preparation, '_nothing_compiled', refused)
     monkeypatch.setattr(preparation, 'keeps_compiled', lambda: False)

@@ -13,6 +13,7 @@ import yaml
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros import Camera
+from rangeseg_ros.cli import segment
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
@@ -48,6 +49,19 @@ def test_segment_writes_labels_overlay_and_planes(folder, run):
     assert {int(row['label']) for row in rows} == set(np.unique(labels)) - {0}
     assert 'depth/10.png: no plane: no valid depth' in output
     assert cv2.imread('out/here/2_overlay.png').shape == (48, 64, 3)
+
+
+def test_segment_compiles_before_the_first_image_and_for_its_parameters(folder, run, monkeypatch):
+    def prepare(config, kinds, report, outputs):
+        prepared.append((config.method, kinds, files(folder)))
+
+    prepared = []
+    monkeypatch.setattr(segment, 'prepare', prepare)
+    (folder / 'params.yaml').write_text('method: normals')
+    before = files(folder)
+    options = ('--camera', 'camera.yaml', '--output', 'out', '--params', 'params.yaml')
+    assert run('segment', 'depth/2.png', *options)[0] == 0
+    assert prepared == [('normals', ('image',), before)]
 
 
 @pytest.mark.parametrize('method', ['planes', 'normals'])

@@ -10,6 +10,7 @@ import click
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
+from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
@@ -17,6 +18,9 @@ from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth
+
+# Outputs of the node that show what the files hold, so that they need the same kernels.
+_SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 
 
 @click.command()
@@ -72,6 +76,7 @@ def command(
     outputs = [frame_path(output, path.stem, kind) for path in depth for kind in files]
     inputs = [*depth, camera_file, *filter(None, [params_file])]
     options.check_new(outputs, inputs, overwrite)
+    prepare(segmenter.config, ('image',), options.show_compilation, _SHOWN)
     for path in options.progress(depth, len(depth), 'image'):
         try:
             image = RangeImage.from_depth(read_depth(path, camera.shape), camera, depth_scale)

@@ -6,7 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import astuple, replace
 from threading import Condition, Thread
@@ -18,6 +18,7 @@ from rangeseg_ros.compilation.discovery import PACKAGE, Kernel
 from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.runtime.cache import keeps_compiled
+from rangeseg_ros.messages.outputs import OUTPUTS
 
 MOST_WORKERS = 4
 """Processes that compile, at most: each takes 250 MB, and the largest kernel an eighth of all."""
@@ -35,7 +36,12 @@ def needs(config: Config) -> tuple[Any, ...]:
     return tuple(v if isinstance(v, (str, bool)) else v == 0 for v in values)
 
 
-def prepare(config: Config, kinds: tuple[str, ...] = KINDS, report: Report = print) -> None:
+def prepare(
+    config: Config,
+    kinds: tuple[str, ...] = KINDS,
+    report: Report = print,
+    outputs: Collection[str] = tuple(OUTPUTS),
+) -> None:
     """Compile all kernels that `config` needs for frames of `kinds`, and load them.
 
     Where they are compiled already, this takes as long as to load them.
@@ -48,18 +54,20 @@ def prepare(config: Config, kinds: tuple[str, ...] = KINDS, report: Report = pri
     report : callable
         Gets the progress, 'compiling kernels, 12 of 35', or where none can be kept for other
         processes 'compiling kernels, 12 so far'; nothing when nothing is compiled.
+    outputs : collection of str
+        Of `OUTPUTS`: what is made of the frames.
     """
     try:
         with _nothing_compiled():
-            rehearse(config, kinds)
+            rehearse(config, kinds, outputs)
         return
     except _NotCompiledError:
         pass
     report('compiling kernels')
     if keeps_compiled():
-        Pool(report).compile(config, kinds)
+        Pool(report).compile(config, kinds, outputs)
     with event.install_listener('numba:compile', _Told(report)):
-        rehearse(config, kinds)
+        rehearse(config, kinds, outputs)
 
 
 class _NotCompiledError(Exception):
@@ -115,11 +123,14 @@ class Pool:
         self._found = self._done = 0
         self._finding = True
 
-    def compile(self, config: Config, kinds: tuple[str, ...]) -> None:
-        """Fill the cache; what a process that breaks off leaves is compiled by its user."""
+    def compile(self, *rehearsed: Any) -> None:
+        """Fill the cache with what `rehearse(*rehearsed)` needs.
+
+        What a process that breaks off leaves is compiled by its user.
+        """
         count = max(1, min(MOST_WORKERS, _processors()))
         threads = [
-            Thread(target=self._attend, args=(('discover', config, kinds) if k == 0 else None,))
+            Thread(target=self._attend, args=(('discover', rehearsed) if k == 0 else None,))
             for k in range(count)
         ]
         for thread in threads:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -19,11 +19,18 @@ from rangeseg_ros.messages.outputs import OUTPUTS
 KINDS = ('image', 'points')
 """Kinds of input whose kernels differ: depth images, and clouds."""
 
+FIRST = ('labels', 'planes')
+"""Outputs that need the fewest kernels: most listeners have no other."""
+
 CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
 
 
-def rehearse(config: Config, kinds: tuple[str, ...] = KINDS) -> None:
-    """Segment small frames of each of `kinds` as `config` says, and make every output of them."""
+def rehearse(
+    config: Config,
+    kinds: tuple[str, ...] = KINDS,
+    outputs: Collection[str] = tuple(OUTPUTS),
+) -> None:
+    """Segment small frames of each of `kinds` as `config` says, and make `outputs` of them."""
     # The room has a few hundred pixels per plane. Few directions, once round: exact solutions with
     # all of them take minutes, and run the same kernels.
     few = 25 if config.directions == 'regular' else 17
@@ -35,8 +42,8 @@ def rehearse(config: Config, kinds: tuple[str, ...] = KINDS) -> None:
         sequence = SequenceSegmenter(config)
         for number, image in enumerate(_frames(kind)):
             result = sequence.segment(image, number)
-            for output in OUTPUTS.values():
-                output.message(_make, None, image, result)
+            for name in outputs:
+                OUTPUTS[name].message(_make, None, image, result)
 
 
 def _frames(kind: str) -> Iterator[RangeImage]:

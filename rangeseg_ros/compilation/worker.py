@@ -1,7 +1,7 @@
 """A process that finds or compiles kernels: pickled requests in, pickled answers out.
 
-Its requests are ('discover', config, kinds), answered by Kernels, and Kernels. Each is answered
-by None when it is done. It ends with its input, so with its parent.
+Its requests are ('discover', arguments of `rehearse`), answered by Kernels, and Kernels. Each is
+answered by None when it is done. It ends with its input, so with its parent.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def main() -> None:
         if isinstance(request, Kernel):
             _compile(request)
         else:
-            _, config, kinds = request
-            discover(partial(rehearse, config, kinds), answer)
+            _, arguments = request
+            discover(partial(rehearse, *arguments), answer)
         answer(None)
 
 

@@ -212,6 +212,8 @@ class Pipeline:
             publisher = self._publishers[name]
             if publisher.get_subscription_count():
                 doing(f'publishing {name}')
+                if not self._settings.ready_for(name):
+                    return
                 header, shown = there if name in IN_TARGET else here
                 if output.serialised:
                     publisher.publish(output.serialised(header, image, shown))

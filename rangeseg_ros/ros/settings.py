@@ -7,7 +7,9 @@ from dataclasses import fields
 from threading import Condition, Thread
 
 from rangeseg_ros.compilation.preparation import needs, prepare
+from rangeseg_ros.compilation.rehearsal import FIRST
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.latest import Latest
 from rangeseg_ros.ros.parameters import NodeConfig
 
@@ -16,6 +18,7 @@ class Settings:
     """The configuration in use: the newest one whose kernels are there.
 
     Those that need no other kernels count at once. While others compile, the one before serves.
+    The first serves for the outputs `FIRST` before the kernels of the others are there.
 
     Parameters
     ----------
@@ -42,6 +45,7 @@ class Settings:
         self._prepared: set[tuple[object, ...]] = set()
         self._jobs: Latest[NodeConfig] = Latest()
         self._closed = self.busy = False
+        self._ready: frozenset[str] = frozenset()
         self._came = Condition()
         self._thread = Thread(target=self._work, name='compilation', daemon=True)
         self._thread.start()
@@ -71,6 +75,12 @@ class Settings:
             self._came.wait_for(lambda: self._closed or self._in_use is not None)
             return None if self._closed else self._in_use
 
+    def ready_for(self, output: str) -> bool:
+        """Wait until the kernels of an output are there. False once closed."""
+        with self._came:
+            self._came.wait_for(lambda: self._closed or output in self._ready)
+            return not self._closed
+
     def close(self) -> None:
         """Let those who wait go."""
         with self._came:
@@ -87,16 +97,25 @@ class Settings:
     def _work(self) -> None:
         while config := self._jobs.take():
             self.busy = True
-            # What cannot be compiled will be reported by the frame that needs it.
-            try:
-                prepare(_of_core(config), (_kind(config),), self._report)
-            except Exception as error:
-                self._report(f'not compiled ahead: {error}')
+            if self._in_use is None:
+                self._prepare(config, FIRST)
+                self._use(config)
+            self._prepare(config, tuple(OUTPUTS))
             self._prepared.add(_needs(config))
             self._report('')
             self.busy = False
             if config is self._wanted:
                 self._use(config)
+
+    def _prepare(self, config: NodeConfig, outputs: tuple[str, ...]) -> None:
+        # What cannot be compiled will be reported by the frame that needs it.
+        try:
+            prepare(_of_core(config), (_kind(config),), self._report, outputs)
+        except Exception as error:
+            self._report(f'not compiled ahead: {error}')
+        with self._came:
+            self._ready |= frozenset(outputs)
+            self._came.notify_all()
 
 
 def _needs(config: NodeConfig) -> tuple[object, ...]:

@@ -1,0 +1,48 @@
+"""The configuration in use while kernels are compiled."""
+
+from threading import Event, Thread
+
+import pytest
+
+pytest.importorskip('rclpy')
+
+from rangeseg_ros.compilation.rehearsal import FIRST
+from rangeseg_ros.ros import settings
+from rangeseg_ros.ros.parameters import NodeConfig
+from rangeseg_ros.ros.settings import Settings
+
+
+def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
+    came, release = [], Event()
+
+    def prepare(config, kinds, report, outputs):
+        if outputs != FIRST:
+            release.wait()
+        came.append(outputs)
+
+    def publish():
+        came.append(used.ready_for('labels'))
+        came.append(used.ready_for('terrain'))
+
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    config = NodeConfig()
+    used = Settings(config, lambda progress: None, lambda: None)
+    assert used.in_use() is config
+    publication = Thread(target=publish)
+    publication.start()
+    publication.join(0.2)  # it must not end by itself
+    release.set()
+    publication.join()
+    used.close()
+    assert came[0] == FIRST and came[1] is True
+    assert set(came[2]) > set(FIRST) and came[3] is True
+
+
+def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
+    release = Event()
+    monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    used.close()
+    assert used.in_use() is None
+    assert not used.ready_for('labels')
+    release.set()
