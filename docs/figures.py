@@ -22,9 +22,8 @@ from matplotlib.figure import Figure
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.by_planes import method
-from rangeseg_ros.core.by_planes.blocks import block_links, block_size, weigh_blocks, whole_blocks
-from rangeseg_ros.core.by_planes.patches import grow_patches
-from rangeseg_ros.core.by_planes.surfaces import join_surfaces
+from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
+from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.calibration.calibrate import calibrate
 from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
 from rangeseg_ros.core.calibration.validation import without_plane
@@ -181,21 +180,16 @@ def stages(image, config):
 
     size, least = block_size(image.shape), least_pixels(config.min_pixels, image.shape)
     blocks = fine if size == 4 else fine.merged(image.rays, size)
-    whole = whole_blocks(bridges.inverse, grid, size)
+    nodes = Nodes.of(bridges.inverse, grid, blocks, sensor, size)
+    whole = nodes.moments[..., COUNT] > 0
     count = np.maximum(blocks.moments[..., COUNT] - 3, 1)[whole]
     shown = np.sqrt(blocks.squared[whole]), blocks.residual[whole] / count
     pictures['noise'] = noise_chart(*shown, stated, sensor)
     pictures['blocks'] = over(image, whole.astype(np.intp), size)
 
-    moments = weigh_blocks(blocks, whole, sensor)
-    links = block_links(grid, size)
-    roots = grow_patches(
-        0, len(moments), moments, *links, sensor.distortion_pixels, sensor.agreement
-    )
-    patch = np.unique(roots, return_inverse=True)[1].reshape(whole.shape) + 1
-    alone = np.bincount(patch.ravel())[patch] == 1
-    pictures['patches'] = over(image, np.where(alone, 0, patch), size)
-    surface, _ = join_surfaces(moments, links, size, sensor, config.plane_smoothness, least)
+    patches = Patches.of(nodes, size, sensor)
+    pictures['patches'] = over(image, patches.labels, size)
+    surface, _ = join_surfaces(patches, nodes, size, sensor, config.plane_smoothness, least)
     pictures['surfaces'] = over(image, surface, size)
 
     labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid
@@ -25,6 +25,14 @@ def grid(height, width, seed=0):
     return inverse.astype(np.float32), rays, edges
 
 
+def whole(inverse, edges):
+    """Blocks of 4 pixels that surfaces are grown from."""
+    rays = grid(*inverse.shape)[1]
+    blocks = Blocks.of(RangeImage(rays, inverse))
+    nodes = Nodes.of(inverse, edges, blocks, SensorModel.from_config(Config()), 4)
+    return nodes.moments[..., COUNT] > 0
+
+
 def test_blocks_are_sums_over_their_pixels():
     inverse, rays, edges = grid(12, 14)
     blocks = Blocks.of(RangeImage(rays, inverse)).moments
@@ -35,7 +43,7 @@ def test_blocks_are_sums_over_their_pixels():
     np.testing.assert_allclose(blocks[1, 2], expected, rtol=1e-12)
     assert (blocks[:, :3, COUNT] == 16).all()
     assert (blocks[:, 3, COUNT] == 8).all(), 'half a block at the border'
-    assert not whole_blocks(inverse, edges, 4)[:, 3].any()
+    assert not whole(inverse, edges)[:, 3].any()
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
@@ -71,7 +79,7 @@ def test_blocks_that_jumps_cross_are_left_out():
     vertical[0:2, 17] = 0
     expected = np.ones((3, 5), bool)
     expected[0, 0] = expected[1, 2] = False
-    np.testing.assert_array_equal(whole_blocks(inverse, edges, 4), expected)
+    np.testing.assert_array_equal(whole(inverse, Grid(horizontal, vertical)), expected)
 
 
 @pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
@@ -79,7 +87,7 @@ def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
     """30 % of 16 pixels are 4.8."""
     inverse, _, edges = grid(4, 4)
     inverse.ravel()[:missing] = 0
-    assert whole_blocks(inverse, edges, 4)[0, 0] == kept
+    assert whole(inverse, edges)[0, 0] == kept
 
 
 @pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
@@ -88,7 +96,10 @@ def test_blocks_touch_along_half_of_their_border(shape):
     random = np.random.default_rng(sum(shape))
     horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
     vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
-    right, below = block_links(Grid(horizontal, vertical), 4)
+    inverse, rays, _ = grid(height, width)
+    blocks, sensor = Blocks.of(RangeImage(rays, inverse)), SensorModel.from_config(Config())
+    nodes = Nodes.of(inverse, Grid(horizontal, vertical), blocks, sensor, 4)
+    right, below = nodes.right, nodes.below
     rows, columns = -(-height // 4), -(-width // 4)
     assert right.shape == (rows, columns - 1) and below.shape == (rows - 1, columns)
     for i, j in np.ndindex(right.shape):
@@ -113,15 +124,16 @@ def test_slopes_and_residuals_are_those_of_the_planes():
 
 
 def test_weights_count_in_variances_of_the_sensor():
-    inverse, rays, _ = grid(80, 80, seed=4)
+    inverse, rays, edges = grid(80, 80, seed=4)
     sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
     plain = Blocks.of(RangeImage(rays, inverse))
     flat = np.zeros(plain.squared.shape)
     facing = plain._replace(across=flat, down=flat)
-    blocks = weigh_blocks(facing, np.ones(flat.shape, bool), sensor)
-    theta, residual = fit_all(blocks.reshape(-1, SIZE))
+    nodes = Nodes.of(inverse, edges, facing, sensor, 4)
+    theta, residual = fit_all(nodes.moments.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.moments.reshape(-1, SIZE))
     np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)
     # Chi-squared of 16 - 3 degrees of freedom each; 400 blocks: 2 % of standard error.
     assert residual.mean() == pytest.approx(13, rel=0.08)
-    np.testing.assert_allclose(blocks[..., RATIO], 16 * 4.0, rtol=1e-5)
+    np.testing.assert_allclose(nodes.residual.ravel(), residual, rtol=1e-3)
+    np.testing.assert_allclose(nodes.moments[..., RATIO], 16 * 4.0, rtol=1e-5)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
-from rangeseg_ros.core.by_planes.surfaces import join_surfaces
+from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -35,8 +35,8 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     model = SensorModel.from_config(Config(**sensor))
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
-    blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, 4), model)
-    return join_surfaces(blocks, block_links(edges, 4), 4, model, SMOOTHNESS, least)
+    nodes = Nodes.of(image.inverse, edges, blocks, model, 4)
+    return join_surfaces(Patches.of(nodes, 4, model), nodes, 4, model, SMOOTHNESS, least)
 
 
 def covered(labels, label):
@@ -138,12 +138,10 @@ def test_clutter_is_no_surface():
 
 
 def test_nothing_to_grow_from():
-    labels, moments = join_surfaces(
-        np.zeros((5, 7, 13)),
-        (np.ones((5, 6), bool), np.ones((4, 7), bool)),
-        4,
-        SensorModel.from_config(Config()),
-        SMOOTHNESS,
-    )
+    links = np.ones((5, 6), bool), np.ones((4, 7), bool)
+    nodes = Nodes(np.zeros((5, 7, 13)), np.zeros((5, 7)), *links)
+    sensor = SensorModel.from_config(Config())
+    patches = Patches.of(nodes, 4, sensor)
+    labels, moments = join_surfaces(patches, nodes, 4, sensor, SMOOTHNESS)
     assert not labels.any() and labels.shape == (5, 7)
     assert moments.shape == (1, 13) and not moments.any()

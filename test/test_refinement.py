@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
-from rangeseg_ros.core.by_planes.blocks import block_links, weigh_blocks, whole_blocks
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.descent import descended
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
-from rangeseg_ros.core.by_planes.surfaces import join_surfaces
+from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
@@ -243,9 +243,10 @@ def small_room(seed=900):
     edges = weights(image)
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
-    blocks = weigh_blocks(blocks, whole_blocks(image.inverse, edges, BLOCK), sensor)
-    found = join_surfaces(blocks, block_links(edges, BLOCK), BLOCK, sensor, LAMBDA)
-    return Problem.of(image, sensor, edges, BLOCK, LAMBDA), (found[0], blocks, found[1]), sensor
+    nodes = Nodes.of(image.inverse, edges, blocks, sensor, BLOCK)
+    found = join_surfaces(Patches.of(nodes, BLOCK, sensor), nodes, BLOCK, sensor, LAMBDA)
+    problem = Problem.of(image, sensor, edges, BLOCK, LAMBDA)
+    return problem, (found[0], nodes.moments, found[1]), sensor
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):

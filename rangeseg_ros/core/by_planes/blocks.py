@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -21,8 +23,58 @@ from rangeseg_ros.core.sensing.sensor import (
 # Share of a block that must have been measured.
 _MEASURED = 0.7
 
-# (rows, columns-1) and (rows-1, columns): whether a block touches its right, its lower neighbour.
-Links = tuple[NDArray[np.bool_], NDArray[np.bool_]]
+
+class Nodes(NamedTuple):
+    """The blocks that surfaces are grown from.
+
+    Attributes
+    ----------
+    moments : (rows, columns, 13) float64
+        With weights according to the sensor, and the ratios of its variances. Zeros for blocks to
+        leave out: that a jump crosses or that lack measurements in over 30 %, bridged holes being
+        measured, or in over 75 % without these.
+    residual : (rows, columns) float64
+        What the plane through each leaves, with these weights.
+    right, below : (rows, columns-1), (rows-1, columns) bool
+        Whether a block touches its right, its lower neighbour: along half of their border at
+        least.
+    """
+
+    moments: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    right: NDArray[np.bool_]
+    below: NDArray[np.bool_]
+
+    @classmethod
+    def of(
+        cls,
+        inverse: NDArray[np.float32],
+        grid: Grid,
+        blocks: Blocks,
+        sensor: SensorModel,
+        size: int,
+    ) -> Nodes:
+        """Those of an image.
+
+        Parameters
+        ----------
+        inverse : (H, W) float32
+            Holes bridged; 0 where nothing was measured.
+        grid : Grid
+            0 across jumps.
+        blocks : Blocks
+            Of the image.
+        sensor : SensorModel
+        size : int
+            Rows and columns of a block.
+        """
+        rows, columns = blocks.squared.shape
+        right = np.zeros((rows, columns - 1), np.bool_)
+        below = np.zeros((rows - 1, columns), np.bool_)
+        moments = np.zeros_like(blocks.moments)
+        nodes = cls(moments, np.zeros((rows, columns)), right, below)
+        run_rows(_fill_in, rows, inverse, grid, blocks, sensor, size, nodes)
+        return nodes
 
 
 def block_size(shape: tuple[int, int]) -> int:
@@ -36,27 +88,22 @@ def block_size(shape: tuple[int, int]) -> int:
     return 4 if shape[0] * shape[1] <= 2 * VGA else 8
 
 
-def whole_blocks(inverse: NDArray[np.float32], grid: Grid, size: int) -> NDArray[np.bool_]:
-    """Blocks that no jump crosses and that were measured.
-
-    Parameters
-    ----------
-    inverse : (H, W) float32
-        0 where nothing was measured.
-    grid : Grid
-        0 across jumps.
-    size : int
-        Rows and columns of a block.
-
-    Returns
-    -------
-    (ceil(H / size), ceil(W / size)) bool
-        False for blocks that a jump edge crosses or that lack measurements in over 30 %.
-    """
-    height, width = inverse.shape
-    result = np.zeros((-(-height // size), -(-width // size)), np.bool_)
-    run_rows(_find_whole, len(result), inverse, grid, size, result)
-    return result
+@njit(cache=True, nogil=True)
+def _fill_in(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    grid: Grid,
+    blocks: Blocks,
+    sensor: SensorModel,
+    size: int,
+    nodes: Nodes,
+) -> None:
+    """Fill in some rows of nodes."""
+    whole = np.zeros(blocks.squared.shape, np.bool_)
+    _find_whole(first, after, inverse, grid, size, whole)
+    _weigh(first, after, blocks, whole, sensor, max(size * size // 4, 3), nodes)
+    _link(first, after, grid, size, nodes)
 
 
 @njit(cache=True, nogil=True)
@@ -68,7 +115,7 @@ def _find_whole(
     size: int,
     result: NDArray[np.bool_],
 ) -> None:
-    """The same of some rows of blocks, from what the columns of a row of blocks hold."""
+    """Which of some rows of blocks no jump crosses and were measured, bridged holes included."""
     height, width = inverse.shape
     measured, across = np.empty(width, np.uint8), np.empty(width, np.bool_)
     down = np.empty(width, np.bool_)
@@ -94,36 +141,16 @@ def _find_whole(
             result[bi, bj] = not crossed and count >= _MEASURED * size * size
 
 
-def block_links(grid: Grid, size: int) -> Links:
-    """Whether a block touches its right, its lower neighbour: along half of their border at least.
-
-    Parameters
-    ----------
-    grid : Grid
-    size : int
-        Rows and columns of a block.
-
-    Returns
-    -------
-    right, below : (rows, columns-1), (rows-1, columns) bool
-    """
-    height, width = len(grid.right), grid.below.shape[1]
-    rows, columns = -(-height // size), -(-width // size)
-    right, below = np.zeros((rows, columns - 1), np.bool_), np.zeros((rows - 1, columns), np.bool_)
-    run_rows(_link, rows, grid, size, right, below)
-    return right, below
-
-
 @njit(cache=True, nogil=True)
 def _link(
     first: int,
     after: int,
     grid: Grid,
     size: int,
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
+    nodes: Nodes,
 ) -> None:
-    """The same of some rows of blocks."""
+    """Link some rows of blocks to their neighbours."""
+    right, below = nodes.right, nodes.below
     height, width = len(grid.right), grid.below.shape[1]
     for bi in range(first, after):
         for bj in range(right.shape[1]):
@@ -139,24 +166,6 @@ def _link(
             below[bi, bj] = 2 * touching >= size
 
 
-def weigh_blocks(
-    blocks: Blocks, whole: NDArray[np.bool_], sensor: SensorModel
-) -> NDArray[np.float64]:
-    """Moments with weights according to the sensor, and the ratios of its variances.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        (rows, columns).
-    whole : (rows, columns) bool
-        Blocks to weigh; the others become zeros.
-    sensor : SensorModel
-    """
-    result = np.zeros_like(blocks.moments)
-    run_rows(_weigh, len(result), blocks, whole, sensor, result)
-    return result
-
-
 @njit(cache=True, nogil=True)
 def _weigh(
     first: int,
@@ -164,20 +173,22 @@ def _weigh(
     blocks: Blocks,
     whole: NDArray[np.bool_],
     sensor: SensorModel,
-    result: NDArray[np.float64],
+    least: int,
+    nodes: Nodes,
 ) -> None:
-    """The same of some rows of blocks."""
+    """Weigh the whole ones of some rows of blocks, of at least so many measurements."""
     for i in range(first, after):
-        for j in range(result.shape[1]):
-            if not whole[i, j]:
-                continue
+        for j in range(whole.shape[1]):
             count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
+            if not whole[i, j] or count < least:
+                continue
             level = random_variance(sensor, squared)
             tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
             weight = 1 / (level * (1 + tilt))
             for entry in range(COUNT):
-                result[i, j, entry] = weight * blocks.moments[i, j, entry]
-            result[i, j, COUNT] = count
+                nodes.moments[i, j, entry] = weight * blocks.moments[i, j, entry]
+            nodes.residual[i, j] = weight * blocks.residual[i, j]
+            nodes.moments[i, j, COUNT] = count
             systematic = systematic_variance(sensor, squared)
-            result[i, j, RATIO] = count * weight * systematic
-            result[i, j, SLOPE] = count * tilt
+            nodes.moments[i, j, RATIO] = count * weight * systematic
+            nodes.moments[i, j, SLOPE] = count * tilt

@@ -7,16 +7,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import (
-    block_links,
-    block_size,
-    weigh_blocks,
-    whole_blocks,
-)
+from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
 from rangeseg_ros.core.by_planes.curvature import find_curved
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
-from rangeseg_ros.core.by_planes.surfaces import join_surfaces
+from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
@@ -26,7 +21,6 @@ from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -93,21 +87,19 @@ def segment(
     elif size != BLOCK:
         # With what was bridged: a row of three pixels alone determines no plane.
         blocks = Blocks.of(image, size)
-    # Of a block of holes, a quarter measured will do.
-    whole = whole_blocks(image.inverse, grid, size)
-    whole &= blocks.moments[..., COUNT] >= max(size * size // 4, 3)
+    nodes = Nodes.of(image.inverse, grid, blocks, sensor, size)
     lap('blocks')
-    pending = submit(Problem.of, image, sensor, grid, size, config.plane_smoothness)
+    patches = Patches.of(nodes, size, sensor)
+    smoothness = config.plane_smoothness
+    pending = submit(Problem.of, image, sensor, grid, size, smoothness)
     # Surfaces as large as regions: smaller ones are clutter.
     least = least_pixels(config.min_pixels, image.shape)
-    weights = weigh_blocks(blocks, whole, sensor)
-    links = block_links(grid, size)
-    surface, moments = join_surfaces(weights, links, size, sensor, config.plane_smoothness, least)
+    surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, least)
     problem = pending.result()
     lap('surfaces')
     cuts = Work.within(config.work_budget).cuts
     labels, models = refine(
-        problem, surface, weights, moments, sensor, config.exact, config.refits, cuts
+        problem, surface, nodes.moments, moments, sensor, config.exact, config.refits, cuts
     )
     lap('labels')
     return Labelling(labels.reshape(image.shape), sensor, problem, models)

@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
@@ -29,9 +30,7 @@ _LEVELS = 16 * _PER_VARIANCE
 def grow_patches(
     first: int,
     after: int,
-    moments: NDArray[np.float64],
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
+    nodes: Nodes,
     largest: float,
     agreement: float,
 ) -> NDArray[np.intp]:
@@ -41,10 +40,8 @@ def grow_patches(
     ----------
     first, after : int
         The rows.
-    moments : (rows, columns, 13) float64
-        Of blocks, weighted; zeros for blocks to leave out.
-    right, below : (rows, columns-1), (rows-1, columns) bool
-        Whether a block is connected to its right, its lower neighbour.
+    nodes : Nodes
+        The blocks.
     largest : float
         Pixels of the largest patch.
     agreement : float
@@ -55,14 +52,12 @@ def grow_patches(
     ((after - first) * columns,) int
         Number of the block that stands for each block's patch, its own for a block in none.
     """
-    shape = after - first, moments.shape[1]
-    blocks = moments[first:after].copy().reshape(-1, SIZE)
-    right, below = right[first:after], below[first : max(after - 1, first)]
-    theta = np.zeros(3)
-    residual = np.zeros(len(blocks))
+    shape = after - first, nodes.residual.shape[1]
+    blocks = nodes.moments[first:after].copy().reshape(-1, SIZE)
+    residual = nodes.residual[first:after].copy().reshape(-1)
+    right, below = nodes.right[first:after], nodes.below[first : max(after - 1, first)]
     smooth = np.zeros(len(blocks), np.bool_)
     for a in range(len(blocks)):
-        residual[a] = fit(blocks[a], theta)
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     pairs = _pairs(smooth.reshape(shape), right, below)
     parent = _quads(blocks, residual, smooth.reshape(shape), right, below, largest)

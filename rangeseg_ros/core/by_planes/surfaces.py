@@ -15,11 +15,13 @@ one plane costs their pixels less than their common border does.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import Links
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
@@ -35,9 +37,48 @@ _BETWEEN_PATCHES, _WITHIN_SURFACE = chi2_quantile(1), 2 * OUTLIER**2
 _BLOCKS_OF_PATCH = 4
 
 
+class Patches(NamedTuple):
+    """Connected blocks on one plane, over which the distortion is nearly constant.
+
+    Attributes
+    ----------
+    labels : (rows, columns) int
+        Patch of each block: 0 for none, otherwise 1...P.
+    moments : (P + 1, 13) float64
+        Of the patches; zeros for 0.
+    """
+
+    labels: NDArray[np.intp]
+    moments: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, nodes: Nodes, block: int, sensor: SensorModel) -> Patches:
+        """Patches of blocks.
+
+        Parameters
+        ----------
+        nodes : Nodes
+            (rows, columns).
+        block : int
+            Rows and columns of a block.
+        sensor : SensorModel
+            Its `agreement` and `distortion_pixels` are read.
+        """
+        shape = nodes.residual.shape
+        # No patch reaches over the middle, but neither does any reach across a large surface.
+        # Not even in a small image is one smaller than four blocks.
+        largest = max(sensor.distortion_pixels, 4.0 * block**2)
+        smallest = float(_BLOCKS_OF_PATCH * block**2)
+        halves = map_halves(_patches, shape[0], nodes, largest, smallest, sensor.agreement)
+        (upper, moments), (lower, beneath) = halves
+        lower = np.where(lower > 0, lower + len(moments) - 1, 0)
+        labels = np.concatenate([upper, lower]).reshape(shape)
+        return cls(labels, np.concatenate([moments, beneath[1:]]))
+
+
 def join_surfaces(
-    moments: NDArray[np.float64],
-    links: Links,
+    patches: Patches,
+    nodes: Nodes,
     block: int,
     sensor: SensorModel,
     smoothness: float,
@@ -47,10 +88,10 @@ def join_surfaces(
 
     Parameters
     ----------
-    moments : (rows, columns, 13) float64
-        Of blocks, weighted; zeros for blocks to leave out.
-    links : Links
-        Which neighbouring blocks are connected.
+    patches : Patches
+        Of the blocks.
+    nodes : Nodes
+        (rows, columns).
     block : int
         Rows and columns of a block.
     sensor : SensorModel
@@ -67,20 +108,11 @@ def join_surfaces(
     moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
-    shape = moments.shape[:2]
-    # No patch reaches over the middle, but neither does any reach across a large surface.
-    # Not even in a small image is one smaller than four blocks.
-    largest = max(sensor.distortion_pixels, 4.0 * block**2)
-    smallest = float(_BLOCKS_OF_PATCH * block**2)
-    halves = map_halves(_patches, shape[0], moments, *links, largest, smallest, sensor.agreement)
-    (patch, moments), (lower, beneath) = halves
-    patch = np.concatenate([patch, np.where(lower > 0, lower + len(moments) - 1, 0)])
-    moments = np.concatenate([moments, beneath[1:]])
-    patch, smooth = patch.reshape(shape), sensor.distortion_pixels
-    border = _borders(patch, *links, len(moments))
+    moments, smooth = patches.moments, sensor.distortion_pixels
+    border = _borders(patches.labels, nodes.right, nodes.below, len(moments))
     part, moments = _renumber(_join(moments, border, smooth, sensor.agreement), moments, 1.0)
-    parts = part[patch]
-    border = _borders(parts, *links, len(moments))
+    parts = part[patches.labels]
+    border = _borders(parts, nodes.right, nodes.below, len(moments))
     # What a block's side of border costs.
     side = smoothness * sensor.patch * block
     surface, moments = _renumber(_unite(moments, side * border, smooth), moments, float(least))
@@ -89,19 +121,12 @@ def join_surfaces(
 
 @njit(cache=True, nogil=True)
 def _patches(
-    first: int,
-    after: int,
-    moments: NDArray[np.float64],
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
-    largest: float,
-    least: float,
-    agreement: float,
+    first: int, after: int, nodes: Nodes, largest: float, least: float, agreement: float
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Patches of at least so many pixels in some rows of blocks, 1...P, and their moments."""
-    begin, end = first * moments.shape[1], after * moments.shape[1]
-    roots = grow_patches(first, after, moments, right, below, largest, agreement) - begin
-    return _renumber(roots, moments.reshape(-1, SIZE)[begin:end], least)
+    begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
+    roots = grow_patches(first, after, nodes, largest, agreement) - begin
+    return _renumber(roots, nodes.moments.reshape(-1, SIZE)[begin:end], least)
 
 
 @njit(cache=True, nogil=True)

@@ -58,10 +58,10 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     prior : SensorModel
         Taken as far as the image says too little.
     """
-    quanta = submit(quantisation, image.inverse)
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
     coarse = blocks.merged(image.rays, 2 * BLOCK)
+    quanta = submit(quantisation, image.inverse)
     used, scale, across, down, ratio = _telling(coarse)
     if used < SAMPLES:
         return prior
