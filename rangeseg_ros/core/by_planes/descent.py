@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -23,6 +22,8 @@ from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 
 REACH = 2
 """Blocks from a surface in which its label may win pixels."""
+# Above all labels.
+_NONE = np.int32(np.iinfo(np.int32).max)
 
 
 def descended(
@@ -31,14 +32,7 @@ def descended(
     """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
     labels = np.empty(len(problem.inverse), np.int32)
     cost = np.empty(len(labels), np.float32)
-    window = np.ones((2 * REACH + 1, 2 * REACH + 1), np.uint8)
-    exact = surfaces.astype(np.float32)
-    # The lowest and the highest label around each block, and whether there is none but them.
-    highest = cv2.dilate(exact, window)
-    lowest = cv2.erode(np.where(exact > 0, exact, np.float32(np.inf)), window)
-    settled = (cv2.erode(exact, window) == highest) & (highest > 0)
-    around = lowest, highest, settled
-    run_rows(_take_nearest, len(surfaces), surfaces, *around, problem, models, labels, cost)
+    run_rows(_take_nearest, len(surfaces), surfaces, problem, models, labels, cost)
     run_halves(_descend, len(labels) // problem.width, labels, cost, problem, models)
     return labels, cost
 
@@ -48,9 +42,6 @@ def _take_nearest(
     first: int,
     after: int,
     surfaces: NDArray[np.int32],
-    lowest: NDArray[np.float32],
-    highest: NDArray[np.float32],
-    settled: NDArray[np.bool_],
     problem: Problem,
     models: Models,
     labels: NDArray[np.int32],
@@ -58,7 +49,7 @@ def _take_nearest(
 ) -> None:
     """Give each pixel of rows of blocks the cheapest label among those of the blocks around it.
 
-    Costs in `settled` blocks, where no label competes, stay 0.
+    Costs in blocks with one label around them, for which none competes, stay 0.
     """
     columns, most = surfaces.shape[1], (2 * REACH + 1) ** 2
     width, block = problem.width, problem.block
@@ -68,17 +59,20 @@ def _take_nearest(
     count = np.empty(columns, np.intp)
     # The first of them, for each column of pixels.
     label, planes = np.empty(width, np.int32), np.empty((5, width))
+    above, around = np.empty((3, columns + 2 * REACH), np.int32), np.empty((3, columns), np.int32)
     for bi in range(first, after):
         top, bottom = bi * block, min((bi + 1) * block, height)
+        _find_ranges(bi, surfaces, above, around)
         for bj in range(columns):
+            lowest, least, highest = around[0, bj], around[1, bj], around[2, bj]
             # A plane at infinity explains nothing; one of precision 0 explains all.
             plane = 0.0, 0.0, 0.0, 0.0, np.inf
-            candidates[bj, 0] = np.int32(highest[bi, bj])
-            count[bj] = candidates[bj, 0] > 0
-            if settled[bi, bj]:
+            candidates[bj, 0] = highest
+            count[bj] = highest > 0
+            if 0 < lowest == highest:
                 plane = 0.0, 0.0, 0.0, 0.0, 0.0
             elif count[bj] > 0:
-                if lowest[bi, bj] < highest[bi, bj]:
+                if least < highest:
                     own = candidates[bj], shifts[bj]
                     count[bj] = _find_candidates(bi, bj, surfaces, models, *own)
                 else:
@@ -101,6 +95,39 @@ def _take_nearest(
                         value = np.float32(plane_cost(plane, p, problem))
                         if value < cost[p]:
                             labels[p], cost[p] = candidates[bj, k], value
+
+
+@njit(cache=True, nogil=True)
+def _find_ranges(
+    row: int,
+    surfaces: NDArray[np.int32],
+    above: NDArray[np.int32],
+    around: NDArray[np.int32],
+) -> None:
+    """Labels of the blocks around each one of a row: the lowest, the lowest but 0, the highest.
+
+    To `around` (3, columns); the second is `_NONE` where there is no label but 0. Scratch are
+    those `above` and below, (3, columns + 2 REACH).
+    """
+    rows, columns = surfaces.shape
+    above[:2], above[2] = _NONE, 0
+    around[:2], around[2] = _NONE, 0
+    # Down the columns, then along the row: views, of which the compiler takes many at a time.
+    lowest, least, highest = above[0, REACH:-REACH], above[1, REACH:-REACH], above[2, REACH:-REACH]
+    for i in range(max(row - REACH, 0), min(row + REACH + 1, rows)):
+        own = surfaces[i]
+        for j in range(columns):
+            label = own[j]
+            lowest[j] = min(lowest[j], label)
+            least[j] = min(least[j], label if label > 0 else _NONE)
+            highest[j] = max(highest[j], label)
+    for step in range(2 * REACH + 1):
+        lowest, least = above[0, step : step + columns], above[1, step : step + columns]
+        highest = above[2, step : step + columns]
+        for j in range(columns):
+            around[0, j] = min(around[0, j], lowest[j])
+            around[1, j] = min(around[1, j], least[j])
+            around[2, j] = max(around[2, j], highest[j])
 
 
 @njit(cache=True, nogil=True)
