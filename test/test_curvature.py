@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes.curvature import find_curved
+from rangeseg_ros.core.by_planes.quadratics import add_terms, explained
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -144,3 +145,18 @@ def test_pixels_left_out_do_not_bend_the_rest():
     regions = np.zeros(CAMERA.shape, int)
     regions[90:150, 130:190] = 1
     assert verdict(inverse, regions).tolist() == [False, False]
+
+
+def test_what_a_quadratic_explains_is_what_least_squares_explain():
+    random = np.random.default_rng(5)
+    x, y, residual = random.uniform(-1, 1, (3, 200))
+    normal, right = np.zeros(15), np.zeros(6)
+    for a, b, c in zip(x, y, residual, strict=True):
+        add_terms(normal, right, b, (1.0, a, a * a, a**3, a**4), (c, c * a, c * a * a))
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+    fitted = [
+        terms[:, :count] @ np.linalg.lstsq(terms[:, :count], residual, rcond=None)[0]
+        for count in (3, 6)
+    ]
+    flat, whole = ((values**2).sum() for values in fitted)
+    np.testing.assert_allclose(explained(normal, right), (flat, whole - flat), rtol=1e-6)

@@ -5,7 +5,11 @@ import pytest
 from planes_of_labels import fit_planes
 
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, theta_covariances
+from rangeseg_ros.core.fitting.uncertainty import (
+    plane_jacobians,
+    sandwiches,
+    theta_covariances,
+)
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -203,3 +207,18 @@ def test_cells_whose_weight_is_lost_by_rounding_count_for_nothing():
         cells = fits.cells._replace(sums=sums)
         covariances.append(theta_covariances(cells, fits.theta, fits.inverse, sensor)[0])
     np.testing.assert_array_equal(*covariances)
+
+
+@pytest.mark.parametrize('rank', [0, 1, 2, 3])
+def test_no_variance_becomes_negative_where_a_covariance_is_magnified(rank):
+    random = np.random.default_rng(rank)
+    root = random.normal(size=(50, 3, rank)) * 10.0 ** random.uniform(-6, 6, (50, 1, rank))
+    middle = root @ root.transpose(0, 2, 1)
+    outer = random.normal(size=(50, 4, 3)) * 10.0 ** random.uniform(-3, 3, (50, 4, 1))
+    found = sandwiches(outer, middle)
+    along = outer @ root
+    scale = np.linalg.norm(outer, axis=2) * np.linalg.norm(root, axis=(1, 2))[:, None]
+    error = np.abs(found - along @ along.transpose(0, 2, 1))
+    assert (error <= 1e-12 * scale[:, :, None] * scale[:, None, :]).all()
+    assert (np.diagonal(found, axis1=1, axis2=2) >= 0).all()
+    np.testing.assert_array_equal(found, found.transpose(0, 2, 1))

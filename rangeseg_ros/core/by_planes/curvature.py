@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.by_planes.quadratics import add_terms, explained
 from rangeseg_ros.core.fitting.interior import fill
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
@@ -31,11 +32,6 @@ _SHARE, _EXPONENT = 0.75**2, 0.78
 _CHI2_LIMIT = chi2_quantile(3, 0.99)
 # Rows and columns from one pixel that is looked at to the next.
 _STRIDE = 2
-# Exponents of x and y in the terms of a quadratic, in the powers of x and y up to the fourth, and
-# which of these are the products of two terms.
-_TERMS = [(n - b, b) for n in range(3) for b in range(n + 1)]
-_POWERS = [(a, b) for b in range(5) for a in range(5 - b)]
-_PRODUCTS = np.array([[_POWERS.index((a + c, b + d)) for c, d in _TERMS] for a, b in _TERMS])
 
 
 def find_curved(
@@ -78,27 +74,41 @@ def find_curved(
     limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
     parts = map_halves(_normal_equations, len(filled), *arrays, theta, slope, limit)
-    powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
-    normal = powers[:, _PRODUCTS]
-    size = np.maximum(normal[:, 0, 0], 1)
-    # What the quadratic explains more than its constant and linear terms do.
-    whole, flat = _explained(normal, right), _explained(normal[:, :3, :3], right[:, :3])
-    bending = (whole - flat) / size
-    distortion = _SHARE * ratio * (covered / max(sensor.distortion_pixels, 1.0)) ** _EXPONENT
-    # Noise as the region itself shows it: at a grazing angle it is more than that of the sensor.
-    noise = np.maximum((square - whole) / size, 1)
-    visible = bending > distortion + sensor.correlated * _CHI2_LIMIT * noise / size
-    result = visible & (bending * (scale / size) ** 2 > flatness**2 * area * covered / size)
-    result[0] = False
+    powers, right, sizes = (a + b for a, b in zip(*parts, strict=True))
+    around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
+    return _bent(covered, ratio, powers, right, sizes, around, alike, float(flatness))
+
+
+@njit(cache=True, nogil=True)
+def _bent(
+    covered: NDArray[np.float64],
+    ratio: NDArray[np.float64],
+    powers: NDArray[np.float64],
+    right: NDArray[np.float64],
+    sizes: NDArray[np.float64],
+    around: float,
+    alike: float,
+    flatness: float,
+) -> NDArray[np.bool_]:
+    """Which regions bend by more than distortion and noise do, and than `flatness`.
+
+    More than seven parameters: what is known of the regions, their pixels, the ratio of the
+    distortion to their noise and the three sums of `_normal_equations`; the pixels that the
+    distortion is alike `around`, and those whose noise is `alike`.
+    """
+    result = np.zeros(len(covered), np.bool_)
+    for k in range(1, len(result)):
+        size, (square, area, scale) = max(powers[k, 0], 1.0), sizes[:, k]
+        flat, more = explained(powers[k], right[k])
+        # What the quadratic explains more than its constant and linear terms do.
+        bending = more / size
+        distortion = _SHARE * ratio[k] * (covered[k] / around) ** _EXPONENT
+        # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
+        noise = max((square - flat - more) / size, 1.0)
+        visible = bending > distortion + alike * _CHI2_LIMIT * noise / size
+        wide = flatness**2 * area * covered[k] / size
+        result[k] = visible and bending * (scale / size) ** 2 > wide
     return result
-
-
-def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum of squares (N,) that least-squares fits explain, of their normal equations."""
-    terms = normal.shape[1]
-    ridge = 1e-9 * np.maximum(normal[:, 0, 0], 1)[:, None, None] * np.eye(terms)
-    solution = np.linalg.solve(normal + ridge, right[..., None])[..., 0]
-    return (solution * right).sum(axis=1)
 
 
 @njit(cache=True, nogil=True)
@@ -177,7 +187,7 @@ def _normal_equations(
             label = int(filled[bi, bj]) if bj < filled.shape[1] else 0
             if label != run:
                 y, powers = (2 * middle - 1 - height) / width, (s0, s1, s2, s3, s4)
-                _add_terms(normal[run], right[run], y, powers, (t0, t1, t2))
+                add_terms(normal[run], right[run], y, powers, (t0, t1, t2))
                 _add_size(total, run, squares, areas, deviations)
                 s0 = s1 = s2 = s3 = s4 = t0 = t1 = t2 = squares = areas = deviations = 0.0
                 run = label
@@ -226,34 +236,11 @@ def _normal_equations(
                         x, y = (2 * j - width) / width, (2 * i - height) / width
                         a, b = pixels * x * x, pixels * residual
                         powers = pixels, pixels * x, a, a * x, a * x * x
-                        _add_terms(normal[label], right[label], y, powers, (b, b * x, b * x * x))
+                        add_terms(normal[label], right[label], y, powers, (b, b * x, b * x * x))
                         area, deviation = _size(i, j, squared, variance, rays)
                         area, deviation = area * slope[label], deviation / slope[label]
                         _add_size(total, label, pixels * square, pixels * area, pixels * deviation)
     return normal, right, total
-
-
-@njit(cache=True, inline='always')
-def _add_terms(
-    normal: NDArray[np.float64],
-    right: NDArray[np.float64],
-    y: float,
-    powers: tuple[float, float, float, float, float],
-    residuals: tuple[float, float, float],
-) -> None:
-    """Add pixels at one y to the normal equations of a quadratic.
-
-    Given are the sums of x^0 ... x^4 over them, and of their residuals times x^0 ... x^2.
-    """
-    entry, of_y = 0, 1.0
-    for b in range(5):
-        for a in range(5 - b):
-            normal[entry] += powers[a] * of_y
-            entry += 1
-        of_y *= y
-    t0, t1, t2 = residuals
-    for entry, value in enumerate((t0, t1, t0 * y, t2, t1 * y, t0 * y * y)):
-        right[entry] += value
 
 
 @njit(cache=True, inline='always')

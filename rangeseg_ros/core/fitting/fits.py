@@ -10,11 +10,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
-from rangeseg_ros.core.fitting.doubtful import (
-    first_sums,
-    sums_of_blocks,
-    sums_without_doubtful,
-)
+from rangeseg_ros.core.fitting.doubtful import sums_without_doubtful
+from rangeseg_ros.core.fitting.first_sums import first_sums, sums_of_blocks
 from rangeseg_ros.core.fitting.interior import Inside
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
