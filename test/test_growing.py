@@ -145,3 +145,12 @@ def test_nothing_to_grow_from():
     labels, moments = join_surfaces(patches, nodes, 4, sensor, SMOOTHNESS)
     assert not labels.any() and labels.shape == (5, 7)
     assert moments.shape == (1, 13) and not moments.any()
+
+
+@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize(('fold', 'faces'), [(0, 1), (2 * NOISE, 4)])
+def test_strong_noise_leaves_no_face_in_parts(fold, faces, seed):
+    """Nor does it hide the folds of a wall, every 40 pixels, as high as two deviations."""
+    inverse = plane(WALL) + fold * np.abs(COLUMNS % 80 - 40) / 40
+    labels, _ = grown(inverse, NOISE, seed, 300, distortion=0.0, noise_correlation=0.0)
+    assert labels.max() == faces
