@@ -45,7 +45,7 @@ def bridge_holes(
     """
     if image.valid.all():
         return image
-    inverse = image.inverse.copy()
+    inverse = np.empty(image.shape, np.float32)
     # A camera has rays everywhere; those of a cloud lie between its points.
     known = image.rays if image.camera is None else image.rays[:0]
     rays = known.copy()
@@ -66,8 +66,9 @@ def _bridge(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
 ) -> None:
-    """Bridge the holes of some rows."""
+    """Copy some rows and bridge their holes."""
     height, width = measured.shape
+    inverse[first:after] = measured[first:after]
     # Whether pixels were measured, of the rows around one and with a margin; and which of the
     # row's were not but lie between two that were: most holes are far from all that was. Bytes,
     # of which the compiler takes more at a time than of truth values.

@@ -47,8 +47,8 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     # Steps between two pixels that need no look at their surroundings: steeper than all but planes
     # seen edge-on from centimetres away.
     clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
-    horizontal = np.zeros((height, width - 1), np.bool_)
-    vertical = np.zeros((height - 1, width), np.bool_)
+    horizontal = np.empty((height, width - 1), np.bool_)
+    vertical = np.empty((height - 1, width), np.bool_)
     run_rows(_find_jumps, height, image.inverse, limits, clear, horizontal, vertical)
     return horizontal, vertical
 
