@@ -59,7 +59,8 @@ setup(
     name=package_name,
     version=version,
     description='Planar segmentation of range images by multi-label graph cuts, for ROS 2',
-    long_description=Path('README.md').read_text(encoding='utf-8'),
+    # Beside the sources: for symlinks colcon runs one to this file, in a folder without it.
+    long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     author='rangeseg_ros maintainers',
     author_email='rangeseg-ros@example.org',

@@ -148,6 +148,15 @@ def build_as_colcon_does(folder, *options, **environment):
     return done.stderr
 
 
+def test_setup_runs_where_colcon_makes_links(tmp_path):
+    """For --symlink-install: to the package and what is installed, not to the README."""
+    for name in ('setup.py', 'setup.cfg', 'rangeseg_ros'):
+        (tmp_path / name).symlink_to(ROOT / name)
+    command = [sys.executable, 'setup.py', '--version']
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == __version__
+
+
 def test_colcon_builds_without_numba_and_says_that_nothing_is_compiled(tmp_path):
     errors = build_as_colcon_does(tmp_path)
     (line,) = (line for line in errors.splitlines() if 'kernels' in line)
