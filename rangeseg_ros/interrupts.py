@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
+import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
+from typing import NoReturn
 
 _received = 0
 
@@ -31,6 +35,19 @@ def silence_losses() -> None:
 def exit_code() -> int:
     """Of the signal that there was; 0 when there was none."""
     return 128 + _received if _received else 0
+
+
+def end() -> NoReturn:
+    """End the process for the signal that there was, once all that was begun is put away.
+
+    Python itself would wait for all threads, and for ever for one that waits for a lock: what a
+    signal raises in `Condition.__enter__` leaves its lock taken, those of thread pools too.
+    """
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # nobody reads it, or it is closed
+            stream.flush()
+    os._exit(exit_code())
 
 
 def check() -> None:

@@ -7,7 +7,7 @@ from textwrap import dedent
 import pytest
 
 PRELUDE = """
-    import ctypes, os, signal
+    import ctypes, os, signal, threading
     import click
     from rangeseg_ros.cli import main, options
     def loop():
@@ -38,6 +38,13 @@ def run(body):
 @pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143), ('SIGHUP', 129)])
 def test_a_signal_ends_the_command(body, name, code):
     done = run(body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException'))
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
+
+
+@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143)])
+def test_a_thread_that_waits_for_ever_keeps_no_command(name, code):
+    waits = 'threading.Thread(target=threading.Event().wait).start()'
+    done = run(f'{waits}; os.kill(os.getpid(), signal.{name})')
     assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
 
 

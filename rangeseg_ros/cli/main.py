@@ -73,7 +73,13 @@ def main() -> None:
     except (ValueError, OSError, MemoryError, RecursionError) as error:
         print(f'rangeseg: {in_words(error)}', file=sys.stderr)
         sys.exit(2)
+    except SystemExit as end:
+        if end.code and end.code == interrupts.exit_code():
+            interrupts.end()
+        raise
     except (KeyboardInterrupt, SystemError, click.Abort) as error:
-        if isinstance(error, SystemError) and not interrupts.exit_code():
+        if interrupts.exit_code():
+            interrupts.end()
+        if isinstance(error, SystemError):
             raise
-        sys.exit(interrupts.exit_code() or 130)
+        sys.exit(130)
