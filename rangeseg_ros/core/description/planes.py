@@ -157,31 +157,27 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
         found = np.setdiff1d(found, doubtful[~kept])
     surface = surfaces.result()
-    # Numbers of Python, all at once: one by one, taking them out of the arrays takes longer.
-    numbers = zip(
-        surface[found].tolist(),
-        distance[found].tolist(),
-        fits.pixels[found].tolist(),
-        rms[found].tolist(),
-        confidence[found].tolist(),
-        strict=True,
-    )
+    columns = surface, distance, fits.pixels, rms, confidence
+    # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
+    numbers = zip(*(column[found].tolist() for column in columns), strict=True)
     return [
         Plane(
             label=k,
             id=k,
-            surface=of_surface,
+            surface=group,
             normal=normal[k],
-            distance=away,
+            distance=offset,
             covariance=covariance[k],
             centroid=centroid[k],
-            count=count,
-            rms=off,
-            confidence=sure,
+            count=pixels,
+            rms=residual,
+            confidence=certainty,
             shape=RegionShape(shapes, k),
             outline=outlines[k],
         )
-        for k, (of_surface, away, count, off, sure) in zip(found.tolist(), numbers, strict=True)
+        for k, (group, offset, pixels, residual, certainty) in zip(
+            found.tolist(), numbers, strict=True
+        )
     ]
 
 

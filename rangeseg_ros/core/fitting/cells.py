@@ -81,6 +81,7 @@ def _cut(
             step = BLOCK
             side = -(-side // BLOCK) * BLOCK
             top, left = top // BLOCK * BLOCK, left // BLOCK * BLOCK
+        # What is begun counts: the negative quotients are rounded down.
         while -((top - bottom) // side) * -((left - right) // side) > MAX_CELLS:
             side += step
         origin[k, 0], origin[k, 1] = top, left

@@ -155,12 +155,6 @@ class Fits(NamedTuple):
             inner=group.astype(np.uint16)[self.inner],
         )
 
-    def regions_of_parts(self) -> NDArray[np.intp]:
-        """Region (P,) that each part belongs to."""
-        region = np.empty_like(self.parts)
-        region[self.parts] = np.repeat(np.arange(len(self.theta)), np.diff(self.start))
-        return region
-
     def boxes(self) -> NDArray[np.intp]:
         """Bounding boxes (M + 1, 4), see `Cells.box`."""
         box, first = self.cells.box[self.parts], self.start[:-1]
