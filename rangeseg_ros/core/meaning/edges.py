@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -45,12 +44,35 @@ def below_edges(
     rise : bool
         The same where the ground rises.
     """
-    fallen = _fallen(-height if rise else height, cells.place, steps, steep, broken, turned, rise)
-    result = np.zeros(fallen.shape, np.bool_)
-    if fallen.any():
+    return _most(
+        _fallen(-height if rise else height, cells.place, steps, steep, broken, turned, rise)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _most(fallen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where most of the columns around have fallen, mirrored at the borders of the image."""
+    rows, columns = fallen.shape
+    reach = _BESIDE[1] // 2
+    column = np.zeros(columns + 2 * reach, np.int64)
+    for k in range(len(column)):
+        c = abs(k - reach)
+        while columns > 1 and not 0 <= c < columns:
+            c = 2 * (columns - 1) - c if c >= columns else -c
+        column[k] = min(c, columns - 1)
+    result = np.zeros((rows, columns), np.bool_)
+    # How many have fallen up to a column.
+    number = np.zeros(len(column) + 1, np.int64)
+    for i in range(rows):
+        for k in range(len(column)):
+            number[k + 1] = number[k] + fallen[i, column[k]]
+        if number[-1] == 0:
+            continue
         for width in _BESIDE:
-            number = cv2.boxFilter(fallen.view(np.uint8), -1, (width, 1), normalize=False)
-            result |= number > width // 2
+            half = width // 2
+            for c in range(columns):
+                around = number[c + reach + half + 1] - number[c + reach - half]
+                result[i, c] |= around > half
     return result
 
 

@@ -89,12 +89,35 @@ def stand(
     tilt : float
         Standard deviation of `up`, radians.
     """
+    winner, below, *lean, confidence = _most_probable(
+        cells, surface, count, sensor, known, slope, tilt
+    )
+    if winner == 0:
+        return Stand(0, np.zeros(3), 0.0)
+    theta = -(up - np.array(lean) @ axes_of(up)[1:]) / (known[0] - below)
+    return Stand(winner, theta, confidence)
+
+
+@njit(cache=True, nogil=True)
+def _most_probable(
+    cells: Cells,
+    surface: NDArray[np.int32],
+    count: int,
+    sensor: SensorModel,
+    known: tuple[float, float],
+    slope: float,
+    tilt: float,
+) -> tuple[int, float, float, float, float]:
+    """The surface, or 0; what is known errs by so much if it is the ground; and its confidence.
+
+    See `stand`, and a, b, c of `_scores`.
+    """
     height, doubt = known
     sizes, reach, steepest = _reaches(cells, surface, count + 1)
     order = np.flatnonzero(sizes >= SAMPLES)
-    order = order[np.argsort(-sizes[order], kind='stable')[:_MAX_SURFACES]]
-    if not len(order):
-        return Stand(0, np.zeros(3), 0.0)
+    if len(order) == 0:
+        return 0, 0.0, 0.0, 0.0, 0.0
+    order = order[np.argsort(-sizes[order], kind='mergesort')[:_MAX_SURFACES]]
     rank = np.full(len(sizes), -1)
     rank[order] = np.arange(len(order))
     sums = _sums(cells, surface, rank, reach, sensor, height)
@@ -102,14 +125,13 @@ def stand(
     if height == 0:
         # A metre farther from below the sensor, for each metre of its height.
         base -= steepest[order] / NEAR
-    scores, planes = _scores(sums, base, height, doubt or 1e3, slope, tilt)
-    winner = int(np.argmax(scores))
+    scores, planes = _scores(sums, base, height, doubt if doubt > 0 else 1e3, slope, tilt)
+    winner = np.argmax(scores)
     if scores[winner] == -np.inf:
-        return Stand(0, np.zeros(3), 0.0)
-    below, *lean = planes[winner]
-    theta = -(up - np.array(lean) @ axes_of(up)[1:]) / (height - below)
+        return 0, 0.0, 0.0, 0.0, 0.0
+    below, ahead, aside = planes[winner]
     share = np.exp(scores - scores[winner])
-    return Stand(int(order[winner]), theta, float(1 / share.sum()))
+    return order[winner], below, ahead, aside, 1 / share.sum()
 
 
 @njit(cache=True, nogil=True)
