@@ -2,11 +2,11 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import suppress
 from glob import glob
 from pathlib import Path
 
 from setuptools import find_packages, setup
-from setuptools.command.develop import develop
 from setuptools.command.install import install
 
 package_name = 'rangeseg_ros'
@@ -47,12 +47,19 @@ class Install(install):
             compile_kernels(self.install_lib)
 
 
-# What `colcon build --symlink-install` runs, where setuptools still has it.
-class Develop(develop):
-    def run(self):
-        super().run()
-        if not getattr(self, 'uninstall', False):
-            compile_kernels(os.getcwd())
+commands = {'install': Install}
+# Deprecated: a setuptools without it, with which colcon makes no links, must not end every build.
+with suppress(ImportError):
+    from setuptools.command.develop import develop
+
+    # What `colcon build --symlink-install` runs.
+    class Develop(develop):
+        def run(self):
+            super().run()
+            if not getattr(self, 'uninstall', False):
+                compile_kernels(os.getcwd())
+
+    commands['develop'] = Develop
 
 
 setup(
@@ -142,7 +149,7 @@ setup(
         ],
     },
     zip_safe=True,
-    cmdclass={'install': Install, 'develop': Develop},
+    cmdclass=commands,
     entry_points={
         'console_scripts': [
             'rangeseg = rangeseg_ros.start:rangeseg',
