@@ -19,7 +19,7 @@ from rangeseg_ros.core.fitting.scale import (
     pixels_of,
     variance_ratio,
 )
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, merged_alone
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, merged_alone, slope_of
 from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 # Chi-squared of 9 degrees of freedom, of what one plane through four blocks leaves, over its mean:
@@ -180,7 +180,7 @@ def _not_bent(
     flat = compared.whole.copy()
     for i in range(flat.shape[0]):
         for j in range(flat.shape[1]):
-            slope = way[0] * blocks.across[i, j] + way[1] * blocks.down[i, j]
+            slope = slope_of(blocks, i, j, way)
             expected = variances(shown, blocks.squared[i, j], slope)
             expected += variances(bending, blocks.squared[i, j], slope)
             flat[i, j] &= compared.excess[i, j] < _BENT * expected

@@ -32,7 +32,7 @@ from rangeseg_ros.core.fitting.scale import (
     variance_ratio,
 )
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, slope_of
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
@@ -161,7 +161,7 @@ def _flat_blocks(
     for i in range(rows):
         for j in range(columns):
             squared = coarse.squared[i // 2, j // 2]
-            slope = way[0] * coarse.across[i // 2, j // 2] + way[1] * coarse.down[i // 2, j // 2]
+            slope = slope_of(coarse, i // 2, j // 2, way)
             level[i, j] = variances(noise, squared, slope)
             count = blocks.moments[i, j, COUNT]
             # Six pixels leave three degrees of freedom.

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.alike import Sets, alike, median, quantiles
-from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.blocks import Blocks, slope_of
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.significance import chi2_quantile
 
@@ -80,7 +80,7 @@ def choose(blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], mo
                 continue
             if seen % stride == 0:
                 place[k], squared[k] = i * columns + j, blocks.squared[i, j]
-                slope[k] = way[0] * blocks.across[i, j] + way[1] * blocks.down[i, j]
+                slope[k] = slope_of(blocks, i, j, way)
                 k += 1
             seen += 1
     return Scale(place, squared, slope, alike(squared, slope))

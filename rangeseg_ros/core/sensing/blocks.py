@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -51,10 +51,6 @@ class Blocks(NamedTuple):
     down: NDArray[np.float64]
     residual: NDArray[np.float64]
 
-    def slope(self, way: tuple[float, float]) -> NDArray[np.float64]:
-        """Sums (rows, columns) of so much of the squared slopes along the row and the column."""
-        return way[0] * self.across + way[1] * self.down
-
     @classmethod
     def of(cls, image: RangeImage, size: int = BLOCK) -> Blocks:
         """Blocks of `size` pixels, 3 or 4."""
@@ -78,6 +74,12 @@ class Blocks(NamedTuple):
         return cls(moments, *(np.zeros((rows, columns)) for _ in range(4)))
 
 
+@njit(cache=True, inline='always')
+def slope_of(blocks: Blocks, i: int, j: int, way: tuple[float, float]) -> Any:
+    """Sum of so much of the squared slopes of a block along the row and down the column."""
+    return way[0] * blocks.across[i, j] + way[1] * blocks.down[i, j]
+
+
 @njit(cache=True, nogil=True)
 def _sum_pixels(
     first: int,
@@ -92,7 +94,8 @@ def _sum_pixels(
     lanes = new_lanes()
     for begin in range(0, blocks.squared.shape[1], LANES):
         left = begin * size
-        for axis in range(0, 3, 2):
+        # Those that the rays of all rows of a pinhole camera share.
+        for axis in (0, 2):
             set_rays(lanes, axis, rays[0, left:, axis], size)
         for bi in range(first, after):
             clear_sums(lanes)
