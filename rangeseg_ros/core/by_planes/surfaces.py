@@ -281,7 +281,6 @@ def _unite(
             if border[a, c] > 0:
                 apart = _energy_change(moments, residual, a, c, smooth)
                 change[min(a, c), max(a, c)] = apart - border[a, c]
-            if c != a and parent[c] == c:
                 partner[c], least[c] = _smallest(change[c], c)
         partner[a], least[a] = _smallest(change[a], a)
     return find_roots(parent)
