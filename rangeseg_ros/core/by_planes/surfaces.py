@@ -186,10 +186,7 @@ def _join(
     """
     count = len(moments)
     moments, border = moments.copy(), border.copy()
-    theta = np.zeros(3)
-    residual = np.zeros(count)
-    for a in range(count):
-        residual[a] = fit(moments[a], theta)
+    residual = _residuals(moments)
     # Between surfaces a < b that touch: the strain along their border, and its mean where they
     # may join. Of each a: the b of least mean strain, and this.
     strain, mean = np.zeros((count, count)), np.full((count, count), np.inf)
@@ -243,15 +240,12 @@ def _unite(
 ) -> NDArray[np.intp]:
     """Unite surfaces 1...K as long as the energy falls, those first by which it falls most.
 
-    `border` is what their borders cost, `smooth` is `SensorModel.distortion_pixels`. Returns the
-    roots.
+    The energy is that of eq. 5.3; `border` is what their borders cost, `smooth` is
+    `SensorModel.distortion_pixels`. Returns the roots.
     """
     count = len(moments)
     moments, border = moments.copy(), border.copy()
-    theta = np.zeros(3)
-    residual = np.zeros(count)
-    for a in range(count):
-        residual[a] = fit(moments[a], theta)
+    residual = _residuals(moments)
     # By how much the energy changes if surfaces a < b that touch unite. Of each a: the b with
     # which it falls most, and by how much.
     change = np.zeros((count, count))
@@ -284,6 +278,16 @@ def _unite(
                 partner[c], least[c] = _smallest(change[c], c)
         partner[a], least[a] = _smallest(change[a], a)
     return find_roots(parent)
+
+
+@njit(cache=True)
+def _residuals(moments: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Chi-squared that the plane of each of some moments leaves."""
+    theta = np.zeros(3)
+    residual = np.zeros(len(moments))
+    for a in range(len(moments)):
+        residual[a] = fit(moments[a], theta)
+    return residual
 
 
 @njit(cache=True)
