@@ -22,6 +22,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.contacts import (
+    Contacts,
+    absorb,
+    find_contacts,
+    least_contact,
+)
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
@@ -109,13 +115,13 @@ def join_surfaces(
         Of the surfaces; zeros for 0.
     """
     moments, smooth = patches.moments, sensor.distortion_pixels
-    border = _borders(patches.labels, nodes.right, nodes.below, len(moments))
-    part, moments = _renumber(_join(moments, border, smooth, sensor.agreement), moments, 1.0)
+    contacts = find_contacts(patches.labels, nodes.right, nodes.below, len(moments))
+    part, moments = _renumber(_join(moments, contacts, smooth, sensor.agreement), moments, 1.0)
     parts = part[patches.labels]
-    border = _borders(parts, nodes.right, nodes.below, len(moments))
+    contacts = find_contacts(parts, nodes.right, nodes.below, len(moments))
     # What a block's side of border costs.
     side = smoothness * sensor.patch * block
-    surface, moments = _renumber(_unite(moments, side * border, smooth), moments, float(least))
+    surface, moments = _renumber(_unite(moments, contacts, side, smooth), moments, float(least))
     return surface[parts], moments
 
 
@@ -154,129 +160,94 @@ def _renumber(
 
 
 @njit(cache=True, nogil=True)
-def _borders(
-    patch: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
-) -> NDArray[np.float64]:
-    """Length of the border between every two patches, in blocks: (count, count), symmetric."""
-    rows, columns = patch.shape
-    border = np.zeros((count, count))
-    for i in range(rows):
-        for j in range(columns):
-            a = patch[i, j]
-            for k in range(2):
-                if k == 0 and (j + 1 == columns or not right[i, j]):
-                    continue
-                if k == 1 and (i + 1 == rows or not below[i, j]):
-                    continue
-                b = patch[i, j + 1] if k == 0 else patch[i + 1, j]
-                if a != b and a > 0 and b > 0:
-                    border[a, b] += 1
-                    border[b, a] += 1
-    return border
-
-
-@njit(cache=True, nogil=True)
 def _join(
-    moments: NDArray[np.float64], border: NDArray[np.float64], smooth: float, agreement: float
+    moments: NDArray[np.float64], contacts: Contacts, smooth: float, agreement: float
 ) -> NDArray[np.intp]:
     """Join patches 1...P to surfaces, those that agree best first; returns the roots.
 
     The strain between two surfaces is the mean misfit of the patches on either side of their
-    border. `smooth` is `SensorModel.distortion_pixels`, `agreement` as in `misfit`.
+    border. `smooth` is `SensorModel.distortion_pixels`, `agreement` as in `misfit`. The contacts
+    are used up.
     """
-    count = len(moments)
-    moments, border = moments.copy(), border.copy()
+    moments, parent = moments.copy(), np.arange(len(moments))
     residual = _residuals(moments)
-    # Between surfaces a < b that touch: the strain along their border, and its mean where they
-    # may join. Of each a: the b of least mean strain, and this.
-    strain, mean = np.zeros((count, count)), np.full((count, count), np.inf)
-    partner, least = np.arange(count), np.full(count, np.inf)
-    for a in range(count):
-        for b in range(a + 1, count):
-            if border[a, b] > 0:
-                extra = common_residual(moments, a, b) - residual[a] - residual[b]
-                apart = misfit(extra, moments, a, b, _BETWEEN_PATCHES, agreement)
-                strain[a, b] = apart * border[a, b]
-                strain[b, a] = strain[a, b]
-                mean[a, b] = strain[a, b] / border[a, b]
-        partner[a], least[a] = _smallest(mean[a], a)
-    parent = np.arange(count)
+    length, target = contacts.length, contacts.target
+    # Of contacts: the strain along the border, and its mean where surfaces may join. Of each
+    # surface: the contact with a later one of least mean strain, and this.
+    strain, mean = np.zeros(len(length)), np.zeros(len(length))
+    nearest, least = np.full(len(moments), -1), np.full(len(moments), np.inf)
+    for e in range(len(length)):
+        a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
+        extra = common_residual(moments, a, b) - residual[a] - residual[b]
+        apart = misfit(extra, moments, a, b, _BETWEEN_PATCHES, agreement)
+        strain[e] = apart * length[e]
+        mean[e] = strain[e] / length[e]
+    for a in range(len(moments)):
+        nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
     while True:
-        a, strained = _smallest(least, 0)
+        a, strained = _smallest(least)
         if not strained < 1:
             break
-        b = partner[a]
+        b = target[nearest[a]]
         chi2 = common_residual(moments, a, b)
         extra = chi2 - residual[a] - residual[b]
         pixels = moments[a, COUNT] + moments[b, COUNT]
         within = _WITHIN_SURFACE * pixels / (pixels + smooth)
-        mean[a, b] = np.inf
         if misfit(extra, moments, a, b, within, agreement) >= 1:
-            partner[a], least[a] = _smallest(mean[a], a)
+            mean[nearest[a] // 2] = np.inf
+            nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
             continue
-        parent[b] = a
+        parent[b], residual[a], least[b] = a, chi2, np.inf
         moments[a] += moments[b]
-        residual[a] = chi2
-        border[a, b] = border[b, a] = 0
-        least[b] = np.inf
-        for c in range(count):
-            if border[b, c] > 0:
-                border[a, c] += border[b, c]
-                strain[a, c] += strain[b, c]
-                border[c, a], strain[c, a] = border[a, c], strain[a, c]
-                border[b, c] = border[c, b] = 0
-                mean[min(b, c), max(b, c)] = np.inf
-            if border[a, c] > 0:
-                mean[min(a, c), max(a, c)] = strain[a, c] / border[a, c]
-                if c < a or partner[c] == b:
-                    partner[c], least[c] = _smallest(mean[c], c)
-        partner[a], least[a] = _smallest(mean[a], a)
+        absorb(contacts, strain, a, b)
+        h = contacts.head[a]
+        while h >= 0:
+            mean[h // 2] = strain[h // 2] / length[h // 2]
+            c = target[h]
+            nearest[c], least[c] = least_contact(contacts, mean, c, np.inf)
+            h = contacts.link[h]
+        nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
     return find_roots(parent)
 
 
 @njit(cache=True, nogil=True)
 def _unite(
-    moments: NDArray[np.float64], border: NDArray[np.float64], smooth: float
+    moments: NDArray[np.float64], contacts: Contacts, side: float, smooth: float
 ) -> NDArray[np.intp]:
     """Unite surfaces 1...K as long as the energy falls, those first by which it falls most.
 
-    The energy is that of eq. 5.3; `border` is what their borders cost, `smooth` is
-    `SensorModel.distortion_pixels`. Returns the roots.
+    The energy is that of eq. 5.3; `side` is what the length of borders costs, `smooth` is
+    `SensorModel.distortion_pixels`. Returns the roots. The contacts are used up.
     """
-    count = len(moments)
-    moments, border = moments.copy(), border.copy()
+    moments, parent = moments.copy(), np.arange(len(moments))
     residual = _residuals(moments)
-    # By how much the energy changes if surfaces a < b that touch unite. Of each a: the b with
-    # which it falls most, and by how much.
-    change = np.zeros((count, count))
-    partner, least = np.arange(count), np.zeros(count)
-    for a in range(count):
-        for b in range(a + 1, count):
-            if border[a, b] > 0:
-                change[a, b] = _energy_change(moments, residual, a, b, smooth) - border[a, b]
-        partner[a], least[a] = _smallest(change[a], a)
-    parent = np.arange(count)
+    length, target = contacts.length, contacts.target
+    # Of contacts: by how much the energy changes if the two unite. Of each surface: the
+    # contact with a later one by which it falls most, and by how much.
+    change = np.zeros(len(length))
+    nearest, least = np.full(len(moments), -1), np.zeros(len(moments))
+    for e in range(len(length)):
+        a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
+        change[e] = _energy_change(moments, residual, a, b, smooth) - side * length[e]
+    for a in range(len(moments)):
+        nearest[a], least[a] = least_contact(contacts, change, a, 0.0)
     while True:
-        a, falls = _smallest(least, 0)
+        a, falls = _smallest(least)
         if not falls < 0:
             break
-        b = partner[a]
-        parent[b] = a
+        b = target[nearest[a]]
+        parent[b], least[b] = a, 0
         residual[a] = common_residual(moments, a, b)
         moments[a] += moments[b]
-        border[a, b] = border[b, a] = 0
-        change[a, b] = least[b] = 0
-        for c in range(count):
-            if border[b, c] > 0:
-                border[a, c] += border[b, c]
-                border[c, a] = border[a, c]
-                border[b, c] = border[c, b] = 0
-                change[min(b, c), max(b, c)] = 0
-            if border[a, c] > 0:
-                apart = _energy_change(moments, residual, a, c, smooth)
-                change[min(a, c), max(a, c)] = apart - border[a, c]
-                partner[c], least[c] = _smallest(change[c], c)
-        partner[a], least[a] = _smallest(change[a], a)
+        absorb(contacts, change, a, b)
+        h = contacts.head[a]
+        while h >= 0:
+            c = target[h]
+            apart = _energy_change(moments, residual, a, c, smooth)
+            change[h // 2] = apart - side * length[h // 2]
+            nearest[c], least[c] = least_contact(contacts, change, c, 0.0)
+            h = contacts.link[h]
+        nearest[a], least[a] = least_contact(contacts, change, a, 0.0)
     return find_roots(parent)
 
 
@@ -303,10 +274,10 @@ def _energy_change(
 
 
 @njit(cache=True)
-def _smallest(values: NDArray[np.float64], first: int) -> tuple[int, float]:
-    """The smallest of some values from `first` on: its index, the first of equals, and itself."""
-    index, smallest = first, values[first]
-    for k in range(first + 1, len(values)):
+def _smallest(values: NDArray[np.float64]) -> tuple[int, float]:
+    """The smallest of some values: its index, the first of equals, and itself."""
+    index, smallest = 0, values[0]
+    for k in range(1, len(values)):
         if values[k] < smallest:
             index, smallest = k, values[k]
     return index, smallest

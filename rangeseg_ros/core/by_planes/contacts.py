@@ -1,0 +1,135 @@
+"""Which parts of an image touch, while they are joined to larger ones."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+
+class Contacts(NamedTuple):
+    """Pairs of parts that touch, as chains of half-edges.
+
+    Half-edge 2e of contact e leads from one part to the other, and 2e + 1 back. Parts touch few
+    others: chains are shorter than the rows of a matrix, and the shorter to clear.
+
+    Attributes
+    ----------
+    head : (N,) int32
+        First half-edge of each part, -1 for none.
+    link : (2E,) int32
+        The next one of the same part, -1 for none.
+    target : (2E,) int32
+        Part that a half-edge leads to.
+    length : (E,) float64
+        Length of the common border, in blocks; 0 where parts have been joined.
+    place : (N,) int32
+        Room for `absorb`, all -1.
+    """
+
+    head: NDArray[np.int32]
+    link: NDArray[np.int32]
+    target: NDArray[np.int32]
+    length: NDArray[np.float64]
+    place: NDArray[np.int32]
+
+
+@njit(cache=True, nogil=True)
+def find_contacts(
+    part: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
+) -> Contacts:
+    """Contacts between the parts of a grid of blocks.
+
+    Parameters
+    ----------
+    part : (rows, columns) int
+        0 for none, otherwise 1...N - 1.
+    right, below : (rows, columns - 1), (rows - 1, columns) bool
+        Whether a block touches its neighbour.
+    count : int
+        N.
+    """
+    rows, columns = part.shape
+    head = np.full(count, -1, np.int32)
+    link = np.empty(4 * rows * columns, np.int32)
+    target = np.empty(4 * rows * columns, np.int32)
+    length = np.empty(2 * rows * columns)
+    found = 0
+    for i in range(rows):
+        for j in range(columns):
+            a = part[i, j]
+            for k in range(2):
+                if k == 0 and (j + 1 == columns or not right[i, j]):
+                    continue
+                if k == 1 and (i + 1 == rows or not below[i, j]):
+                    continue
+                b = part[i, j + 1] if k == 0 else part[i + 1, j]
+                if a == b or a == 0 or b == 0:
+                    continue
+                h = head[a]
+                while h >= 0 and target[h] != b:
+                    h = link[h]
+                if h < 0:
+                    h = 2 * found
+                    target[h], target[h + 1], length[found] = b, a, 0
+                    link[h], link[h + 1] = head[a], head[b]
+                    head[a], head[b] = h, h + 1
+                    found += 1
+                length[h // 2] += 1
+    place = np.full(count, -1, np.int32)
+    return Contacts(head, link[: 2 * found], target[: 2 * found], length[:found], place)
+
+
+@njit(cache=True, nogil=True)
+def absorb(contacts: Contacts, values: NDArray[np.float64], a: int, b: int) -> None:
+    """Let part a take the contacts of part b over, in place; where both touch a third, add up.
+
+    Added are the lengths, and what `values` (E,) tells of the contacts.
+    """
+    head, link, target, length, place = contacts
+    kept, h = -1, head[a]
+    while h >= 0:
+        following, c = link[h], target[h]
+        if c == b:
+            length[h // 2] = 0
+        elif length[h // 2] > 0:
+            place[c] = h // 2
+            link[h], kept = kept, h
+        h = following
+    h = head[b]
+    while h >= 0:
+        following, e, c = link[h], h // 2, target[h]
+        if length[e] > 0 and place[c] >= 0:
+            values[place[c]] += values[e]
+            length[place[c]] += length[e]
+            length[e] = 0
+        elif length[e] > 0:
+            target[h ^ 1] = a
+            link[h], kept = kept, h
+        h = following
+    head[a], head[b] = kept, -1
+    h = kept
+    while h >= 0:
+        place[target[h]] = -1
+        h = link[h]
+
+
+@njit(cache=True, nogil=True)
+def least_contact(
+    contacts: Contacts, values: NDArray[np.float64], a: int, most: float
+) -> tuple[int, float]:
+    """The contact of part a with a later one of which `values` (E,) are least, and this.
+
+    As a half-edge, -1 where no value is below `most`; of equal ones that to the first part.
+    """
+    best, least = -1, most
+    h = contacts.head[a]
+    while h >= 0:
+        b, value = contacts.target[h], values[h // 2]
+        first = value < least or (value == least and best >= 0 and b < contacts.target[best])
+        if b > a and contacts.length[h // 2] > 0 and first:
+            best, least = h, value
+        h = contacts.link[h]
+    return best, least

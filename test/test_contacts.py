@@ -1,0 +1,64 @@
+"""Contacts of parts of a grid, while parts join."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.by_planes.contacts import absorb, find_contacts, least_contact
+
+
+def borders(part, right, below, count):
+    """Length of the border between every two parts, by definition."""
+    found = np.zeros((count, count))
+    for one, other, touch in (
+        (part[:, :-1], part[:, 1:], right),
+        (part[:-1], part[1:], below),
+    ):
+        for a, b in zip(one[touch], other[touch], strict=True):
+            if a != b and a > 0 and b > 0:
+                found[a, b] += 1
+                found[b, a] += 1
+    return found
+
+
+def as_matrix(contacts, values):
+    """What is told of all contacts, as their chains lead to them; nan for none."""
+    count = len(contacts.head)
+    told = np.full((count, count), np.nan)
+    for a in range(count):
+        h = contacts.head[a]
+        while h >= 0:
+            if contacts.length[h // 2] > 0:
+                assert np.isnan(told[a, contacts.target[h]])
+                told[a, contacts.target[h]] = values[h // 2]
+            h = contacts.link[h]
+    return told
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_contacts_stay_those_of_the_grid(seed):
+    rng = np.random.default_rng(seed)
+    shape, count = (14, 17), 25
+    part = np.repeat(np.repeat(rng.integers(0, count, (7, 9)), 2, 0), 2, 1)[:, : shape[1]]
+    right = rng.random((shape[0], shape[1] - 1)) < 0.8
+    below = rng.random((shape[0] - 1, shape[1])) < 0.8
+    contacts = find_contacts(part, right, below, count)
+    length = contacts.length
+    values = rng.random(len(length))
+    told = as_matrix(contacts, values)
+    for _ in range(15):
+        found = borders(part, right, below, count)
+        assert np.array_equal(np.nan_to_num(as_matrix(contacts, length)), found)
+        assert np.allclose(as_matrix(contacts, values), told, equal_nan=True)
+        assert np.array_equal(np.isnan(told), found == 0)
+        for a in range(count):
+            later = np.where(np.isnan(told[a, a + 1 :]), np.inf, told[a, a + 1 :])
+            h, least = least_contact(contacts, values, a, np.inf)
+            assert least == pytest.approx(later.min(initial=np.inf))
+            assert h == -1 or contacts.target[h] == a + 1 + later.argmin()
+        a, b = (int(k) for k in rng.choice(np.argwhere(found > 0)))
+        part = np.where(part == b, a, part)
+        absorb(contacts, values, a, b)
+        both = np.nansum(told[[a, b]], 0)
+        both[[a, b]] = 0
+        told[a] = told[:, a] = np.where(both > 0, both, np.nan)
+        told[b] = told[:, b] = np.nan
