@@ -46,6 +46,18 @@ def test_blocks_are_sums_over_their_pixels():
     assert not whole(inverse, edges)[:, 3].any()
 
 
+@pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3)])
+def test_slopes_do_not_need_the_rays_of_holes(hole):
+    """Those in the middle of a block, which clouds do not have."""
+    _, rays, _ = grid(8, 8)
+    inverse = (rays @ np.array([0.1, -0.05, 0.5])).astype(np.float32)
+    for holes in (hole, np.s_[4:, 5::2]):
+        rays[holes], inverse[holes] = 0, 0
+    blocks = Blocks.of(RangeImage(rays, inverse))
+    np.testing.assert_allclose(blocks.across, (0.1 / 50) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(blocks.down, (0.05 / 50) ** 2, rtol=1e-3)
+
+
 @pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
 @pytest.mark.parametrize('size', [3, 4])
 def test_blocks_of_any_size_add_up(shape, size):

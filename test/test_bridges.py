@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from clouds import cloud_of
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
@@ -40,7 +41,7 @@ def test_holes_part_no_plane_and_stay_holes(holes, cloud):
     depth = np.where(holes, np.nan, 1 / inverse).astype(np.float32)
     image = RangeImage.from_depth(depth, CAMERA)
     if cloud:
-        image = RangeImage.from_points(depth[..., None] * CAMERA.rays)
+        image = cloud_of(depth[..., None] * CAMERA.rays)
     result = Segmenter(Config()).segment(image)
     assert len(result.planes) == 2
     assert not result.labels[holes].any()

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from calibration_frames import CAMERA, NOISE, frames, rms, true_map
+from clouds import cloud_of
 
 from rangeseg_ros import RangeImage
 from rangeseg_ros.core.calibration.bands import column_profile
@@ -250,7 +251,7 @@ def test_views_of_one_corner_are_refused():
 
 def test_clouds_are_seen_as_depth_images_are():
     labels, image = next(frames(1, true_map()))
-    cloud = RangeImage.from_points(image.points)
+    cloud = cloud_of(image.points)
     one, other = find_sightings(labels, image), find_sightings(labels, cloud)
     assert np.array_equal(one.cell, other.cell)
     assert other.inverse == pytest.approx(one.inverse, rel=1e-5)

@@ -9,6 +9,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from clouds import cloud_of
 from numba import njit
 
 from rangeseg_ros import Config, RangeImage
@@ -57,7 +58,7 @@ def test_frames_need_nothing_more(method, shape):
     depth[:, ::17] = np.nan
     image = RangeImage.from_depth(depth, camera)
     with preparation._nothing_compiled():
-        for each in (image, RangeImage.from_points(image.points)):
+        for each in (image, cloud_of(image.points)):
             SequenceSegmenter(config).segment(each, 0)
 
 
@@ -68,7 +69,7 @@ def test_less_of_the_work_needs_nothing_more(budget):
     camera = kinect_camera(161, 121)
     image = RangeImage.from_depth(simulate_kinect(kinect_room(2), camera, seed=2).depth, camera)
     with preparation._nothing_compiled():
-        for each in (image, RangeImage.from_points(image.points)):
+        for each in (image, cloud_of(image.points)):
             SequenceSegmenter(Config(work_budget=budget)).segment(each, 0)
 
 

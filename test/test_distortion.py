@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from clouds import cloud_of
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, TiffImagePlugin
@@ -46,7 +47,7 @@ def test_clouds_are_corrected_along_their_rays():
     true = CAMERA.rays / wall()[..., None]
     seen = CAMERA.rays / (wall() + smooth_map())[..., None]
     seen[3, 4] = np.nan
-    image = DistortionMap(smooth_map()).corrected(RangeImage.from_points(seen))
+    image = DistortionMap(smooth_map()).corrected(cloud_of(seen))
     valid = image.valid
     assert valid.sum() == valid.size - 1
     assert image.points[valid] == pytest.approx(true[valid], rel=1e-5)

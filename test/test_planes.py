@@ -5,6 +5,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from clouds import cloud_of
 from planes_of_labels import fit_planes
 
 from rangeseg_ros.core.sensing.camera import Camera
@@ -31,7 +32,7 @@ def boxes(*corners):
 
 
 def as_cloud(image):
-    return RangeImage.from_points(image.points)
+    return cloud_of(image.points)
 
 
 def polygon_area(ring, normal):
@@ -152,7 +153,7 @@ def test_a_row_of_a_cloud_determines_no_plane():
     angle = np.linspace(-0.3, 0.3, 25)
     rays = np.stack([np.sin(angle), -0.2 * np.cos(angle), np.cos(angle)], axis=1)
     row = rays * random.normal(4, 0.02, (25, 1)) + random.normal(0, 1e-4, (25, 3))
-    image = RangeImage.from_points(row[None])
+    image = cloud_of(row[None])
     assert fit_planes(np.ones((1, 25), np.uint16), image, KINECT) == []
 
 

@@ -86,6 +86,79 @@ def test_clouds_keep_their_points():
     np.testing.assert_allclose(np.linalg.norm(image.rays[image.valid], axis=1), 1, rtol=1e-6)
 
 
+# Numbers of a data sheet, of a calibration, and of a tiny sensor.
+CAMERAS = (
+    Camera(160, 120, 131.0, 131.5, 79.5, 59.5),
+    Camera(212, 160, 178.8243, 179.2906, 105.819287, 79.129813),
+    Camera(16, 12, 14.0, 14.0, 7.25, 5.5),
+)
+
+
+@pytest.mark.parametrize('camera', CAMERAS)
+@pytest.mark.parametrize('holes', ['none', 'random', 'columns', 'left'])
+def test_the_cloud_of_a_pinhole_camera_is_its_depth_image(camera, holes):
+    """Made in float32 as depth_image_proc does."""
+    v, u = np.indices(camera.shape, np.float32)
+    z = np.random.default_rng(3).uniform(0.4, 6, camera.shape).astype(np.float32)
+    missing = {
+        'none': np.zeros(camera.shape, bool),
+        'random': np.random.default_rng(4).random(camera.shape) < 0.3,
+        'columns': u % 2 == 0,
+        'left': u < camera.width // 3,
+    }[holes]
+    z[missing] = np.nan
+    f = np.float32
+    x = (u - f(camera.cx)) * z * f(1 / camera.fx)
+    y = (v - f(camera.cy)) * z * f(1 / camera.fy)
+    image = RangeImage.from_points(np.stack([x, y, z], axis=2))
+    found, expected = image.camera, RangeImage.from_depth(z, camera)
+    assert found.shape == camera.shape and image.pinhole
+    np.testing.assert_allclose(found.matrix, camera.matrix, atol=2e-3)
+    np.testing.assert_array_equal(image.inverse, expected.inverse)
+    assert image.rays is RangeImage.from_points(np.stack([x, y, z], axis=2)).rays
+
+
+def scanned(camera):
+    """Rays (H, W, 3) at even angles, as of a scanner that turns."""
+    azimuth = (np.arange(camera.width) - camera.cx) / camera.fx
+    elevation = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
+    rays = np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth)
+    return np.stack(np.broadcast_arrays(*rays[:2], rays[2] * np.cos(elevation)), axis=2)
+
+
+def bent(camera):
+    """Rays through a lens that moves the corners by a fifth of a pixel."""
+    square = (camera.rays[..., :2] ** 2).sum(axis=2, keepdims=True)
+    return camera.rays * np.concatenate([*[1 + 0.0015 * square] * 2, np.ones_like(square)], axis=2)
+
+
+@pytest.mark.parametrize(
+    'rays',
+    [
+        scanned(CAMERAS[0]),
+        bent(CAMERAS[0]),
+        CAMERAS[0].rays[:, ::-1],
+        CAMERAS[0].rays[..., [2, 0, 1]],
+        CAMERAS[0].rays[:1],
+        CAMERAS[0].rays[:, :1],
+        np.where(np.arange(160)[:, None] < 60, CAMERAS[0].rays, np.nan),
+    ],
+    ids=['scanner', 'lens', 'mirrored', 'x forward', 'row', 'column', 'part'],
+)
+def test_no_camera_is_seen_in_other_clouds(rays):
+    depth = np.random.default_rng(3).uniform(0.4, 6, rays.shape[:2])
+    image = RangeImage.from_points((rays * depth[..., None]).astype(np.float32))
+    assert image.camera is None
+    np.testing.assert_allclose(np.linalg.norm(image.rays[image.valid], axis=1), 1, rtol=1e-6)
+
+
+def test_one_point_off_the_rays_is_not_moved_to_them():
+    points = CAMERAS[0].rays * np.float32(2)
+    points[7, 9, 0] += 0.01
+    image = RangeImage.from_points(points)
+    np.testing.assert_allclose(image.points, points, rtol=1e-5, atol=1e-6)
+
+
 def test_dithering_adds_the_stated_noise_to_the_ranges():
     camera = Camera(200, 150, 100.0, 100.0, 99.5, 74.5)
     depth = np.full(camera.shape, 2.0)

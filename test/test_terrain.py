@@ -5,6 +5,7 @@ import pickle
 import cv2
 import numpy as np
 import pytest
+from clouds import cloud_of
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
@@ -154,7 +155,7 @@ def test_the_camera_may_be_rolled(roll):
 
 def test_clouds_of_any_sensor():
     image, result, frame = found(scene(*drop_of(0.15)))
-    cloud = RangeImage.from_points(image.points)
+    cloud = cloud_of(image.points)
     up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(scene().up)
     config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
     again = Segmenter(config).segment(cloud)
@@ -191,7 +192,7 @@ def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
     # A cloud does not say where it looked: what it saw around tells.
     up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(terrain.up)
     config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
-    cloud = RangeImage.from_points(image.points)
+    cloud = cloud_of(image.points)
     others = unseen(cloud, Segmenter(config).segment(cloud).ground)
     there = others[:, :3] @ terrain.pose.rotation.T + terrain.pose.position
     within = (there[:, 0] > 1.45) & (there[:, 0] < 2.3)

@@ -5,6 +5,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 import pytest
+from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
@@ -98,7 +99,7 @@ def test_half_a_camera_sees_every_second_pixel():
 
 
 def test_clouds_and_bodies_are_halved(image):
-    cloud = RangeImage.from_points(image.points)
+    cloud = cloud_of(image.points)
     budget = Config(work_budget=0.5)
     result = Segmenter(budget).segment(cloud)
     assert result.labels.shape == image.shape and result.planes

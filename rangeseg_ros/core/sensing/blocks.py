@@ -163,12 +163,47 @@ def _store(
         if i < 0 or j < 0 or count <= 3:
             continue
         theta = block_plane(lanes, bj - begin)
-        right, below = 0.0, 0.0
-        for k in range(3):
-            right += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
-            below += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+        if _known(rays, i, j) and _known(rays, i, j + 1) and _known(rays, i + 1, j):
+            right, below = 0.0, 0.0
+            for k in range(3):
+                right += theta[k] * (rays[i, j + 1, k] - rays[i, j, k])
+                below += theta[k] * (rays[i + 1, j, k] - rays[i, j, k])
+        else:
+            right = _change(theta, rays, (bi * size, bj * size), size, False)
+            below = _change(theta, rays, (bi * size, bj * size), size, True)
         square = right * right + below * below
         noise = blocks.residual[bi, bj] / (count - 3) * doubt / count
         share = max(square - noise, 0.0) / max(square, 1e-300)
         blocks.across[bi, bj] = share * right * right
         blocks.down[bi, bj] = share * below * below
+
+
+@njit(cache=True, inline='always')
+def _known(rays: NDArray[np.float32], i: int, j: int) -> Any:
+    """Whether a pixel has a ray: those of a cloud are 0 where nothing was measured."""
+    return (rays[i, j, 0] != 0) | (rays[i, j, 1] != 0) | (rays[i, j, 2] != 0)
+
+
+@njit(cache=True, nogil=True)
+def _change(
+    theta: Any, rays: NDArray[np.float32], corner: tuple[int, int], size: int, down: bool
+) -> float:
+    """Change of the inverse range from pixel to pixel on the plane of a block, with holes in it.
+
+    Between the two rays of a column (`down`) or row that are farthest apart; 0 where none has two.
+    """
+    farthest, change = 0, 0.0
+    for line in range(size):
+        first, begin = -1, 0.0
+        for place in range(size):
+            i = corner[0] + (place if down else line)
+            j = corner[1] + (line if down else place)
+            if i >= rays.shape[0] or j >= rays.shape[1] or not _known(rays, i, j):
+                continue
+            level = theta[0] * rays[i, j, 0] + theta[1] * rays[i, j, 1] + theta[2] * rays[i, j, 2]
+            if first < 0:
+                first, begin = place, level
+            elif place - first > farthest:
+                farthest = place - first
+                change = (level - begin) / farthest
+    return change

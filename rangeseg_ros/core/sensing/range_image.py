@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.pinhole import camera_of
 
 
 class RangeImageError(ValueError):
@@ -42,7 +43,7 @@ class RangeImage:
     inverse : (H, W) float32
         Inverse depth (pinhole) or inverse range (cloud), 1/m; 0 where nothing was measured.
     camera : Camera or None
-        None for organised clouds.
+        None for organised clouds of other sensors.
     corrected : bool
         Whether the sensor's fixed distortion has been subtracted.
     body : (H, W) bool or None
@@ -103,6 +104,8 @@ class RangeImage:
     def from_points(cls, points: ArrayLike) -> RangeImage:
         """Range image of an organised cloud of any sensor.
 
+        That of a pinhole camera is what its depth image is (see `camera_of`).
+
         Parameters
         ----------
         points : (H, W, 3) float
@@ -124,24 +127,30 @@ class RangeImage:
             raise RangeImageError(
                 f'organised cloud must be (H, W, 3) float, not {array.shape} {array.dtype}'
             )
-        finite = np.isfinite(array).all(axis=2)
+        x, y, z = array[..., 0], array[..., 1], array[..., 2]
+        with np.errstate(invalid='ignore', over='ignore'):
+            known = np.isfinite(x + y + z) & ((x != 0) | (y != 0) | (z != 0))
         if hidden is not None:
-            finite &= ~hidden.any(axis=2)
-        cloud = np.where(finite[..., None], array, 0).astype(np.float64)
-        with np.errstate(over='ignore'):
-            distance = np.linalg.norm(cloud, axis=2)
-        inverse = _reciprocal(distance, 1.0)
-        rays = (cloud * inverse[..., None]).astype(np.float32)
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
-        far = (inverse > 0) & (inverse < 1 / _FAR)
-        if 2 * np.count_nonzero(far) > np.count_nonzero(inverse):
+            known &= ~hidden.any(axis=2)
+        camera = camera_of(array, known)
+        if camera is not None:
+            image = cls.from_depth(np.where(known, z, 0), camera)
+        else:
+            cloud = np.where(known[..., None], array, 0).astype(np.float64)
+            with np.errstate(over='ignore'):
+                inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
+            rays = (cloud * inverse[..., None]).astype(np.float32)
+            # Like those of cameras, or every kernel that reads them is compiled twice.
+            rays.flags.writeable = False
+            image = cls(rays, inverse)
+        far = image.valid & (image.inverse < 1 / _FAR)
+        if 2 * np.count_nonzero(far) > np.count_nonzero(image.valid):
             warnings.warn(
                 f'more than half of the points are beyond {_FAR:.0f} m: are they in metres?',
                 UnitWarning,
                 stacklevel=2,
             )
-        return cls(rays, inverse)
+        return image
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
         """Copy with Gaussian noise on the ranges (thesis 6.7.1).
