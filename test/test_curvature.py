@@ -6,6 +6,7 @@ import pytest
 from rangeseg_ros.core.by_planes.curvature import find_curved
 from rangeseg_ros.core.by_planes.quadratics import add_terms, explained
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -38,9 +39,9 @@ def verdict(inverse, regions, distortion=0.0, seed=0):
     bent = smooth_field(CAMERA.shape, (13.0, 22.0), random)
     inverse = inverse + (inverse > 0) * QUANTUM * (0.45 * field + distortion * bent)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    return find_curved(
-        regions.astype(np.uint16), image, Blocks.of(image), SENSOR, Config().flatness
-    )
+    regions, blocks = regions.astype(np.uint16), Blocks.of(image)
+    first = FirstPlanes.of(regions, image, blocks, SENSOR)
+    return find_curved(regions, first, image, blocks, SENSOR, Config().flatness)
 
 
 def test_planes_are_not_curved():
@@ -100,7 +101,9 @@ def test_holes_make_no_region_smaller(distortion, flatness):
             blocks = Blocks.of(image)
             # What is missing is bridged.
             image = RangeImage(CAMERA.rays, (0.8 + bend * barrel).astype(np.float32), CAMERA)
-            if find_curved(seen.astype(np.uint16), image, blocks, sensor, flatness)[1]:
+            regions = seen.astype(np.uint16)
+            first = FirstPlanes.of(regions, image, blocks, sensor)
+            if find_curved(regions, first, image, blocks, sensor, flatness)[1]:
                 break
         least.append(bend)
     assert 0.01 < least[0] < 1

@@ -13,6 +13,7 @@ from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
@@ -240,11 +241,11 @@ class Segmenter:
         jumps = jump_edges(whole, config.jump_edges, steps, slopes)
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
-        method = self._by_planes if config.method == 'planes' else self._by_normals
-        regions, labelling = method(whole, blocks, grid, sensor, config, watch)
         if config.method == 'planes':
-            regions, fits = by_planes.unite_regions(regions, image, blocks, sensor, grid)
+            regions, first, labelling = self._by_planes(whole, blocks, grid, sensor, config, watch)
+            regions, fits = by_planes.unite_regions(regions, first, image, blocks, sensor, grid)
         else:
+            regions, labelling = self._by_normals(whole, grid, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             fits = Fits.of(regions, image, stated, blocks)
         planes = describe_regions(regions, whole, fits)
@@ -270,25 +271,23 @@ class Segmenter:
         sensor: SensorModel,
         config: Config,
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], by_planes.Labelling]:
-        """Regions and the labelling they are made from, by planes as labels."""
+    ) -> tuple[NDArray[np.uint16], FirstPlanes, Labelling]:
+        """Regions, their first planes and the labelling they are made from: planes as labels."""
         least = least_pixels(config.min_pixels, image.shape)
         labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
         regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-        regions = by_planes.drop_curved(regions, image, blocks, sensor, config.flatness)
+        found = by_planes.flat_regions(regions, image, blocks, sensor, config.flatness)
         watch.lap('regions')
-        return regions, labelling
+        return *found, labelling
 
     def _by_normals(
         self,
         image: RangeImage,
-        blocks: Blocks,
         grid: Grid,
-        sensor: SensorModel,
         config: Config,
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], by_normals.Labelling]:
+    ) -> tuple[NDArray[np.uint16], Labelling]:
         """The same by discretised normals as labels."""
         least = least_pixels(config.min_pixels, image.shape)
         before = self._labels_before(image)

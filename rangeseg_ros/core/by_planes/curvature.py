@@ -7,20 +7,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.quadratics import add_terms, explained
-from rangeseg_ros.core.fitting.interior import fill
+from rangeseg_ros.core.fitting.first_planes import STRIDE, FirstPlanes
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.moments import (
-    CHI2,
-    COUNT,
-    RATIO,
-    SIZE,
-    add_pixel,
-    fit_all,
-    squares_left,
-)
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
 # The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has a
@@ -30,12 +22,11 @@ from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 _SHARE, _EXPONENT = 0.75**2, 0.78
 # Chi-squared of three terms of curvature, for pixels whose noise is independent.
 _CHI2_LIMIT = chi2_quantile(3, 0.99)
-# Rows and columns from one pixel that is looked at to the next.
-_STRIDE = 2
 
 
 def find_curved(
     regions: NDArray[np.uint16],
+    first: FirstPlanes,
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
@@ -50,6 +41,8 @@ def find_curved(
     ----------
     regions : (H, W) uint16
         0...M, 0 for no region.
+    first : FirstPlanes
+        Of the regions.
     image : RangeImage
         (H, W).
     blocks : Blocks
@@ -63,17 +56,14 @@ def find_curved(
     (M + 1,) bool
         Never true for 0.
     """
-    count = int(regions.max(initial=0)) + 1
-    filled = fill(regions)
-    arrays = regions, filled, image.inverse, image.rays, blocks, sensor
-    moments = np.add(*map_halves(_sum_moments, len(filled), *arrays, count))
-    theta, _ = fit_all(moments)
+    filled, moments, theta = first
     covered = np.maximum(moments[:, COUNT], 1)
     ratio = moments[:, RATIO] / covered
     # A residual is the region's up to noise and twice the distortion.
     limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
-    parts = map_halves(_normal_equations, len(filled), *arrays, theta, slope, limit)
+    arrays = regions, filled, image.inverse, image.rays, blocks, sensor, theta, slope, limit
+    parts = map_halves(_normal_equations, len(filled), *arrays)
     powers, right, sizes = (a + b for a, b in zip(*parts, strict=True))
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
     return _bent(covered, ratio, powers, right, sizes, around, alike, float(flatness))
@@ -109,47 +99,6 @@ def _bent(
         wide = flatness**2 * area * covered[k] / size
         result[k] = visible and bending * (scale / size) ** 2 > wide
     return result
-
-
-@njit(cache=True, nogil=True)
-def _sum_moments(
-    first: int,
-    after: int,
-    regions: NDArray[np.uint16],
-    filled: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    blocks: Blocks,
-    sensor: SensorModel,
-    count: int,
-) -> NDArray[np.float64]:
-    """Moments (count, 13), weighted, of each region in some rows of blocks.
-
-    Their numbers are of all pixels of the blocks, as holes make no region smaller.
-    """
-    height, width = regions.shape
-    total = np.zeros((count, SIZE))
-    for bi in range(first, after):
-        for bj in range(filled.shape[1]):
-            label, squared = int(filled[bi, bj]), blocks.squared[bi, bj]
-            if label > 0 and squared > 0:
-                weight = 1 / random_variance(sensor, squared)
-                for entry in range(CHI2 + 1):
-                    total[label, entry] += weight * blocks.moments[bi, bj, entry]
-                total[label, COUNT] += BLOCK**2
-                total[label, RATIO] += BLOCK**2 * weight * systematic_variance(sensor, squared)
-            if label > 0:
-                continue
-            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):
-                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), _STRIDE):
-                    label, y = int(regions[i, j]), float(inverse[i, j])
-                    if label == 0 or y == 0:
-                        continue
-                    weight = _STRIDE**2 / random_variance(sensor, y * y)
-                    ratio = weight * systematic_variance(sensor, y * y)
-                    add_pixel(total[label], rays[i, j], y, weight, ratio)
-                    total[label, COUNT] += _STRIDE**2
-    return total
 
 
 @njit(cache=True, nogil=True)
@@ -220,8 +169,8 @@ def _normal_equations(
                 areas += pixels * area * slope[label]
                 deviations += pixels * deviation / slope[label]
                 continue
-            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), _STRIDE):
-                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), _STRIDE):
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), STRIDE):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), STRIDE):
                     label, value = int(regions[i, j]), float(inverse[i, j])
                     if label == 0 or value == 0 or slope[label] == 0:
                         continue
@@ -231,7 +180,7 @@ def _normal_equations(
                     for m in range(3):
                         residual -= theta[label, m] * rays[i, j, m]
                     residual /= np.sqrt(variance)
-                    square, pixels = residual * residual, float(_STRIDE**2)
+                    square, pixels = residual * residual, float(STRIDE**2)
                     if square <= limit[label]:
                         x, y = (2 * j - width) / width, (2 * i - height) / width
                         a, b = pixels * x * x, pixels * residual

@@ -14,8 +14,9 @@ from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.interior import Inside
+from rangeseg_ros.core.fitting.interior import interior
 from rangeseg_ros.core.regions import by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
@@ -105,19 +106,25 @@ def segment(
     return Labelling(labels.reshape(image.shape), sensor, problem, models)
 
 
-def drop_curved(
+def flat_regions(
     regions: NDArray[np.uint16],
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
     flatness: float,
-) -> NDArray[np.uint16]:
-    """Regions (H, W) without those that bend, numbered anew; see `find_curved`."""
-    return drop_regions(regions, find_curved(regions, image, blocks, sensor, flatness))
+) -> tuple[NDArray[np.uint16], FirstPlanes]:
+    """Regions (H, W) without those that bend, numbered anew, and their first planes.
+
+    See `find_curved`.
+    """
+    first = FirstPlanes.of(regions, image, blocks, sensor)
+    curved = find_curved(regions, first, image, blocks, sensor, flatness)
+    return drop_regions(regions, curved), first.without(curved)
 
 
 def unite_regions(
     regions: NDArray[np.uint16],
+    first: FirstPlanes,
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
@@ -129,6 +136,8 @@ def unite_regions(
     ----------
     regions : (H, W) uint16
         0...M.
+    first : FirstPlanes
+        Of the regions.
     image : RangeImage
         (H, W).
     blocks : Blocks
@@ -136,9 +145,9 @@ def unite_regions(
     sensor : SensorModel
     grid : Grid
     """
-    inside, count = Inside.of(regions), int(regions.max(initial=0)) + 1
-    borders = submit(find_borders, regions, grid, count, inside.inner)
-    fits = Fits.of(regions, image, sensor, blocks, inside)
+    inner, count = interior(regions, first.filled), len(first.theta)
+    borders = submit(find_borders, regions, grid, count, inner)
+    fits = Fits.of(regions, image, sensor, blocks, first, inner)
     group = group_coplanar(fits, borders.result())
     if (group == np.arange(count)).all():
         return regions, fits

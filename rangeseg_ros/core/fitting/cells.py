@@ -104,8 +104,8 @@ def _regions(start: NDArray[np.intp], sums: NDArray[np.float64]) -> NDArray[np.f
 @njit(cache=True, nogil=True)
 def measure_regions(
     labels: NDArray[np.uint16], inner: NDArray[np.uint16], count: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Bounding box of each label, the number of pixel sides along its border, that of its pixels.
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Bounding box of each label, and the number of pixel sides along its border.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def measure_regions(
     """
     height, width = labels.shape
     box = np.zeros((count, 4), np.intp)
-    border, area = np.zeros(count, np.intp), np.zeros(count, np.intp)
+    border = np.zeros(count, np.intp)
     for i in range(height):
         within = inner[i // BLOCK]
-        before, begin, j = 0, 0, 0
+        before, j = 0, 0
         while j < width:
             if within[j // BLOCK] > 0:
                 j = (j // BLOCK + 1) * BLOCK
@@ -133,21 +133,19 @@ def measure_regions(
             if label != before:
                 border[label] += 1
                 border[before] += 1
-                area[before] += j - begin
                 _reach(box[before], i, j)
                 if label > 0:
                     if box[label, 3] == 0:
                         box[label, 0], box[label, 1] = i, j
                     box[label, 1] = min(box[label, 1], j)
-                before, begin = label, j
+                before = label
             j += 1
-        area[before] += width - begin
         _reach(box[before], i, width)
         border[before] += 1
     for j in range(width):
         border[labels[height - 1, j]] += 1
     box[0] = 0
-    return box, border, area
+    return box, border
 
 
 @njit(cache=True)

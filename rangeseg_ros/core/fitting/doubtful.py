@@ -47,7 +47,7 @@ def sums_without_doubtful(
     cells : Cells
         Empty, of M + 1 regions.
     labels, image, sensor, blocks
-        As for `first_sums.sums_of_blocks`.
+        As for `FirstPlanes.of`.
     theta : (M + 1, 3) float64
         First planes.
     inner : (rows, columns) uint16

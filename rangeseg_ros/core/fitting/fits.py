@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
 from rangeseg_ros.core.fitting.doubtful import sums_without_doubtful
-from rangeseg_ros.core.fitting.first_sums import first_sums, sums_of_blocks
-from rangeseg_ros.core.fitting.interior import Inside
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
+from rangeseg_ros.core.fitting.interior import interior
 from rangeseg_ros.core.fitting.uncertainty import (
     Field,
     pairs,
@@ -20,7 +20,6 @@ from rangeseg_ros.core.fitting.uncertainty import (
     systematic_field,
     theta_covariances,
 )
-from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, cofactors, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -80,7 +79,8 @@ class Fits(NamedTuple):
         image: RangeImage,
         sensor: SensorModel,
         blocks: Blocks | None = None,
-        inside: Inside | None = None,
+        first: FirstPlanes | None = None,
+        inner: NDArray[np.uint16] | None = None,
     ) -> Fits:
         """Fit a plane to every region.
 
@@ -101,18 +101,18 @@ class Fits(NamedTuple):
             Errors of the image.
         blocks : Blocks, optional
             Of the image, where they are known.
-        inside : Inside, optional
-            Of the labels, where it is known.
+        first : FirstPlanes, optional
+            Of the labels, where they are known.
+        inner : (rows, columns) uint16, optional
+            Blocks inside regions, see `interior`, where they are known.
         """
         blocks = blocks or Blocks.of(image)
-        filled, inner = inside or Inside.of(labels)
-        count = int(labels.max(initial=0)) + 1
-        measures = submit(measure_regions, labels, inner, count)
-        sums = sums_of_blocks(image, sensor, blocks, filled, count)
-        box, border, area = measures.result()
-        first = _theta(first_sums(sums, labels, image, sensor, area))
+        first = first or FirstPlanes.of(labels, image, blocks, sensor)
+        if inner is None:
+            inner = interior(labels, first.filled)
+        cells = Cells.empty(*measure_regions(labels, inner, len(first.theta)))
         cells, pixels, outliers, explained = sums_without_doubtful(
-            Cells.empty(box, border), labels, image, first, sensor, blocks, inner
+            cells, labels, image, first.theta, sensor, blocks, inner
         )
         sums = cells.regions()
         theta, inverse = _solved(sums, image.camera is not None)

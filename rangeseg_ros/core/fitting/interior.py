@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -13,19 +11,6 @@ from rangeseg_ros.core.sensing.blocks import BLOCK
 
 RIM = 2
 """Pixels from another region up to which a pixel may be its neighbour's."""
-
-
-class Inside(NamedTuple):
-    """Blocks (rows, columns) of regions, see `fill` and `interior`."""
-
-    filled: NDArray[np.uint16]
-    inner: NDArray[np.uint16]
-
-    @classmethod
-    def of(cls, labels: NDArray[np.uint16]) -> Inside:
-        """Those of labels (H, W)."""
-        filled = fill(labels)
-        return cls(filled, interior(labels, filled))
 
 
 def fill(labels: NDArray[np.uint16]) -> NDArray[np.uint16]:
