@@ -5,14 +5,17 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)
 
+# Most tests keep one core busy. All tests of a file run in the same process.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
+
 .PHONY: test quick demo demo-ros lint docs release-check clean
 
 test: $(VENV)/installed
-	$(BIN)/python -m pytest
+	$(PYTEST)
 
 # Without the tests that take long or need ROS 2.
 quick: $(VENV)/installed
-	$(BIN)/python -m pytest -m 'not slow and not ros'
+	$(PYTEST) -m 'not slow and not ros'
 
 demo: $(VENV)/installed
 	rm -rf demo

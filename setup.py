@@ -128,6 +128,7 @@ setup(
             'mcap>=1.2.1',
             'pytest>=7.4',
             'pytest-timeout>=2.2',
+            'pytest-xdist>=3.3',
         ],
         'dask': ['distributed>=2023.1'],
         'view': ['rerun-sdk>=0.23'],
