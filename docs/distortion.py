@@ -68,6 +68,13 @@ def halves(folder):
 
 def simulated(name, count):
     """Error of what is learned, and how it compares with the standard deviation stated."""
+    true, error, ratio = errors(name, count)
+    print(f'{count} frames: true {true:.5f} / m, error {error:.5f} / m')
+    print(f'that is {error / true:.0%}; error / standard deviation {ratio:.2f}')
+
+
+def errors(name, count):
+    """Root mean squares: the true error, that of what is learned, and this by its deviation."""
     camera, segmenter, seen = camera_of(name), Segmenter(), []
     for seed in ROOMS:
         room = kinect_room(seed)
@@ -86,9 +93,7 @@ def simulated(name, count):
         field = field + learned.slope * (inverse - learned.reference)
     true = without_plane(true_error(name, camera, inverse), known)
     off = without_plane(field.astype(float) - true, known)[known]
-    ratio = rms(off / learned.deviation[known])
-    print(f'{len(seen)} frames: true {rms(true[known]):.5f} / m, error {rms(off):.5f} / m')
-    print(f'that is {rms(off) / rms(true[known]):.0%}; error / standard deviation {ratio:.2f}')
+    return rms(true[known]), rms(off), rms(off / learned.deviation[known])
 
 
 def true_error(name, camera, inverse):

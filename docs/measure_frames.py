@@ -43,6 +43,7 @@ class Frame(NamedTuple):
     image: RangeImage
     labels: np.ndarray
     planes: list
+    terrain: np.ndarray
     pose: Transform
     faces: np.ndarray
 
@@ -52,14 +53,15 @@ def walked(scene: Scene, seed: int) -> Iterator[Frame]:
     sequence = SequenceSegmenter(CONFIG)
     for k in range(0, FRAMES * STEP, STEP):
         view = simulate_kinect(scene, frame=k, seed=seed, sensor_seed=seed)
+        pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
         image = RangeImage.from_depth(view.depth, view.camera)
         stamp = SECOND + k * SECOND // 30
-        found = sequence.segment(image, stamp)
+        found = sequence.segment(image, stamp, up=pose.rotation[2])
         number = np.full(int(view.labels.max()) + 1, -1)
         for plane in view.planes:
             number[plane.label] = plane.face
-        pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
-        yield Frame(stamp, image, found.labels, found.planes, pose, number[view.labels])
+        seen = found.labels, found.planes, found.terrain
+        yield Frame(stamp, image, *seen, pose, number[view.labels])
 
 
 def room_of(seed: int) -> Scene:

@@ -108,3 +108,31 @@ def test_command_resumes(tmp_path, monkeypatch):
     assert len(measured) == 1 + 4 + 1 and measured[3] == measured[4]
     unknown = CliRunner().invoke(command, [*map(str, arguments[:4]), '--constant', 'a._B'])
     assert unknown.exit_code == 1 and 'no constant a._B' in unknown.output
+
+
+@pytest.mark.parametrize(
+    ('program', 'found'),
+    [
+        (
+            'import json\n'
+            'from rangeseg_ros.core.tracking.tracker import _GATE\n'
+            "print(json.dumps({'gate': _GATE}))",
+            {'gate': CONSTANTS['tracking/tracker._GATE'].value / 2},
+        ),
+        ('print("no figures")', None),
+        ('raise SystemExit(1)', None),
+    ],
+)
+def test_script_measures_the_changed_package(program, found, tmp_path):
+    script = tmp_path / 'figures.py'
+    script.write_text(program)
+    trial = Trial(CONSTANTS['tracking/tracker._GATE'], 0.5, (), (), tmp_path / 'cache', script)
+    assert trial.run() == found
+    # Another program is another trial.
+    script.write_text('print("{}")')
+    assert trial.run() == {}
+
+
+def test_command_needs_something_to_measure(tmp_path):
+    done = CliRunner().invoke(command, ['sensitivity', '--output', str(tmp_path)])
+    assert done.exit_code == 2 and '--script' in done.output

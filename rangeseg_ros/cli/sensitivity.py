@@ -15,7 +15,7 @@ from rangeseg_ros.tasks import run_all
 
 
 @click.command()
-@click.argument('folders', metavar='DIR...', nargs=-1, required=True, type=options.FOLDER)
+@click.argument('folders', metavar='DIR...', nargs=-1, type=options.FOLDER)
 @options.params
 @options.method
 @click.option(
@@ -29,6 +29,11 @@ from rangeseg_ros.tasks import run_all
     '--table',
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help='Only those of kind d in this table: docs/method.md.',
+)
+@click.option(
+    '--script',
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help='Python program that prints more figures, 1 at best, as JSON: docs/quality.py.',
 )
 @click.option(
     '--factor',
@@ -52,6 +57,7 @@ def command(
     method: str | None,
     names: tuple[str, ...],
     table: Path | None,
+    script: Path | None,
     factors: tuple[float, ...],
     output: Path,
     jobs: int | None,
@@ -63,18 +69,22 @@ def command(
     a minute to two. Let it run overnight: interrupted, it resumes. Of terrains it counts what is
     found of ground, obstacles and drops.
     """
+    if not folders and not script:
+        raise click.UsageError('give a set, DIR, or --script')
     chosen = _chosen(names, table)
     arguments = ['--method', method] if method else []
     if params_file:
         arguments += ['--params', str(params_file.resolve())]
     trials = [
-        Trial(constant, factor, folders, tuple(arguments), output / 'cache')
+        Trial(constant, factor, folders, tuple(arguments), output / 'cache', script)
         for factor in (1.0, *factors)
         for constant in chosen
     ]
     results = list(options.progress(run_all(trials, jobs), len(trials), 'trial'))
     if any(r is None for t, r in zip(trials, results, strict=True) if t.factor == 1):
-        raise click.ClickException('the sets cannot be segmented: try `rangeseg evaluate`')
+        raise click.ClickException(
+            'sets or script fail: try `rangeseg evaluate`, and the script by itself'
+        )
     rows = ranges(trials, results)
     write_csv(output / 'sensitivity.csv', rows)
     for row in rows:

@@ -1,8 +1,8 @@
 """How far a constant of the core may move before results get worse.
 
 A constant is compiled into the kernels that read it, and into those that call them. So each trial
-runs `rangeseg evaluate` on all sets in a copy of the package in which that one expression is
-changed, with all compiled code: the copy itself sees which of it is outdated.
+runs `rangeseg evaluate` on all sets, and a program of one's own, in a copy of the package in which
+that one expression is changed, with all compiled code: the copy sees which of it is outdated.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rangeseg_ros.io.files import replacing
 
 PACKAGE = Path(__file__).parents[1]
 TOLERATED_LOSS = 0.003
-"""Mean IoU that a constant may cost within its range."""
+"""Mean IoU, or another share, that a constant may cost within its range."""
 _FOUND = 'ground_kept', 'obstacle_found', 'drop_found'
 
 
@@ -124,6 +124,9 @@ class Trial:
         More of its arguments.
     cache : Path
         Folder of finished trials: what is there is not done again.
+    script : Path, optional
+        A Python program that measures the package that it imports, and prints an object of JSON:
+        names of figures, 1 at best.
     """
 
     constant: Constant
@@ -131,12 +134,13 @@ class Trial:
     folders: tuple[Path, ...]
     arguments: tuple[str, ...]
     cache: Path
+    script: Path | None = None
 
     def run(self) -> dict[str, float] | None:
-        """How good each set is, by its path; None where the segmenter fails.
+        """How good each set is, by its path, and what the script says; None where either fails.
 
-        That is the mean IoU at tolerance 0.8, and of terrains the mean of what is found of ground,
-        obstacles and drops.
+        Of a set that is the mean IoU at tolerance 0.8, of terrains the mean of what is found of
+        ground, obstacles and drops.
         """
         path = self.cache / f'{self._key()}.json'
         if not path.exists():
@@ -151,25 +155,35 @@ class Trial:
         with tempfile.TemporaryDirectory() as temporary:
             copy, result = Path(temporary), Path(temporary, 'figures.json')
             write_changed(self.constant, self.factor, copy)
-            code = 'from rangeseg_ros.cli.main import main; main()'
-            command = [sys.executable, '-c', code, 'evaluate', '--jobs', '1', '--tolerance', '0.8']
-            command += ['--json', str(result), *self.arguments]
             environment = {**os.environ, 'PYTHONPATH': str(copy)}
             environment.pop('NUMBA_CACHE_DIR', None)
-            found = {}
-            for folder in self.folders:
-                words = [*command, str(folder.resolve())]
-                done = subprocess.run(words, env=environment, cwd=copy, capture_output=True)
-                if done.returncode:
-                    return None
-                found[str(folder)] = _quality(json.loads(result.read_text()))
+
+            def python(*words: str) -> bytes:
+                command = [sys.executable, *words]
+                return subprocess.run(
+                    command, env=environment, cwd=copy, capture_output=True, check=True
+                ).stdout
+
+            code = 'from rangeseg_ros.cli.main import main; main()'
+            evaluate = ['-c', code, 'evaluate', '--jobs', '1', '--tolerance', '0.8']
+            evaluate += ['--json', str(result), *self.arguments]
+            found: dict[str, float] = {}
+            try:
+                for folder in self.folders:
+                    python(*evaluate, str(folder.resolve()))
+                    found[str(folder)] = _quality(json.loads(result.read_text()))
+                if self.script:
+                    found |= json.loads(python(str(self.script.resolve())))
+            except (subprocess.CalledProcessError, ValueError):
+                return None
             return found
 
     def _key(self) -> str:
         # Without a change, all constants are alike.
         constant = '' if self.factor == 1 else str(self.constant)
         sets = [str(folder.resolve()) for folder in self.folders]
-        words = constant, self.factor, sets, self.arguments
+        script = self.script.read_text() if self.script else ''
+        words = constant, self.factor, sets, self.arguments, script
         return hashlib.sha256(code_digest() + repr(words).encode()).hexdigest()[:16]
 
 
