@@ -234,15 +234,11 @@ def _descend(
             label = around[k] if k < 4 else np.int32(0)
             if label == here:
                 continue
-            # What the edges alone cost rules most labels out.
-            total = np.float64(0)
+            data = np.float32(data_cost(int(label), int(p), problem, models))
+            total = np.float64(data)
             for m in range(4):
                 if around[m] != label:
                     total += link[m]
-            if total >= least:
-                continue
-            data = np.float32(data_cost(int(label), int(p), problem, models))
-            total += np.float64(data)
             if total < least:
                 least, labels[p], cost[p] = total, label, data
         if labels[p] == here:
