@@ -167,12 +167,12 @@ def _terrain(
     """The same for an image whose columns are along up; `turned` where up is down in it."""
     size = CellSize.of(image.shape)
     cells = cells_of(image, size, up, sensor)
-    measured = submit(levels_of, cells, cells.inverse > 0)
     noise = noise_of(cells, sensor)
     least = min(limits.obstacle, limits.drop)
     slope = float(np.tan(limits.slope + limits.tilt))
     steps = Steps.of(slope, least, noise, sensor.correlation / size.rows)
     surface, count, steep, broken, links = surfaces_of(cells, steps)
+    measured = submit(levels_of, cells, cells.inverse > 0)
     under = stand(cells, surface, count, up, sensor, known, limits.slope, limits.tilt)
     if under.surface == 0:
         return _without_ground(image, cells, size, steep, up, known, limits)
@@ -187,16 +187,16 @@ def _terrain(
     own &= ~(fallen | risen)
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
-    seen = levels_of(cells, ground)
-    field = GroundField.of(ground_field(seen, measured.result(), under.theta), size, up)
-    height = cell_heights(cells, field, size)
+    plane = under.theta
+    continued = submit(_continued, cells, ground, measured.result(), plane, size, up)
     part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
     part[steep | ground] = 0
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
-    near, low = around(ground), height <= steps.least
+    near = around(ground)
     for _ in range(2):
         surface, count = join_cells(links, part)
+        field, height = continued.result()
         beyond = np.zeros(count + 1, np.bool_)
         beyond[surface[fallen]] = True
         sizes, side, blur, width = sides_of(height, unsure, surface, near, count)
@@ -206,16 +206,14 @@ def _terrain(
         level = large & (np.abs(side) <= steps.least) & ~hidden
         # Most of the columns around have risen and the ground goes on in others: what is as low
         # as ground may be is looked at by itself, or a box beside it would be level with it.
-        mixed = risen & low & level.take(surface)
+        mixed = risen & (height <= steps.least) & level.take(surface)
         if not mixed.any():
             break
         part[mixed] = 1
         risen &= ~mixed
     if level.any():
         ground |= level.take(surface)  # several times faster than level[surface]
-        seen = levels_of(cells, ground)
-        field = GroundField.of(ground_field(seen, measured.result(), under.theta), size, up)
-        height = cell_heights(cells, field, size)
+        continued = submit(_continued, cells, ground, measured.result(), plane, size, up)
     # Little pieces among the ground are its noise.
     verdict = np.where(beyond, np.int8(UNKNOWN), np.int8(GROUND))
     verdict[0] = UNKNOWN
@@ -235,8 +233,9 @@ def _terrain(
         verdict[beside & ~large & (verdict == GROUND)] = HIDDEN
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
-    foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
     kind = np.where(ground, np.int8(GROUND), verdict.take(surface))
+    field, height = continued.result()
+    foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
     doubt = decide(kind, fallen, foot, height, unsure, _EXCUSED * least)
     bounds = limits.obstacle / 2, limits.drop / 2
     classes, heights = pixels_of(image, field, size, Said(kind, doubt, unsure), bounds)
@@ -247,6 +246,20 @@ def _terrain(
         under = under._replace(confidence=under.confidence * ends)
     below = CellTerrain(cells.place, height, kind, unsure, turned)
     return Terrain(classes, heights, under, field, below)
+
+
+def _continued(
+    cells: Cells,
+    ground: NDArray[np.bool_],
+    measured: list[NDArray[np.float64]],
+    plane: NDArray[np.float64],
+    size: CellSize,
+    up: NDArray[np.float64],
+) -> tuple[GroundField, NDArray[np.float32]]:
+    """The ground everywhere, and the heights of cells above it."""
+    theta = ground_field(levels_of(cells, ground), measured, plane)
+    field = GroundField.of(theta, size, up)
+    return field, cell_heights(cells, field, size)
 
 
 def _without_ground(

@@ -10,6 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.bridges import SPAN
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
@@ -67,13 +68,13 @@ def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
     -------
     (B,) float64, one for each of `BASELINES`.
     """
-    bends, counts = _bends_of(cells.inverse, sensor)
+    few = len(BASELINES) // 2
+    longer = submit(_spreads, cells.inverse, sensor, few, len(BASELINES))
+    spreads = _spreads(cells.inverse, sensor, 0, few) + longer.result()
     found = np.ones(len(BASELINES))
-    for b, count in enumerate(map(int, counts)):
-        if count:
-            rank = int(0.4 * count)
-            # Of a normal distribution, 40 % lie within 0.524 standard deviations.
-            found[b] = np.sqrt(np.partition(bends[b, :count], rank)[rank] / 6) / 0.524
+    for b, spread in enumerate(spreads):
+        if spread is not None:
+            found[b] = spread
         elif b:
             found[b] = found[b - 1]
         # Never less than at shorter ones, nor than rounding makes.
@@ -81,16 +82,34 @@ def noise_of(cells: Cells, sensor: SensorModel) -> NDArray[np.float64]:
     return found
 
 
+def _spreads(
+    inverse: NDArray[np.float32], sensor: SensorModel, first: int, after: int
+) -> list[float | None]:
+    """Standard deviations at baselines first...after; None where nothing tells."""
+    found = []
+    bends, counts = _bends_of(inverse, sensor, first, after)
+    for bend, count in zip(bends, map(int, counts), strict=True):
+        rank = int(0.4 * count)
+        # Of a normal distribution, 40 % lie within 0.524 standard deviations.
+        found.append(
+            np.sqrt(np.partition(bend[:count], rank)[rank] / 6) / 0.524 if count else None
+        )
+    return found
+
+
 @njit(cache=True, nogil=True)
 def _bends_of(
-    inverse: NDArray[np.float32], sensor: SensorModel
+    inverse: NDArray[np.float32], sensor: SensorModel, first: int, after: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Squares of second differences over their variance, (B, N), and how many are known, (B,)."""
+    """Squares of second differences over their variance, (B, N), and how many are known, (B,).
+
+    Of the B baselines first...after.
+    """
     rows, columns = inverse.shape
-    bends = np.empty((len(BASELINES), -(-rows // 2) * -(-columns // 4)))
-    counts = np.zeros(len(BASELINES), np.int64)
-    for b in range(len(BASELINES)):
-        k, count = BASELINES[b], 0
+    bends = np.empty((after - first, -(-rows // 2) * -(-columns // 4)))
+    counts = np.zeros(after - first, np.int64)
+    for b in range(after - first):
+        k, count = BASELINES[first + b], 0
         for i in range(k, rows - k, 2):
             for c in range(0, columns, 4):
                 above, middle, below = inverse[i - k, c], inverse[i, c], inverse[i + k, c]

@@ -113,7 +113,7 @@ def _most_probable(
     See `stand`, and a, b, c of `_scores`.
     """
     height, doubt = known
-    sizes, reach, steepest = _reaches(cells, surface, count + 1)
+    sizes, reach, steepest = _reaches(cells, surface, count + 1, height == 0)
     order = np.flatnonzero(sizes >= SAMPLES)
     if len(order) == 0:
         return 0, 0.0, 0.0, 0.0, 0.0
@@ -136,22 +136,26 @@ def _most_probable(
 
 @njit(cache=True, nogil=True)
 def _reaches(
-    cells: Cells, surface: NDArray[np.int32], count: int
+    cells: Cells, surface: NDArray[np.int32], count: int, steepness: bool
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Cells of surfaces, least horizontal distance, metres, least ratio of it to the depth."""
+    """Cells of surfaces, least horizontal distance, metres, least ratio of it to the depth.
+
+    The ratio only where `steepness` is asked for; inf otherwise.
+    """
     sizes = np.zeros(count, np.int64)
-    reach = np.full(count, np.inf)
+    nearest = np.full(count, np.float32(np.inf))
     ratio = np.full(count, np.inf)
     for i in range(surface.shape[0]):
         for c in range(surface.shape[1]):
             k = surface[i, c]
             if k:
                 z, x, y = cells.place[0, i, c], cells.place[1, i, c], cells.place[2, i, c]
-                way = np.sqrt(x * x + y * y)
+                square = x * x + y * y
                 sizes[k] += 1
-                reach[k] = min(reach[k], way)
-                ratio[k] = min(ratio[k], way / max(-z, np.float32(1e-3)))
-    return sizes, reach, ratio
+                nearest[k] = min(nearest[k], square)
+                if steepness:
+                    ratio[k] = min(ratio[k], np.sqrt(square) / max(-z, np.float32(1e-3)))
+    return sizes, np.sqrt(nearest).astype(np.float64), ratio
 
 
 @njit(cache=True, nogil=True)
