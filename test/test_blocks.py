@@ -59,7 +59,7 @@ def test_slopes_do_not_need_the_rays_of_holes(hole):
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
-@pytest.mark.parametrize('size', [3, 4])
+@pytest.mark.parametrize('size', [2, 3, 4])
 def test_blocks_of_any_size_add_up(shape, size):
     """Of images wider than what is summed at a time, with holes where no ray is."""
     inverse, rays, _ = grid(*shape)

@@ -65,6 +65,21 @@ def test_accuracy_on_simulated_rooms(noise, mean_iou, share):
         assert np.max(normals) <= 2.0
 
 
+@pytest.mark.parametrize(
+    ('width', 'height', 'mean_iou', 'share'), [(160, 120, 0.9, 0.87), (80, 60, 0.7, 0.7)]
+)
+def test_small_images_show_the_same_faces(width, height, mean_iou, share):
+    overlaps = []
+    for seed in range(900, 906):
+        frame = room(seed, width=width, height=height)
+        result = segmented(frame.depth, frame.camera)
+        least = round(1000 * width * height / 307200)
+        overlaps.append(as_truth(frame.labels, least).compare(result.labels))
+    correct = sum(classify(overlap, 0.8).counts()['correct'] for overlap in overlaps)
+    assert overlap_figures(overlaps)['mean_iou'] >= mean_iou
+    assert correct >= share * sum(len(overlap.truth) for overlap in overlaps)
+
+
 def annotated_frames():
     return sorted(ANNOTATED.glob('*/truth.png'))
 

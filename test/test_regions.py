@@ -36,14 +36,19 @@ def test_components_of_random_images(seed):
     assert pairs.shape[1] == count == len(np.unique(found))
 
 
-def test_noise_is_less_than_two_pixels_per_pixel_of_perimeter():
-    """7 x 7: 49 pixels, 24 of them on the perimeter; 6 x 6: 36 and 20."""
-    regions = np.ones((7, 13), np.int32)
-    regions[:, 7:] = 3
-    regions[:6, 7:] = 2
-    everywhere = np.ones(regions.shape, np.bool_)
-    found = plane_regions(regions, everywhere, uncut(regions.shape), 'identify', 1)
-    assert np.array_equal(found, np.where(regions == 1, 1, 0))
+@pytest.mark.parametrize(('shape', 'least'), [((480, 640), 7), ((960, 1280), 7), ((60, 80), 3)])
+def test_thin_regions_are_noise(shape, least):
+    """7 x 7: 49 pixels, 24 of them on the perimeter; 6 x 6: 36 and 20.
+
+    A small image shows all regions smaller; what has an inner pixel is none of its noise.
+    """
+    labels = np.zeros(shape, np.int32)
+    for k in range(1, 10):
+        labels[10 : 10 + k, 7 * k : 7 * k + k] = k
+    everywhere = np.ones(shape, np.bool_)
+    found = plane_regions(labels, everywhere, uncut(shape), 'identify', 1)
+    kept = {k for k in range(1, 10) if found[labels == k].all()}
+    assert kept == set(range(least, 10))
 
 
 def test_merge_erodes_towards_the_majority():

@@ -10,6 +10,9 @@ from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import CHUNK, Grid
 
+# Pixels of an image of the ABW set, which the thesis's experiments are about.
+_IMAGE = 512 * 512
+
 
 def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
     """Pixels of the smallest plane: `min_pixels`, or for 0 what follows the size of the image.
@@ -47,7 +50,7 @@ def plane_regions(
     regions = connected_components(labels, grid, valid)
     area, perimeter = _measures(regions)
     if noise_regions != 'leave':
-        noise = _thin(area, perimeter)
+        noise = _thin(area, perimeter, regions.shape)
         if noise_regions == 'merge':
             regions = merge(regions, noise)
             area = np.bincount(regions.ravel(), minlength=len(area))
@@ -192,9 +195,16 @@ def _renumber(first: int, after: int, found: NDArray[np.int32], number: NDArray[
             found[i, j] = number[found[i, j]]
 
 
-def _thin(area: NDArray[np.int64], perimeter: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Regions of fewer than two pixels per pixel of the perimeter (thesis eq. 6.3); never 0."""
-    noise = area < 2 * perimeter
+def _thin(
+    area: NDArray[np.int64], perimeter: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Regions of fewer than two pixels per pixel of the perimeter (thesis eq. 6.3); never 0.
+
+    In images as large as the thesis's, or larger: a smaller one shows the same strip narrower. But
+    transitions between two surfaces are a pixel or two wide at any size, without inner pixels.
+    """
+    least = 2 * min(float(np.sqrt(shape[0] * shape[1] / _IMAGE)), 1.0)
+    noise = (area < least * perimeter) | (area == perimeter)
     noise[0] = False
     return noise
 

@@ -78,11 +78,14 @@ class Nodes(NamedTuple):
 
 
 def block_size(shape: tuple[int, int]) -> int:
-    """Rows and columns of the blocks: 3 pixels below half of VGA, 4 up to twice VGA, 8 above.
+    """Rows and columns of the blocks: 2 pixels below an eighth of VGA, 3 below half of it, 8 above
+    twice VGA, and 4 between.
 
     Blocks of 4 pixels find faces 10 pixels wide; a larger image shows the same face larger, a
     smaller one smaller.
     """
+    if shape[0] * shape[1] < VGA / 8:
+        return 2
     if shape[0] * shape[1] < VGA / 2:
         return 3
     return 4 if shape[0] * shape[1] <= 2 * VGA else 8

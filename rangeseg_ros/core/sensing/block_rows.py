@@ -71,15 +71,19 @@ def _deal(lanes: NDArray[np.float64], entry: int, row: NDArray[np.float32], size
     """Deal the pixels of a row out to the blocks, and 0 where it ends."""
     entries = lanes[entry * LANES : (entry + WIDEST) * LANES]
     whole = min(len(row) // size, LANES)
-    # Blocks of 4 and of 3 pixels, each at a distance that the compiler knows.
+    # Blocks of 4, 3 and 2 pixels, each at a distance that the compiler knows.
     if size == WIDEST:
         for b in range(whole):
             for k in range(WIDEST):
                 entries[k * LANES + b] = row[WIDEST * b + k]
-    else:
+    elif size == WIDEST - 1:
         for b in range(whole):
             for k in range(WIDEST - 1):
                 entries[k * LANES + b] = row[(WIDEST - 1) * b + k]
+    else:
+        for b in range(whole):
+            for k in range(WIDEST - 2):
+                entries[k * LANES + b] = row[(WIDEST - 2) * b + k]
     for b in range(whole, LANES):
         for k in range(size):
             j = b * size + k

@@ -53,7 +53,7 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(cls, image: RangeImage, size: int = BLOCK) -> Blocks:
-        """Blocks of `size` pixels, 3 or 4."""
+        """Blocks of `size` pixels, 2 to 4."""
         height, width = image.shape
         blocks = cls._empty(-(-height // size), -(-width // size))
         rays = image.inverse, image.rays, image.pinhole
