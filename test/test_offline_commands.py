@@ -1,6 +1,7 @@
 """The commands segment, pack and replay, as a user starts them."""
 
 import csv
+import re
 import signal
 import subprocess
 import sys
@@ -49,6 +50,16 @@ def test_segment_writes_labels_overlay_and_planes(folder, run):
     assert {int(row['label']) for row in rows} == set(np.unique(labels)) - {0}
     assert 'depth/10.png: no plane: no valid depth' in output
     assert cv2.imread('out/here/2_overlay.png').shape == (48, 64, 3)
+
+
+def test_segment_says_what_the_sensor_errs_by(folder, run):
+    depth = 1500 + np.random.default_rng(0).normal(0, 4, (48, 64))
+    write_image(folder / 'depth' / '3.png', np.rint(depth).astype(np.uint16))
+    arguments = 'segment', 'depth/3.png', '--camera', 'camera.yaml', '--output', 'out'
+    code, output, _ = run(*arguments, '--sensor')
+    assert code == 0
+    (said,) = re.findall(r'^depth/3.png: noise ([.\d]+) 1/m', output, re.M)
+    assert float(said) == pytest.approx(0.004 / 1.5**2, rel=0.3)
 
 
 def test_segment_compiles_before_the_first_image_and_for_its_parameters(folder, run, monkeypatch):

@@ -260,3 +260,11 @@ def test_a_ranked_value_is_that_of_a_sort():
             for quantile in (0.0, rng.random(), 1.0):
                 expected = np.sort(values)[int(quantile * (len(values) - 1))]
                 assert ranked(values.copy(), quantile) == expected
+
+
+def test_what_is_said_of_the_errors():
+    width = 9 / (2 * np.sqrt(np.pi))
+    stereo = SensorModel(0.0034, 0.0, 0.1, width, 0.005, 0.0, 35.0)
+    assert str(stereo) == 'noise 0.0034 1/m, correlated over 9 px, distortion 0.005 1/m'
+    laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)
+    assert str(laser) == 'range noise 0.012 m, steps of 0.001 m'
