@@ -25,9 +25,10 @@ from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
 from rangeseg_ros.core.regions import least_pixels, plane_regions
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.bridges import bridge_holes
+from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, GridEdges, weights
 from rangeseg_ros.core.sensing.halving import doubled_edges, doubled_labels
@@ -224,6 +225,8 @@ class Segmenter:
 
     def _segment(self, image: RangeImage, config: Config, watch: Stopwatch) -> Segmentation:
         blocks = Blocks.of(image)
+        # Much of what tells the noise runs on one thread: on another one meanwhile.
+        holes = submit(find_holes, image.inverse)
         stated = sensor = SensorModel.from_config(config, image.shape)
         if config.sensor_model == 'measured':
             sensor = measured_sensor(image, blocks, sensor)
@@ -237,7 +240,7 @@ class Segmenter:
         if config.edge_step > 0:
             steps = np.full_like(steps, config.edge_step)
         # What was measured tells the planes; where they end is told with small holes bridged.
-        whole = bridge_holes(image, steps, slopes)
+        whole = bridge_holes(image, steps, slopes, holes.result())
         jumps = jump_edges(whole, config.jump_edges, steps, slopes)
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')

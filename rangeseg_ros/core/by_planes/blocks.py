@@ -69,10 +69,10 @@ class Nodes(NamedTuple):
             Rows and columns of a block.
         """
         rows, columns = blocks.squared.shape
-        right = np.zeros((rows, columns - 1), np.bool_)
-        below = np.zeros((rows - 1, columns), np.bool_)
-        moments = np.zeros_like(blocks.moments)
-        nodes = cls(moments, np.zeros((rows, columns)), right, below)
+        right = np.empty((rows, columns - 1), np.bool_)
+        below = np.empty((rows - 1, columns), np.bool_)
+        moments = np.empty_like(blocks.moments)
+        nodes = cls(moments, np.empty((rows, columns)), right, below)
         run_rows(_fill_in, rows, inverse, grid, blocks, sensor, size, nodes)
         return nodes
 
@@ -184,6 +184,8 @@ def _weigh(
         for j in range(whole.shape[1]):
             count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
             if not whole[i, j] or count < least:
+                nodes.moments[i, j] = 0
+                nodes.residual[i, j] = 0
                 continue
             level = random_variance(sensor, squared)
             tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level

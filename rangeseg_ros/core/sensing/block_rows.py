@@ -118,6 +118,7 @@ def store_sums(
     for b in range(len(moments)):
         for entry in range(COUNT + 1):
             moments[b, entry] = lanes[(_SUMS + entry) * LANES + b]
+        moments[b, COUNT + 1 :] = 0
         squared[b] = moments[b, CHI2] / max(moments[b, COUNT], 1.0)
         residual[b] = lanes[_RESIDUAL * LANES + b]
 

@@ -69,9 +69,9 @@ class Blocks(NamedTuple):
 
     @classmethod
     def _empty(cls, rows: int, columns: int) -> Blocks:
-        """To be filled in."""
-        moments = np.zeros((rows, columns, SIZE))
-        return cls(moments, *(np.zeros((rows, columns)) for _ in range(4)))
+        """To be filled in, all of it: clearing it here would keep the other threads waiting."""
+        moments = np.empty((rows, columns, SIZE))
+        return cls(moments, *(np.empty((rows, columns)) for _ in range(4)))
 
 
 @njit(cache=True, inline='always')
@@ -133,8 +133,8 @@ def merged_alone(blocks: Blocks, rays: NDArray[np.float32], size: int) -> Blocks
     """What `Blocks.merged` returns, for kernels and on one thread."""
     rows, columns = (blocks.squared.shape[0] + 1) // 2, (blocks.squared.shape[1] + 1) // 2
     shape = rows, columns
-    squared, across, down = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-    result = Blocks(np.zeros((rows, columns, SIZE)), squared, across, down, np.zeros(shape))
+    squared, across, down = np.empty(shape), np.empty(shape), np.empty(shape)
+    result = Blocks(np.empty((rows, columns, SIZE)), squared, across, down, np.empty(shape))
     _sum_blocks(0, rows, blocks.moments, rays, size, result)
     return result
 
@@ -160,6 +160,7 @@ def _store(
     for bj in range(begin, after):
         j = min(bj * size + size // 2, rays.shape[1] - 2)
         count = blocks.moments[bi, bj, COUNT]
+        blocks.across[bi, bj] = blocks.down[bi, bj] = 0
         if i < 0 or j < 0 or count <= 3:
             continue
         theta = block_plane(lanes, bj - begin)
