@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.runtime.threads import map_halves, run_rows, submit
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
 
 
 @pytest.fixture(params=[1, 2, 7])
@@ -49,6 +49,25 @@ def test_one_thread_is_the_callers_own(threads):
     workers = set()
     run_rows(lambda first, after: workers.add(threading.get_ident()), 100)
     assert workers == {threading.get_ident()}
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_frames_with_a_core_each_have_no_helpers(threads):
+    def workers():
+        found = set()
+        run_rows(lambda first, after: found.add(threading.get_ident()), 100)
+        found.add(submit(threading.get_ident).result())
+        return found
+
+    me = {threading.get_ident()}
+    with sharing_cores():
+        assert workers() > me
+        with sharing_cores():
+            assert workers() == me
+        assert workers() > me
+    with pytest.raises(ValueError), sharing_cores(), sharing_cores():
+        raise ValueError
+    assert workers() > me
 
 
 def test_errors_come_back():

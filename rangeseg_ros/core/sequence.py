@@ -95,13 +95,28 @@ class SequenceSegmenter:
         """
         if stamp < self._stamp:
             self._segmenter.reset()
+        return self.follow(self._segmenter.segment(image), image, stamp, up, pose, height)
+
+    def follow(
+        self,
+        result: Segmentation,
+        image: RangeImage,
+        stamp: int,
+        up: ArrayLike | None = None,
+        pose: Transform | None = None,
+        height: float | None = None,
+    ) -> Segmentation:
+        """Find the planes of the frames before in the `result` of a `Segmenter` for the next one.
+
+        As `segment` does, for segmenters that work on several frames at once.
+        """
+        if stamp < self._stamp:
             self._tracker.reset()
             self.map.clear('time has gone back')
             self._ground.forget()
             self._pose = None
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
-        result = self._segmenter.segment(image)
         planes = self._tracker.track(result.labels, result.planes, stamp, motion)
         planes = with_roles(planes, self.config, up)
         if self._tracker.contradicted:

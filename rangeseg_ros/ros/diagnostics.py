@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from threading import get_ident
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
@@ -60,24 +61,22 @@ class FrameTimes:
 
 
 class Activity:
-    """What the worker is doing, and since when.
-
-    Attributes
-    ----------
-    what : str
-        Empty while it waits for a frame.
-    """
+    """What threads are doing, and since when."""
 
     def __init__(self) -> None:
-        self.what = ''
-        self._since = time.monotonic()
+        self._doing: dict[int, tuple[float, str]] = {}
 
     def now(self, what: str = '') -> None:
-        """Begin something else."""
-        self.what, self._since = what, time.monotonic()
+        """Have this thread begin something else; nothing while it waits for a frame."""
+        if what:
+            self._doing[get_ident()] = time.monotonic(), what
+        else:
+            self._doing.pop(get_ident(), None)
 
     def __str__(self) -> str:
-        return f'{self.what} for {time.monotonic() - self._since:.1f} s' if self.what else ''
+        now = time.monotonic()
+        doing = sorted(self._doing.copy().values())
+        return ', '.join(f'{what} for {now - since:.1f} s' for since, what in doing)
 
 
 class FrameStatistics:
@@ -92,8 +91,8 @@ class FrameStatistics:
         Depth messages that never arrived.
     compiling : str
         How far the compilation of kernels is that frames wait for; empty when none do.
-    activity, publishing : Activity
-        Of the thread that segments, and of that which publishes.
+    activity : Activity
+        Of the threads that work on frames.
     pending : str
         What is being done with parameters that are not in use yet; empty when all are.
     problem : str
@@ -123,7 +122,7 @@ class FrameStatistics:
         self.dropped, self.refused = Window(), Window()
         self.losses = Losses()
         self.compiling = ''
-        self.activity, self.publishing = Activity(), Activity()
+        self.activity = Activity()
         self.pending = ''
         self.problem = ''
         self.sources: dict[str, str] = {}
@@ -197,7 +196,7 @@ class FrameStatistics:
 
     def doing(self) -> str:
         """What the threads are at; empty while they wait."""
-        parts = self.compiling, str(self.activity), str(self.publishing)
+        parts = self.compiling, str(self.activity)
         return ', '.join(part for part in parts if part)
 
     def lost(self, source: DepthInput) -> str:

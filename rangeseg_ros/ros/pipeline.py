@@ -1,4 +1,4 @@
-"""Frames to published results: one thread segments, another publishes what was found before."""
+"""Frames to published results: two at a time, published in their order."""
 
 from __future__ import annotations
 
@@ -6,52 +6,56 @@ import time
 import traceback
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import pairwise
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any, NamedTuple
 
+import cv2
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.odometry import Motion
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
-from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.runtime.pace import Pace
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.runtime.threads import sharing_cores
+from rangeseg_ros.core.segmenter import Segmentation, Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.make import make_rclpy
-from rangeseg_ros.messages.motion import odometry_message
-from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target
-from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
-from rangeseg_ros.ros.latest import HandOver
+from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.locator import Locator
+from rangeseg_ros.ros.order import Order
+from rangeseg_ros.ros.publication import Publication, Result
 from rangeseg_ros.ros.settings import Settings
 from rangeseg_ros.ros.waiting import WaitingRoom
 
-_MAP_INTERVAL = 1.0
-"""Seconds between messages of the map: it changes with every frame, and is not for control."""
+_AT_ONCE = 2
+"""Frames that are worked on at a time: one that comes before the last is done need not wait."""
 
 
-class Result(NamedTuple):
-    """A segmented frame; `ticks` are the times at which its parts began and ended, seconds."""
+class Work(NamedTuple):
+    """A frame that is being worked on, and what with; `began` in seconds."""
 
+    place: int
     frame: DepthFrame
+    segmenter: Segmenter
+    pace: Pace
+    began: float
+
+
+class Segmented(NamedTuple):
+    """What is known of a frame without those before; `found` is None where that is nothing."""
+
     image: RangeImage
-    segmentation: Segmentation
+    found: Segmentation | None
+    at: Placement
     start: int
     ticks: list[float]
-    target: tuple[str, Transform] | None = None
-    map: list[MapPlane] | None = None
-    motion: Motion | None = None
 
 
 class Pipeline:
-    """Segments the newest frame whenever it is free.
+    """Segments the newest frame whenever one of its threads is free.
 
     Parameters
     ----------
@@ -78,19 +82,26 @@ class Pipeline:
         odometry_publisher: Publisher,
     ) -> None:
         self._node = node
-        self._publishers = publishers
         self._settings = settings
         self._statistics = statistics
-        self._map_publishers = map_publishers
-        self._odometry_publisher = odometry_publisher
-        self._map_time = 0.0
+        self._publication = Publication(
+            publishers, settings, statistics, map_publishers, odometry_publisher
+        )
         self._frames: WaitingRoom[DepthFrame] = WaitingRoom(self._delay)
         self.locator = Locator(node, self._frames.look_again)
-        # Every result is published: the segmentation waits rather than replace one.
-        self._results: HandOver[Result] = HandOver()
+        self._order = Order()
+        self._beginning = Lock()
+        # Of the frame that was begun last.
+        self._pace = Pace(0.0, 1.0)
+        self._given: Config | None = None
+        self._segmenter = Segmenter()
+        # Of the frame that was done last.
+        self._sequence: SequenceSegmenter | None = None
+        self._ended = 0.0
+        self._size = 0
         self._threads = [
-            Thread(target=self._segment_all, name='segmentation', daemon=True),
-            Thread(target=self._publish_all, name='publication', daemon=True),
+            Thread(target=self._work_all, name='segmentation', daemon=True)
+            for _ in range(_AT_ONCE if cv2.getNumThreads() > 1 else 1)
         ]
         for thread in self._threads:
             thread.start()
@@ -103,64 +114,113 @@ class Pipeline:
             self._statistics.dropped.add(dropped - 1)
 
     def stop(self, patience: float) -> bool:
-        """Let the frame in hand be finished; False when it takes more seconds than that."""
+        """Let the frames in hand be finished; False when it takes more seconds than that."""
         self._frames.close()
-        self._results.close()
         end = time.monotonic() + patience
         for thread in self._threads:
             thread.join(max(0.0, end - time.monotonic()))
         return not any(thread.is_alive() for thread in self._threads)
 
-    def _segment_all(self) -> None:
-        if (config := self._settings.in_use()) is None:
+    def _work_all(self) -> None:
+        if self._settings.in_use() is None:
             return
-        given = config
-        sequence = SequenceSegmenter(config)
-        pace = Pace(config.target_rate, config.work_budget)
-        while taken := self._frames.take():
+        while work := self._begin():
+            segmented: Segmented | Exception
+            try:
+                with sharing_cores():
+                    segmented = self._segment(work)
+            except Exception as error:
+                segmented = error
+            with self._order.turn(work.place), sharing_cores():
+                before = self._size
+                self._finish(work, segmented)
+                # What the next frame needs memory for, and the system after a larger frame.
+                del work, segmented
+                if self._size < before:
+                    give_back_memory()
+
+    def _begin(self) -> Work | None:
+        """Take the newest frame, and the configuration that all of it is to be of."""
+        with self._beginning:
+            if not (taken := self._frames.take()):
+                return None
             began = time.perf_counter()
             frame, dropped = taken
             if dropped:
                 self._statistics.dropped.add(dropped)
-            # Here and not where parameters change, so that one frame is of one configuration.
             if (config := self._settings.in_use()) is None:
-                return
+                return None
+            pace = self._pace
             if (config.target_rate, config.work_budget) != (pace.rate, pace.most):
-                pace = Pace(config.target_rate, config.work_budget)
-            if config is not given or pace.budget != sequence.config.work_budget:
-                given = config
-                sequence.config = replace(config, work_budget=pace.budget)
-            try:
-                result = self._segment(sequence, frame)
-                self._statistics.problem = ''
-            except ValueError as error:
-                self._refuse(str(error))
-            # Whatever one frame does to the segmenter, the next one gets its chance.
-            except Exception as error:
-                self._fail(error)
-            else:
-                self._results.put(result)
-                refining = sum(result.segmentation.timings.values()) / 1000
-                pace.add(refining, time.perf_counter() - began - refining)
-                # What the next frame needs memory for.
-                del result
+                pace = self._pace = Pace(config.target_rate, config.work_budget)
+            budget = pace.budget
+            if config is not self._given or budget != self._segmenter.config.work_budget:
+                self._given = config
+                self._segmenter = Segmenter(replace(config, work_budget=budget))
+            return Work(self._order.line_up(), frame, self._segmenter, pace, began)
 
-    def _segment(self, sequence: SequenceSegmenter, frame: DepthFrame) -> Result:
+    def _segment(self, work: Work) -> Segmented:
+        """Do what needs no other frame."""
+        config, frame = work.segmenter.config, work.frame
         doing = self._statistics.activity.now
         doing('converting the message')
         ticks = [time.perf_counter()]
         start = self._node.get_clock().now().nanoseconds
-        image = corrected(frame.range_image(), sequence.config)
+        image = corrected(frame.range_image(), config)
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
-        at = self.locator.place(sequence.config, frame)
-        found = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
+        at = self.locator.place(config, frame)
+        # Which begins with the result of the frame before.
+        found = None if config.warm_start else work.segmenter.segment(image)
+        return Segmented(image, found, at, start, ticks)
+
+    def _finish(self, work: Work, segmented: Segmented | Exception) -> None:
+        """Do what takes frames one after the other, publishing included."""
+        try:
+            if isinstance(segmented, Exception):
+                raise segmented
+            result = self._follow(work, segmented)
+        except ValueError as error:
+            self._refuse(str(error))
+        # Whatever one frame does, the next one gets its chance.
+        except Exception as error:
+            self._fail(error)
+        else:
+            self._statistics.problem = ''
+            self._size = result.image.inverse.size
+            try:
+                self._publication.publish(result)
+            except Exception as error:
+                self._fail(error)
+            self._set_pace(work, result.segmentation)
+
+    def _follow(self, work: Work, segmented: Segmented) -> Result:
+        """Find the planes of the frames before in a frame."""
+        image, found, at, start, ticks = segmented
+        config = work.segmenter.config
+        if self._sequence is None:
+            self._sequence = SequenceSegmenter(config)
+        elif config is not self._sequence.config:
+            self._sequence.config = config
+        sequence = self._sequence
+        placed = work.frame.stamp, at.up, at.pose, at.height
+        if found is None:
+            found = sequence.segment(image, *placed)
+        else:
+            found = sequence.follow(found, image, *placed)
         self._tell(sequence, at)
         ticks.append(time.perf_counter())
-        doing()
-        target = (sequence.config.target_frame, at.target) if at.target else None
-        planes = self._map_to_send(sequence)
-        return Result(frame, image, found, start, ticks, target, planes, sequence.motion)
+        target = (config.target_frame, at.target) if at.target else None
+        planes = self._publication.map_to_send(sequence)
+        return Result(work.frame, image, found, start, ticks, target, planes, sequence.motion)
+
+    def _set_pace(self, work: Work, found: Segmentation) -> None:
+        """Take up how long a frame took, after the one before if they were worked on at once."""
+        ended = time.perf_counter()
+        seconds = ended - max(work.began, self._ended)
+        self._ended = ended
+        refining = sum(found.timings.values()) / 1000 / (ended - work.began)
+        work.pace.add(seconds * refining, seconds * (1 - refining))
 
     def _delay(self, frame: DepthFrame, waited: float) -> float:
         return self.locator.delay(self._settings.wanted, frame, waited)
@@ -178,81 +238,6 @@ class Pipeline:
             statistics.sources['odometry'] = f'{sequence.motion.held} planes'
         if statistics.missing:
             self._node.get_logger().warning(statistics.missing, throttle_duration_sec=5.0)
-
-    def _map_to_send(self, sequence: SequenceSegmenter) -> list[MapPlane] | None:
-        """The planes of the map, once a second while somebody listens."""
-        config = sequence.config
-        listeners = sum(p.get_subscription_count() for p in self._map_publishers.values())
-        now = time.monotonic()
-        if not config.map_frame or not listeners or now - self._map_time < _MAP_INTERVAL:
-            return None
-        self._map_time = now
-        return sequence.map.planes
-
-    def _publish_all(self) -> None:
-        before = 0
-        while result := self._results.take():
-            size = result.image.inverse.size
-            try:
-                self._publish(result)
-            except Exception as error:
-                self._fail(error)
-            del result
-            # Now, as nothing holds the larger frame any more.
-            if size < before:
-                give_back_memory()
-            before = size
-
-    def _publish(self, result: Result) -> None:
-        frame, image, found, start, ticks = result[:5]
-        doing = self._statistics.publishing.now
-        here = frame.message.header, found
-        there = in_target(make_rclpy, *here, *result.target) if result.target else here
-        for name, output in OUTPUTS.items():
-            publisher = self._publishers[name]
-            if publisher.get_subscription_count():
-                doing(f'publishing {name}')
-                if not self._settings.ready_for(name):
-                    return
-                header, shown = there if name in IN_TARGET else here
-                if output.serialised:
-                    publisher.publish(output.serialised(header, image, shown))
-                else:
-                    publisher.publish(output.message(make_rclpy, header, image, shown))
-        if result.motion and self._odometry_publisher.get_subscription_count():
-            message = odometry_message(make_rclpy, frame.message.header, result.motion)
-            self._odometry_publisher.publish(message)
-        if result.map is not None:
-            doing('publishing the map')
-            self._publish_map(result.map, frame.message.header.stamp)
-        doing()
-        times = [*ticks, time.perf_counter()]
-        conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(times))
-        statistics = self._statistics
-        statistics.times = FrameTimes(
-            transport=(frame.time - frame.stamp) / 1e6,
-            waiting=(start - frame.time) / 1e6,
-            conversion=conversion,
-            compute=compute,
-            publication=publication,
-            stages=found.timings,
-        )
-        statistics.planes = len(found.planes)
-        statistics.reason = found.reason
-        statistics.sensor = str(found.sensor)
-        statistics.work_budget = found.work_budget
-        statistics.tilt = str(found.tilt or '')
-        # Only what was worked out for a listener.
-        known = vars(found)
-        statistics.ground = str(known.get('ground', ''))
-        statistics.stairs = ', '.join(map(str, known.get('stairs', ())))
-        statistics.answered(statistics.published)
-
-    def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:
-        frame = self._settings.wanted.map_frame
-        header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
-        for name, (_, message) in MAP_OUTPUTS.items():
-            self._map_publishers[name].publish(message(make_rclpy, header, planes))
 
     def _refuse(self, problem: str) -> None:
         self._statistics.problem = problem

@@ -8,10 +8,12 @@ both.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
+from threading import Lock
 from typing import Any, TypeVar
 
 import cv2
@@ -35,13 +37,38 @@ if hasattr(os, 'register_at_fork'):  # not on Windows, which does not fork
     os.register_at_fork(after_in_child=_pool.cache_clear)
 
 
+_sharing = 0
+_lock = Lock()
+
+
+@contextmanager
+def sharing_cores() -> Iterator[None]:
+    """Work on one of several frames: threads that do so at the same time share the cores.
+
+    Where there is one core for each of them, they have no helpers, which would take from one frame
+    what they give to another.
+    """
+    global _sharing
+    with _lock:
+        _sharing += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _sharing -= 1
+
+
+def _cores() -> int:
+    return cv2.getNumThreads() // max(_sharing, 1)
+
+
 def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     """Run kernel(first, after, *arguments) on strips of the rows at the same time.
 
     What one strip writes no other may touch: then the result is the same for any number of
     threads.
     """
-    count = max(min(cv2.getNumThreads(), _MAX_THREADS, rows // _ROWS), 1)
+    count = max(min(_cores(), _MAX_THREADS, rows // _ROWS), 1)
     bounds = [rows * part // count for part in range(count + 1)]
     others = [
         _pool().submit(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])
@@ -76,7 +103,7 @@ def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
 
 def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:
     """Start a task that has no subtasks here, beside what the caller does until `result()`."""
-    if cv2.getNumThreads() > 1:
+    if _cores() > 1:
         return _pool().submit(task, *arguments)
     future: Future[T] = Future()
     future.set_result(task(*arguments))
