@@ -90,7 +90,7 @@ def find_holes(measured: NDArray[np.float32]) -> NDArray[np.int32]:
             continue
         here, missing = known[i % _ROWS, SPAN:], 0
         for j in range(width):
-            missing += here[j] ^ 1
+            missing += int(here[j] ^ 1)
         if missing == 0:
             continue
         between[:] = 0
@@ -110,7 +110,7 @@ def find_holes(measured: NDArray[np.float32]) -> NDArray[np.int32]:
             if eight[k] > 0:
                 for j in range(8 * k, min(8 * k + 8, width)):
                     places[count] = i * width + j
-                    count += between[j]
+                    count += int(between[j])
     return places[:count].copy()
 
 
