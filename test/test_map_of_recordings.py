@@ -74,7 +74,7 @@ def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
     recording.messages.sort(key=lambda message: message[0])
     path = tmp_path / f'recording{SUFFIXES[storage]}'
     recording.write(path, storage)
-    config = Config(fixed_frame='odom', gravity_frame='odom', min_pixels=100)
+    config = Config(fixed_frame='odom', gravity_frame='odom', min_pixels=300)
     outcome = Replay(path, tmp_path / 'out', config).run()
     assert outcome.mapped == 2 and not outcome.unlocated
     check(tmp_path / 'out')
@@ -93,7 +93,7 @@ def test_poses_in_files_become_a_map(tmp_path):
         f'image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_matrix: {{rows: 3, cols: 3, data: '
         f'[{FOCAL}, 0, 31.5, 0, {FOCAL}, 23.5, 0, 0, 1]}}\n'
     )
-    (tmp_path / 'p.yaml').write_text('min_pixels: 100\ngravity_frame: world\n')
+    (tmp_path / 'p.yaml').write_text('min_pixels: 300\ngravity_frame: world\n')
 
     def run(*words):
         result = CliRunner().invoke(rangeseg, list(map(str, words)))
