@@ -8,7 +8,8 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.description.planes import Plane
     from rangeseg_ros.core.meaning.roles import ROLES
     from rangeseg_ros.core.options import ConfigError
-    from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+    from rangeseg_ros.core.segmentation import Segmentation
+    from rangeseg_ros.core.segmenter import Segmenter
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
     from rangeseg_ros.io.corrections import corrected
@@ -38,7 +39,8 @@ _HOMES = {
     'core.description.planes': ('Plane',),
     'core.meaning.roles': ('ROLES',),
     'core.options': ('ConfigError',),
-    'core.segmenter': ('Segmentation', 'Segmenter'),
+    'core.segmentation': ('Segmentation',),
+    'core.segmenter': ('Segmenter',),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
     'io.corrections': ('corrected',),

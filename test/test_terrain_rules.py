@@ -14,7 +14,7 @@ from rangeseg_ros.core.meaning.ground_field import GroundField
 from rangeseg_ros.core.meaning.pixels import Said, pixels_of
 from rangeseg_ros.core.meaning.stairs import _find_level
 from rangeseg_ros.core.meaning.steps import BASELINES, Steps
-from rangeseg_ros.core.segmenter import STATED
+from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import Kinect

@@ -17,7 +17,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.tilt import Tilt
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import code_digest

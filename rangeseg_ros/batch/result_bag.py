@@ -16,7 +16,7 @@ from rosbags.typesys import Stores
 
 from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_writer import BagWriter
 from rangeseg_ros.io.chunks import Lost

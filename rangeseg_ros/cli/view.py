@@ -16,7 +16,7 @@ from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import segment_frames
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey

@@ -17,7 +17,8 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.memory import GroundMemory
 from rangeseg_ros.core.meaning.roles import roles, unit
 from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
 

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.digest import code_digest
 from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
 from rangeseg_ros.evaluation.hoover import classify

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rangeseg_ros.core.meaning.stairs import Stairs
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.io.files import replacing
 
 STAIRS = (

@@ -15,7 +15,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
 from rangeseg_ros.core.meaning.ground import Terrain
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import planes_message, points_message

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.messages.make import Make
 
 OK, WARN = 0, 1

@@ -34,6 +34,7 @@ from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.gravity import IMU_TOPIC
 from rangeseg_ros.ros.parameters import bind
 from rangeseg_ros.ros.pipeline import Pipeline
+from rangeseg_ros.ros.publication import Publication
 from rangeseg_ros.ros.seldom import SeldomCallbackGroup
 from rangeseg_ros.ros.settings import Settings
 
@@ -104,9 +105,10 @@ class SegmentPlanes(Node):
         # What follows a change of parameters is done by the executor, as are all subscriptions.
         self._changed = self.create_guard_condition(self._configure)
         self._settings = Settings(config, self._on_compiling, self._changed.trigger)
-        self._pipeline = Pipeline(
-            self, self._outputs, self._settings, self._statistics, self._maps, self._odometry
+        publication = Publication(
+            self._outputs, self._maps, self._odometry, self._settings, self._statistics
         )
+        self._pipeline = Pipeline(self, publication, self._settings, self._statistics)
         self.get_logger().info(self._waits_for())
 
     def stop(self, patience: float) -> bool:

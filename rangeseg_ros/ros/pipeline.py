@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Mapping
 from dataclasses import replace
 from threading import Lock, Thread
 from typing import Any, NamedTuple
 
 import cv2
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.runtime.pace import Pace
 from rangeseg_ros.core.runtime.threads import sharing_cores
-from rangeseg_ros.core.segmenter import Segmentation, Segmenter
+from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
@@ -60,11 +59,9 @@ class Pipeline:
     Parameters
     ----------
     node : rclpy.node.Node
-    publishers, map_publishers : mapping
-        By the names of `OUTPUTS` and `MAP_OUTPUTS`; what nobody subscribes to is not made.
+    publication : Publication
     settings : Settings
     statistics : FrameStatistics
-    odometry_publisher : rclpy.publisher.Publisher
 
     Attributes
     ----------
@@ -75,18 +72,14 @@ class Pipeline:
     def __init__(
         self,
         node: Node,
-        publishers: Mapping[str, Publisher],
+        publication: Publication,
         settings: Settings,
         statistics: FrameStatistics,
-        map_publishers: Mapping[str, Publisher],
-        odometry_publisher: Publisher,
     ) -> None:
         self._node = node
+        self._publication = publication
         self._settings = settings
         self._statistics = statistics
-        self._publication = Publication(
-            publishers, settings, statistics, map_publishers, odometry_publisher
-        )
         self._frames: WaitingRoom[DepthFrame] = WaitingRoom(self._delay)
         self.locator = Locator(node, self._frames.look_again)
         self._order = Order()

@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.segmenter import Segmentation
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.frames import DepthFrame
@@ -46,18 +46,18 @@ class Publication:
     ----------
     publishers, map_publishers : mapping
         By the names of `OUTPUTS` and `MAP_OUTPUTS`.
+    odometry_publisher : rclpy.publisher.Publisher
     settings : Settings
     statistics : FrameStatistics
-    odometry_publisher : rclpy.publisher.Publisher
     """
 
     def __init__(
         self,
         publishers: Mapping[str, Publisher],
-        settings: Settings,
-        statistics: FrameStatistics,
         map_publishers: Mapping[str, Publisher],
         odometry_publisher: Publisher,
+        settings: Settings,
+        statistics: FrameStatistics,
     ) -> None:
         self._publishers = publishers
         self._settings = settings

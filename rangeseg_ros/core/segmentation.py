@@ -1,0 +1,163 @@
+"""What is found in a range image: labels, planes, and what is worked out of them when read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.meaning.ramps import Ramp, ramps_of
+from rangeseg_ros.core.meaning.stairs import Stairs, stairs_of
+from rangeseg_ros.core.meaning.survey import Survey
+from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
+from rangeseg_ros.core.sensing.grid import GridEdges
+from rangeseg_ros.core.sensing.jump_edges import pixels_beside
+from rangeseg_ros.core.sensing.sensor import SensorModel
+
+STATED = SensorModel.from_config(Config())
+"""The sensor that the defaults describe."""
+
+
+class Labelling(Protocol):
+    """What a method labels the pixels with, as far as results are made of it."""
+
+    def energy(self) -> float:
+        """Value of eq. 5.3."""
+
+    def normals(self) -> NDArray[np.float32] | None:
+        """Normals (H, W, 3) that the labels stand for; None where the planes have them."""
+
+
+@dataclass(frozen=True, eq=False)
+class WorkedOut:
+    """A `Labelling` without the image it is of: what remains of it in a pickle."""
+
+    value: float
+    field: NDArray[np.float32] | None
+
+    def energy(self) -> float:
+        return self.value
+
+    def normals(self) -> NDArray[np.float32] | None:
+        return self.field
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """What was found in one range image.
+
+    Attributes
+    ----------
+    labels : (H, W) uint16
+        0 = no plane, otherwise the label of a plane.
+    planes : list of Plane
+        In the order of their labels.
+    timings : dict
+        Milliseconds per stage, in the order of the stages.
+    reason : str
+        Why there is no plane; empty when there is one.
+    sensor : SensorModel
+        Errors of the sensor, as the image shows them.
+    labelling : Labelling
+        What the regions were made from.
+    jumps : (horizontal, vertical) of bool or None
+        Edges of the grid that cross a jump; None where none were looked for.
+    survey : Survey or Terrain
+        How the ground is found, or what was found.
+    upright : tuple of 3 float
+        Tolerance, smallest area and slope of `tilt_of`.
+    work_budget : float
+        Share of the full work that the image was given: with the same, its labels are the same.
+    """
+
+    labels: NDArray[np.uint16]
+    planes: list[Plane]
+    timings: dict[str, float]
+    reason: str
+    sensor: SensorModel = STATED
+    labelling: Labelling = field(default=WorkedOut(0.0, None), repr=False)
+    jumps: GridEdges | None = field(default=None, repr=False)
+    survey: Survey | Terrain | None = field(default=None, repr=False)
+    upright: tuple[float, float, float] | None = None
+    work_budget: float = 1.0
+
+    @cached_property
+    def tilt(self) -> Tilt | None:
+        """Where the planes say that up is, when that is not what was stated; when read."""
+        if self.upright is None or not isinstance(self.survey, Survey):
+            return None
+        return tilt_of(self.planes, self.survey.up, *self.upright)
+
+    @cached_property
+    def normals(self) -> NDArray[np.float32]:
+        """Reconstructed surface normals (thesis 5.11), worked out when read.
+
+        (H, W, 3), unit vectors towards the sensor in the frame of the image: with method normals
+        the direction that the pixel was given, with method planes the normal of its plane. NaN
+        where there is no label.
+        """
+        normals = self.labelling.normals()
+        if normals is not None:
+            return np.where((self.labels > 0)[..., None], normals, np.float32(np.nan))
+        table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
+        for plane in self.planes:
+            table[plane.label] = plane.normal
+        return np.take(table, self.labels, axis=0)
+
+    @cached_property
+    def edges(self) -> NDArray[np.bool_]:
+        """(H, W) True on either side of a jump edge, worked out when read."""
+        if self.jumps is None:
+            return np.zeros(self.labels.shape, np.bool_)
+        return pixels_beside(self.jumps)
+
+    @cached_property
+    def ground(self) -> Terrain | None:
+        """The ground and what interrupts it, worked out when read; None where none was asked."""
+        return self.survey.terrain() if isinstance(self.survey, Survey) else self.survey
+
+    @cached_property
+    def stairs(self) -> list[Stairs]:
+        """Staircases in sight, up and down, worked out when read."""
+        if not isinstance(self.survey, Survey) or self.ground is None:
+            return []
+        return stairs_of(self.ground)
+
+    @property
+    def ramps(self) -> list[Ramp]:
+        """Ramps among planes that have roles."""
+        if self.survey is None:
+            return []
+        known = self.survey.up if isinstance(self.survey, Survey) else self.survey.field.up
+        return ramps_of(self.planes, known)
+
+    @property
+    def terrain(self) -> NDArray[np.uint8]:
+        """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
+        if self.ground is None:
+            return np.zeros(self.labels.shape, np.uint8)
+        return self.ground.classes
+
+    @property
+    def height(self) -> NDArray[np.float32]:
+        """(H, W) metres along up above the ground; NaN where that is not known."""
+        if self.ground is None:
+            return np.full(self.labels.shape, np.nan, np.float32)
+        return self.ground.height
+
+    @cached_property
+    def energy(self) -> float:
+        """Value of eq. 5.3 for the labelling the regions were made from, worked out when read."""
+        return self.labelling.energy()
+
+    def __getstate__(self) -> dict[str, Any]:
+        kept = WorkedOut(self.energy, self.labelling.normals())
+        survey, stairs = self.ground, self.stairs
+        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt}
+        return {**self.__dict__, 'labelling': kept, **found}
