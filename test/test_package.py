@@ -90,6 +90,11 @@ def test_launchers_match_the_console_scripts(setup_arguments):
         assert 'from {} import {}\n'.format(*target.split(':')) in launcher.read_text()
 
 
+def test_workers_import_the_launchers_and_run_nothing():
+    for launcher in (ROOT / 'scripts').iterdir():
+        runpy.run_path(str(launcher), run_name='__mp_main__')  # what multiprocessing calls it
+
+
 def test_launchers_run_with_the_python_of_the_environment(tmp_path):
     launcher = tmp_path / 'lib/rangeseg_ros/rangeseg'
     launcher.parent.mkdir(parents=True)
