@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.classes import DROP, GROUND
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.ground_field import GroundField, plane_at
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.rays import completed_rays
 
@@ -20,7 +19,12 @@ from rangeseg_ros.core.sensing.rays import completed_rays
 _TOLERANCE = 2.0
 
 
-def find_crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]) -> NDArray:
+def find_crossings(
+    image: RangeImage,
+    terrain: Terrain,
+    where: NDArray[np.bool_],
+    bounds: tuple[float, float] = (0.0, np.inf),
+) -> NDArray[np.float32]:
     """Points where rays cross the ground continued.
 
     Parameters
@@ -30,6 +34,8 @@ def find_crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]
     terrain : Terrain
     where : (H, W) bool
         Which rays; those that do not cross the ground in front of the sensor are left out.
+    bounds : (float, float)
+        Least and largest inverse range of the ground at a crossing, 1/m.
 
     Returns
     -------
@@ -37,11 +43,7 @@ def find_crossings(image: RangeImage, terrain: Terrain, where: NDArray[np.bool_]
         x, y, z in the frame of the image, metres, and the height of what was measured along the
         ray, NaN where nothing was.
     """
-    inverse = np.zeros(image.shape, np.float32)
-    run_rows(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
-    chosen = where & (inverse > 0)
-    points = image.rays[chosen] / inverse[chosen, None]
-    return np.column_stack([points, terrain.height[chosen]]).astype(np.float32)
+    return _cross(image.rays, where, terrain.height, terrain.field, bounds)
 
 
 def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
@@ -60,7 +62,8 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
     seen = terrain.classes == GROUND
     missing = ~image.valid if image.body is None else ~(image.valid | image.body)
     opened = cv2.morphologyEx(missing.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
-    if not seen.any():
+    bounds = _extremes(image.inverse, seen)
+    if bounds[1] == 0:
         return np.zeros((0, 4), np.float32)
     if image.camera is None:
         completed = completed_rays(image)
@@ -70,40 +73,79 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
         rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
         image = replace(image, rays=rays)
         opened[~completed[1]] = 0
-    found = find_crossings(image, terrain, opened > 0)
-    nearest, farthest = 1 / image.inverse[seen].max(), 1 / image.inverse[seen].min()
-    # Clouds measure along their rays, images along the optical axis.
-    depth = found[:, 2] if image.camera else np.linalg.norm(found[:, :3], axis=1)
-    return found[(depth >= nearest) & (depth <= farthest)]
+    return find_crossings(image, terrain, opened > 0, bounds)
 
 
 def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
     """Closed lines (N, 3) around the ground, metres, in the frame of the image."""
     ground = (terrain.classes == GROUND).astype(np.uint8)
     rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    inverse = np.zeros(image.shape, np.float32)
-    run_rows(_ground_inverse, image.shape[0], image.rays, terrain.field, inverse)
     lines = []
     for ring in rings:
-        columns, rows = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0].T
-        if len(rows) > 2:  # holes of single pixels have no outline
-            values = inverse[rows, columns]
-            ahead = values > 0
-            lines.append(image.rays[rows, columns][ahead] / values[ahead, None])
+        line = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0]
+        if len(line) > 2:  # holes of single pixels have no outline
+            lines.append(_cross_at(image.rays, line, terrain.field))
     return lines
 
 
+@njit(cache=True, inline='always')
+def _inverse(field: GroundField, rays: NDArray[np.float32], i: int, j: int) -> np.float32:
+    """Inverse range at which a ray crosses the ground; not positive where it does not."""
+    x, y, z = plane_at(field, i, j)
+    return np.float32(x * rays[i, j, 0] + y * rays[i, j, 1] + z * rays[i, j, 2])
+
+
 @njit(cache=True, nogil=True)
-def _ground_inverse(
-    first: int,
-    after: int,
+def _cross(
     rays: NDArray[np.float32],
+    where: NDArray[np.bool_],
+    height: NDArray[np.float32],
     field: GroundField,
-    inverse: NDArray[np.float32],
-) -> None:
-    """Inverse range at which rays cross the ground; not positive where they do not."""
-    for i in range(first, after):
-        for j in range(rays.shape[1]):
-            theta = plane_at(field, i, j)
-            ray = rays[i, j]
-            inverse[i, j] = theta[0] * ray[0] + theta[1] * ray[1] + theta[2] * ray[2]
+    bounds: tuple[float, float],
+) -> NDArray[np.float32]:
+    """See `find_crossings`."""
+    number = np.zeros(len(where), np.int64)
+    for i in range(len(where)):
+        for j in range(where.shape[1]):  # as vector instructions
+            number[i] += where[i, j]
+    found = np.empty((number.sum(), 4), np.float32)
+    count = 0
+    for i in np.flatnonzero(number):
+        for j in range(where.shape[1]):
+            if where[i, j]:
+                value = _inverse(field, rays, i, j)
+                if value > 0 and bounds[0] <= value <= bounds[1]:
+                    for n in range(3):
+                        found[count, n] = rays[i, j, n] / value
+                    found[count, 3] = height[i, j]
+                    count += 1
+    return found[:count]
+
+
+@njit(cache=True, nogil=True)
+def _cross_at(
+    rays: NDArray[np.float32], pixels: NDArray[np.int32], field: GroundField
+) -> NDArray[np.float32]:
+    """The same of some pixels (N, 2), each a column and a row."""
+    found = np.empty((len(pixels), 3), np.float32)
+    count = 0
+    for j, i in pixels:
+        value = _inverse(field, rays, i, j)
+        if value > 0:
+            for n in range(3):
+                found[count, n] = rays[i, j, n] / value
+            count += 1
+    return found[:count]
+
+
+@njit(cache=True, nogil=True)
+def _extremes(inverse: NDArray[np.float32], where: NDArray[np.bool_]) -> tuple[float, float]:
+    """Least and largest of some pixels' inverse range; inf, 0 where there are none."""
+    low = np.full(inverse.shape[1], np.float32(np.inf))
+    high = np.zeros(inverse.shape[1], np.float32)
+    for i in range(inverse.shape[0]):
+        for j in range(inverse.shape[1]):  # as vector instructions
+            value = inverse[i, j]
+            low[j] = min(low[j], value) if where[i, j] else low[j]
+            high[j] = max(high[j], value) if where[i, j] else high[j]
+    return low.min(), high.max()
