@@ -110,7 +110,9 @@ def _cross(
             number[i] += where[i, j]
     found = np.empty((number.sum(), 4), np.float32)
     count = 0
-    for i in np.flatnonzero(number):
+    for i in range(len(where)):
+        if number[i] == 0:
+            continue
         for j in range(where.shape[1]):
             if where[i, j]:
                 value = _inverse(field, rays, i, j)

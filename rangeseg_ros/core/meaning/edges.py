@@ -96,27 +96,35 @@ def _fallen(
     # Of each column: mean height of the ground before, where that is, or its last cell, whether an
     # edge was passed since, and whether it has fallen.
     near, (x, y) = np.full(columns, np.nan), np.zeros((2, columns))
-    edge, fallen = np.zeros((2, columns), np.bool_)
+    edge, fallen, level = np.zeros((3, columns), np.bool_)
     for m in range(rows):  # outwards
         i = m if turned else rows - 1 - m
-        # Between these cells and those before.
-        before = i if not turned else i - 1
+        # Between these cells and those before; the first cells have none before them.
+        before = max(i if not turned else i - 1, 0)
+        beyond = False
+        # As vector instructions, and what is rare by itself.
         for c in range(columns):
-            edge[c] |= before >= 0 and broken[before, c]
-            if np.isnan(height[i, c]) or steep[i, c]:
-                edge[c] |= steep[i, c]
-                continue
-            if edge[c]:
+            edge[c] |= broken[before, c] | steep[i, c]
+            level[c] = (height[i, c] == height[i, c]) & ~steep[i, c]
+            beyond |= edge[c] & level[c]
+        for c in range(columns if beyond else 0):
+            if edge[c] and level[c]:
                 far, ramp = _beyond(m, c, height, place, steps, steep, turned, fallen[c], x, y)
                 fallen[c] = near[c] - far > steps.least + ramp
                 edge[c] = False
-            result[i, c] = fallen[c]
-            if not fallen[c]:
-                first = np.isnan(near[c])
-                share = 1.0 if first or not rise else 1.0 / _MEAN
-                near[c] = height[i, c] if first else near[c] + (height[i, c] - near[c]) / _MEAN
-                x[c] += (place[1, i, c] - x[c]) * share
-                y[c] += (place[2, i, c] - y[c]) * share
+        for c in range(columns):
+            result[i, c] = fallen[c] & level[c]
+            first = near[c] != near[c]
+            share = 1.0 if first or not rise else 1.0 / _MEAN
+            own = height[i, c] if first else near[c] + (height[i, c] - near[c]) / _MEAN
+            ahead, aside = (
+                x[c] + (place[1, i, c] - x[c]) * share,
+                y[c] + (place[2, i, c] - y[c]) * share,
+            )
+            goes_on = level[c] & ~fallen[c]
+            near[c] = own if goes_on else near[c]
+            x[c] = ahead if goes_on else x[c]
+            y[c] = aside if goes_on else y[c]
     return result
 
 
