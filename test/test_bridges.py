@@ -17,6 +17,7 @@ HOLES = {
     'every second row': ROWS % 2 == 1,
     'every fourth column': COLUMNS % 4 == 3,
     'chequered': (ROWS + COLUMNS) % 2 == 1,
+    'registered 1.1 times larger': (ROWS % 11 == 10) | (COLUMNS % 11 == 10),
     'registered 1.33 times larger': (ROWS % 4 == 3) | (COLUMNS % 4 == 3),
 }
 
@@ -83,7 +84,7 @@ def test_an_image_without_holes_is_itself():
     assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
 
 
-@pytest.mark.parametrize('size', [(32, 24), (160, 120), (424, 240), (1280, 720)])
+@pytest.mark.parametrize('size', [(32, 24), (160, 120), (424, 240), (1280, 720), (1920, 1080)])
 def test_images_of_every_size_segment_alike(size):
     width, height = size
     focal = 0.9 * width

@@ -1,5 +1,6 @@
 """The node over real DDS: what it publishes, when, and by which quality of service."""
 
+import re
 import struct
 import subprocess
 import sys
@@ -206,6 +207,7 @@ def test_diagnostics_tell_where_the_time_goes(bench):
     assert min(times) >= 0 and sum(times) == pytest.approx(float(values['latency (ms)']), abs=0.05)
     stages = [float(values[key]) for key in values if key.startswith('compute: ')]
     assert stages and sum(stages) <= times[3] + 0.05
+    assert re.match(r'noise 0\.\d+ 1/m', values['sensor'])
     counts = [int(values[f'frames {what}']) for what in ('received', 'published')]
     assert counts[0] >= counts[1] > 0
 

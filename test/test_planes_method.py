@@ -201,6 +201,22 @@ def test_absurd_depths_disturb_nothing(value, where):
         assert ((result.labels > 0) == (expected.labels > 0))[away].mean() > 0.9
 
 
+@pytest.mark.parametrize(('distance', 'degrees'), [(2, 0), (2, 40), (4, 20)])
+def test_a_picture_ten_millimetres_before_a_wall_is_a_plane(distance, degrees):
+    camera = kinect_camera()
+    angle = np.radians(degrees)
+    wall = camera.rays @ np.array([np.sin(angle), 0.0, np.cos(angle)])
+    away = distance * np.cos(angle)
+    picture = np.zeros(camera.shape, bool)
+    picture[150:330, 200:460] = True
+    depth = np.where(picture, away - 0.01, away) / wall
+    labels = segmented(depth.astype(np.float32), camera).labels
+    here, there = labels[picture], labels[~picture]
+    hung, behind = np.bincount(here).argmax(), np.bincount(there).argmax()
+    assert hung != behind
+    assert (here == hung).mean() > 0.98 and (there == behind).mean() > 0.98
+
+
 def test_faces_of_twenty_pixels_are_planes_of_their_own():
     """Of 300 pixels of VGA in blocks, before a wall."""
     camera = kinect_camera()

@@ -69,6 +69,7 @@ def test_a_page_says_what_was_found(report):
     page = Page(report)
     assert '4 frames in 1.5 s, 2 planes in the median frame, 2 ids in all' in page.text
     assert 'file ends within a record' in page.text
+    assert re.search(r'Errors of the sensor, median over the frames: noise 0\.\d+ 1/m', page.text)
     assert 'frame 2: 2 planes' in page.text
     assert 'frame 3: no valid depth' in page.text
     assert re.search(r'without planes\s*number\s*reason\s*1\s*no valid depth', page.text)
