@@ -12,6 +12,7 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
@@ -62,8 +63,9 @@ def find_curved(
     # A residual is the region's up to noise and twice the distortion.
     limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
-    arrays = regions, filled, image.inverse, image.rays, blocks, sensor, theta, slope, limit
-    parts = map_halves(_normal_equations, len(filled), *arrays)
+    pixels = regions, filled, image.inverse, image.rays, image.pinhole
+    planes = blocks, sensor, theta, slope, limit
+    parts = map_halves(_normal_equations, len(filled), *pixels, *planes)
     powers, right, sizes = (a + b for a, b in zip(*parts, strict=True))
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
     return _bent(covered, ratio, powers, right, sizes, around, alike, float(flatness))
@@ -109,6 +111,7 @@ def _normal_equations(
     filled: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     blocks: Blocks,
     sensor: SensorModel,
     theta: NDArray[np.float64],
@@ -164,7 +167,7 @@ def _normal_equations(
                 s0, s1, s2 = s0 + pixels, s1 + pixels * x, s2 + a
                 s3, s4 = s3 + a * x, s4 + a * x * x
                 t0, t1, t2 = t0 + b, t1 + b * x, t2 + b * x * x
-                area, deviation = _size(middle, j, squared, variance, rays)
+                area, deviation = _size(middle, j, squared, variance, rays, pinhole)
                 squares += pixels * square
                 areas += pixels * area * slope[label]
                 deviations += pixels * deviation / slope[label]
@@ -176,9 +179,9 @@ def _normal_equations(
                         continue
                     squared = value * value
                     variance = random_variance(sensor, squared)
-                    residual = value
+                    residual, ray = value, ray_of(rays, pinhole, i, j)
                     for m in range(3):
-                        residual -= theta[label, m] * rays[i, j, m]
+                        residual -= theta[label, m] * ray[m]
                     residual /= np.sqrt(variance)
                     square, pixels = residual * residual, float(STRIDE**2)
                     if square <= limit[label]:
@@ -186,7 +189,7 @@ def _normal_equations(
                         a, b = pixels * x * x, pixels * residual
                         powers = pixels, pixels * x, a, a * x, a * x * x
                         add_terms(normal[label], right[label], y, powers, (b, b * x, b * x * x))
-                        area, deviation = _size(i, j, squared, variance, rays)
+                        area, deviation = _size(i, j, squared, variance, rays, pinhole)
                         area, deviation = area * slope[label], deviation / slope[label]
                         _add_size(total, label, pixels * square, pixels * area, pixels * deviation)
     return normal, right, total
@@ -204,7 +207,12 @@ def _add_size(
 
 @njit(cache=True, inline='always')
 def _size(
-    i: int, j: int, squared: float, variance: float, rays: NDArray[np.float32]
+    i: int,
+    j: int,
+    squared: float,
+    variance: float,
+    rays: NDArray[np.float32],
+    pinhole: bool,
 ) -> tuple[float, float]:
     """Area over |theta|, and standard deviation times |theta|, of a pixel on its plane.
 
@@ -215,12 +223,14 @@ def _size(
     if i == 0 or j == 0:
         return 0.0, deviation
     across = down = length = left = above = 0.0
+    own = ray_of(rays, pinhole, i, j)
+    before, over = ray_of(rays, pinhole, i, j - 1), ray_of(rays, pinhole, i - 1, j)
     for k in range(3):
-        across += (rays[i, j, k] - rays[i, j - 1, k]) ** 2
-        down += (rays[i, j, k] - rays[i - 1, j, k]) ** 2
-        length += rays[i, j, k] ** 2
-        left += rays[i, j - 1, k] ** 2
-        above += rays[i - 1, j, k] ** 2
+        across += (own[k] - before[k]) ** 2
+        down += (own[k] - over[k]) ** 2
+        length += own[k] ** 2
+        left += before[k] ** 2
+        above += over[k] ** 2
     # Rays of a cloud are 0 where nothing was measured.
     if min(length, left, above) == 0:
         return 0.0, deviation

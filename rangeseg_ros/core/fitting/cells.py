@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, NO_PIXEL, plus_pixel
+from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
 MAX_CELLS = 100
@@ -189,6 +190,7 @@ def add_pixels(
     after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     sensor: SensorModel,
     central: bool,
 ) -> None:
@@ -205,7 +207,8 @@ def add_pixels(
         w = 1 / random_variance(sensor, squared) if central else 1 / squared
         count += 1
         weight += w
-        x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
+        ray = ray_of(rays, pinhole, i, j)
+        x0, x1, x2 = float(ray[0]), float(ray[1]), float(ray[2])
         w0, w1, w2 = w0 + w * x0, w1 + w * x1, w2 + w * x2
         moments = plus_pixel(moments, x0, x1, x2, y, w)
         # Sums of the points and of their squares.

@@ -16,6 +16,7 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
     random_variance,
@@ -62,8 +63,9 @@ def sums_without_doubtful(
         Sums over whole regions, with their rims.
     """
     central = image.camera is not None
-    arrays = labels, image.inverse, image.rays, blocks, inner, cells, sensor, theta, central
-    (count, upper), (lower_count, lower) = map_halves(_sort, len(labels), *arrays)
+    pixels = labels, image.inverse, image.rays, image.pinhole
+    regions = blocks, inner, cells, sensor, theta, central
+    (count, upper), (lower_count, lower) = map_halves(_sort, len(labels), *pixels, *regions)
     count += lower_count
     explained = np.zeros((len(theta), RECORD))
     map_halves(_leave_out, len(theta), cells, count, upper, lower, explained)
@@ -77,6 +79,7 @@ def _sort(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     blocks: Blocks,
     inner: NDArray[np.uint16],
     cells: Cells,
@@ -104,7 +107,7 @@ def _sort(
             # No pixel is farther off than all together.
             left = squares_left(blocks.moments[bi, bj], theta[label])
             explained[bi, bj] = left <= OUTLIER**2 * variance or not _has_outliers(
-                bi * BLOCK, bj * BLOCK, inverse, rays, sensor, theta[label]
+                bi * BLOCK, bj * BLOCK, inverse, rays, pinhole, sensor, theta[label]
             )
             if explained[bi, bj] and bi >= first_block and squared > 0:
                 count[0, label] += int(blocks.moments[bi, bj, COUNT])
@@ -121,13 +124,13 @@ def _sort(
             j += 1
             if label == 0 or inverse[i, first] == 0:
                 continue
-            kind = _kind(i, first, labels, inverse, rays, inside, sensor, theta)
+            kind = _kind(i, first, labels, inverse, rays, pinhole, inside, sensor, theta)
             size = cells.size[label]
             end = min(first + size - (first - cells.origin[label, 1]) % size, width)
             pixels = 1
             while j < end and labels[i, j] == label and not within[j // BLOCK]:
                 if inverse[i, j] > 0:
-                    if _kind(i, j, labels, inverse, rays, inside, sensor, theta) != kind:
+                    if _kind(i, j, labels, inverse, rays, pinhole, inside, sensor, theta) != kind:
                         break
                     pixels += 1
                 j += 1
@@ -135,7 +138,7 @@ def _sort(
             if kind != _SURE:
                 count[kind, label] += pixels
             record = sums[kind, cell_of(cells, label, i, first)]
-            add_pixels(record, i, first, j, inverse, rays, sensor, central)
+            add_pixels(record, i, first, j, inverse, rays, pinhole, sensor, central)
     return count, sums
 
 
@@ -182,6 +185,7 @@ def _has_outliers(
     left: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     sensor: SensorModel,
     theta: NDArray[np.float64],
 ) -> bool:
@@ -191,8 +195,9 @@ def _has_outliers(
     for i in range(top, top + BLOCK):
         for j in range(left, left + BLOCK):
             y = float(inverse[i, j])
-            residual = y - theta[0] * rays[i, j, 0] - theta[1] * rays[i, j, 1]
-            residual -= theta[2] * rays[i, j, 2]
+            x0, x1, x2 = ray_of(rays, pinhole, i, j)
+            residual = y - theta[0] * x0 - theta[1] * x1
+            residual -= theta[2] * x2
             squared = y * y
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
             found |= (y > 0) & (residual * residual > OUTLIER**2 * variance)
@@ -206,6 +211,7 @@ def _kind(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     inside: NDArray[np.uint16],
     sensor: SensorModel,
     theta: NDArray[np.float64],
@@ -213,8 +219,9 @@ def _kind(
     """Kind of a measured pixel; `inside` are the blocks inside regions of its row of blocks."""
     label, y = labels[i, j], float(inverse[i, j])
     # No views of a ray and a plane: their references would be counted for every pixel.
-    residual = y - theta[label, 0] * rays[i, j, 0] - theta[label, 1] * rays[i, j, 1]
-    residual -= theta[label, 2] * rays[i, j, 2]
+    x0, x1, x2 = ray_of(rays, pinhole, i, j)
+    residual = y - theta[label, 0] * x0 - theta[label, 1] * x1
+    residual -= theta[label, 2] * x2
     squared = y * y
     variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
     if residual * residual > OUTLIER**2 * variance:

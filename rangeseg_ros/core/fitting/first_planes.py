@@ -20,6 +20,7 @@ from rangeseg_ros.core.sensing.moments import (
     fit_all,
 )
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 STRIDE = 2
@@ -63,8 +64,8 @@ class FirstPlanes(NamedTuple):
         sensor : SensorModel
         """
         filled, count = fill(labels), int(labels.max(initial=0)) + 1
-        arrays = labels, filled, image.inverse, image.rays, blocks, sensor, count
-        moments = np.add(*map_halves(_sum_moments, len(filled), *arrays))
+        pixels = labels, filled, image.inverse, image.rays, image.pinhole
+        moments = np.add(*map_halves(_sum_moments, len(filled), *pixels, blocks, sensor, count))
         return cls(filled, moments, fit_all(moments)[0])
 
     def without(self, dropped: NDArray[np.bool_]) -> FirstPlanes:
@@ -83,6 +84,7 @@ def _sum_moments(
     filled: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     blocks: Blocks,
     sensor: SensorModel,
     count: int,
@@ -115,6 +117,6 @@ def _sum_moments(
                         continue
                     weight = step**2 / random_variance(sensor, y * y)
                     ratio = weight * systematic_variance(sensor, y * y)
-                    add_pixel(total[label], rays[i, j], y, weight, ratio)
+                    add_pixel(total[label], ray_of(rays, pinhole, i, j), y, weight, ratio)
                     total[label, COUNT] += step**2
     return total

@@ -64,7 +64,7 @@ def plus_pixel(
 @njit(cache=True, inline='always')
 def add_pixel(
     moments: NDArray[np.float64],
-    ray: NDArray[np.float32],
+    ray: NDArray[np.float32] | tuple[Any, Any, Any],
     inverse: float,
     weight: float,
     ratio: float,
