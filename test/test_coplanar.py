@@ -4,7 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
+from rangeseg_ros.core.fitting.borders import find_borders
+from rangeseg_ros.core.fitting.coplanar import group_coplanar
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
@@ -27,8 +28,8 @@ def linked():
 
 def groups(regions, inverse, grid):
     fits = Fits.of(regions, RangeImage(CAMERA.rays, inverse, CAMERA), KINECT)
-    edges = find_borders(regions, grid, int(regions.max()) + 1, fits.inner)
-    return group_coplanar(fits, edges).tolist()
+    borders = find_borders(regions, grid, int(regions.max()) + 1)
+    return group_coplanar(fits, borders, KINECT.agreement).tolist()
 
 
 def stripes(*borders):

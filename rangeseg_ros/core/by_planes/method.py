@@ -13,10 +13,10 @@ from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.coplanar import find_borders, group_coplanar
+from rangeseg_ros.core.fitting.borders import find_borders
+from rangeseg_ros.core.fitting.coplanar import group_coplanar
 from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.interior import interior
 from rangeseg_ros.core.regions import by_falling_size, drop_regions, least_pixels, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
@@ -145,10 +145,10 @@ def unite_regions(
     sensor : SensorModel
     grid : Grid
     """
-    inner, count = interior(regions, first.filled), len(first.theta)
-    borders = submit(find_borders, regions, grid, count, inner)
-    fits = Fits.of(regions, image, sensor, blocks, first, inner)
-    group = group_coplanar(fits, borders.result())
+    count = len(first.theta)
+    borders = submit(find_borders, regions, grid, count)
+    fits = Fits.of(regions, image, sensor, blocks, first, borders)
+    group = group_coplanar(fits, borders.result(), sensor.agreement)
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)

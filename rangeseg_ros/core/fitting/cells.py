@@ -102,60 +102,6 @@ def _regions(start: NDArray[np.intp], sums: NDArray[np.float64]) -> NDArray[np.f
     return total
 
 
-@njit(cache=True, nogil=True)
-def measure_regions(
-    labels: NDArray[np.uint16], inner: NDArray[np.uint16], count: int
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Bounding box of each label, and the number of pixel sides along its border.
-
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        Below `count`.
-    inner : (rows, columns) uint16
-        Not 0 for blocks without a border, see `interior`.
-    count : int
-    """
-    height, width = labels.shape
-    box = np.zeros((count, 4), np.intp)
-    border = np.zeros(count, np.intp)
-    for i in range(height):
-        within = inner[i // BLOCK]
-        before, j = 0, 0
-        while j < width:
-            if within[j // BLOCK] > 0:
-                j = (j // BLOCK + 1) * BLOCK
-                continue
-            label = int(labels[i, j])
-            above = int(labels[i - 1, j]) if i > 0 else 0
-            if label != above:
-                border[label] += 1
-                border[above] += 1
-            if label != before:
-                border[label] += 1
-                border[before] += 1
-                _reach(box[before], i, j)
-                if label > 0:
-                    if box[label, 3] == 0:
-                        box[label, 0], box[label, 1] = i, j
-                    box[label, 1] = min(box[label, 1], j)
-                before = label
-            j += 1
-        _reach(box[before], i, width)
-        border[before] += 1
-    for j in range(width):
-        border[labels[height - 1, j]] += 1
-    box[0] = 0
-    return box, border
-
-
-@njit(cache=True)
-def _reach(box: NDArray[np.intp], row: int, after: int) -> None:
-    """Let a box reach to a row, and to the column before `after`."""
-    box[2] = max(box[2], row + 1)
-    box[3] = max(box[3], after)
-
-
 @njit(cache=True)
 def cell_of(cells: Cells, label: int, i: int, j: int) -> int:
     """Cell of a pixel of a region."""

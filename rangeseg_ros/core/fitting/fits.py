@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -9,7 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells, measure_regions
+from rangeseg_ros.core.fitting.borders import Borders, find_borders
+from rangeseg_ros.core.fitting.cells import POINT, SCATTER, Cells
 from rangeseg_ros.core.fitting.doubtful import sums_without_doubtful
 from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.interior import interior
@@ -20,7 +22,9 @@ from rangeseg_ros.core.fitting.uncertainty import (
     systematic_field,
     theta_covariances,
 )
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, cofactors, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -80,7 +84,7 @@ class Fits(NamedTuple):
         sensor: SensorModel,
         blocks: Blocks | None = None,
         first: FirstPlanes | None = None,
-        inner: NDArray[np.uint16] | None = None,
+        borders: Future[Borders] | None = None,
     ) -> Fits:
         """Fit a plane to every region.
 
@@ -103,14 +107,15 @@ class Fits(NamedTuple):
             Of the image, where they are known.
         first : FirstPlanes, optional
             Of the labels, where they are known.
-        inner : (rows, columns) uint16, optional
-            Blocks inside regions, see `interior`, where they are known.
+        borders : Future of Borders, optional
+            Of the labels, where they are asked for already.
         """
         blocks = blocks or Blocks.of(image)
         first = first or FirstPlanes.of(labels, image, blocks, sensor)
-        if inner is None:
-            inner = interior(labels, first.filled)
-        cells = Cells.empty(*measure_regions(labels, inner, len(first.theta)))
+        count = len(first.theta)
+        borders = borders or submit(find_borders, labels, weights(image), count)
+        inner = interior(labels, first.filled)
+        cells = Cells.empty(borders.result().box, borders.result().length)
         cells, pixels, outliers, explained = sums_without_doubtful(
             cells, labels, image, first.theta, sensor, blocks, inner
         )
@@ -118,7 +123,7 @@ class Fits(NamedTuple):
         theta, inverse = _solved(sums, image.camera is not None)
         covariance, middle = theta_covariances(cells, theta, inverse, sensor)
         systematic = systematic_field(sensor)
-        parts, start = np.arange(len(theta)), np.arange(len(theta) + 1)
+        parts, start = np.arange(count), np.arange(count + 1)
         counts = pixels, outliers, explained
         planes = theta, inverse, covariance, middle
         return cls(cells, parts, start, *counts, *planes, sensor, systematic, inner)
