@@ -17,7 +17,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     shifted_plane,
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at
-from rangeseg_ros.core.graphcut.sites import unlike_sites
+from rangeseg_ros.core.graphcut.sites import room_for_unlike, unlike_sites
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 
 REACH = 2
@@ -196,7 +196,7 @@ def _descend(
     """
     width = problem.width
     begin, end = rows[0] * width, rows[1] * width
-    offsets = np.array([1, width, -1, -width])
+    offsets = 1, width, -1, -width
     links = problem.links
     around = np.zeros(4, np.int32)
     link = np.zeros(4)
@@ -204,7 +204,7 @@ def _descend(
     queue = np.empty(max(end - begin, 1), np.int32)
     queued = np.zeros(end - begin, np.bool_)
     waiting = 0
-    marks, unlike = np.zeros((width + 7) // 8 * 8, np.uint8), np.empty(width, np.intp)
+    marks, unlike = room_for_unlike(width)
     for row in range(max(rows[0] - 1, 0), rows[1]):
         for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
             p = unlike[s]
@@ -219,7 +219,7 @@ def _descend(
     first, last = 0, waiting % len(queue)
     while waiting > 0:
         p = queue[first]
-        first = (first + 1) % len(queue)
+        first = first + 1 if first + 1 < len(queue) else 0
         waiting -= 1
         queued[p - begin] = False
         here = labels[p]
@@ -234,11 +234,11 @@ def _descend(
             label = around[k] if k < 4 else np.int32(0)
             if label == here:
                 continue
+            # Where the links alone cost too much, the data are not asked.
+            if _plus_links(np.float64(0), int(label), around, link) >= least:
+                continue
             data = np.float32(data_cost(int(label), int(p), problem, models))
-            total = np.float64(data)
-            for m in range(4):
-                if around[m] != label:
-                    total += link[m]
+            total = _plus_links(np.float64(data), int(label), around, link)
             if total < least:
                 least, labels[p], cost[p] = total, label, data
         if labels[p] == here:
@@ -248,5 +248,16 @@ def _descend(
             if link[k] > 0 and begin <= q < end and not queued[q - begin]:
                 queued[q - begin] = True
                 queue[last] = q
-                last = (last + 1) % len(queue)
+                last = last + 1 if last + 1 < len(queue) else 0
                 waiting += 1
+
+
+@njit(cache=True, inline='always')
+def _plus_links(
+    total: np.float64, label: int, around: NDArray[np.int32], link: NDArray[np.float64]
+) -> np.float64:
+    """A cost and those of the links to the neighbours `around`, as far as their labels differ."""
+    for k in range(4):
+        if around[k] != label:
+            total += link[k]
+    return total

@@ -137,8 +137,10 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     """What a label costs a measured pixel."""
     if label == 0:
         return NO_PLANE
-    row, column = p // problem.width // problem.block, p % problem.width // problem.block
-    plane = shifted_plane(label, shift_at(models.shifts, label, row, column), models)
+    # Unsigned and short, which divides in a fraction of the time.
+    place, width, block = np.uint32(p), np.uint32(problem.width), np.uint32(problem.block)
+    row, column = np.intp(place // width // block), np.intp(place % width // block)
+    plane = shifted_plane(label, shift_at(models.shifts, label, int(row), int(column)), models)
     return plane_cost(plane, p, problem)
 
 

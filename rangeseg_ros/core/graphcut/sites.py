@@ -74,7 +74,7 @@ def fronts(
     room = 4 * (after - first)
     beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
     found = 0
-    marks, unlike = np.zeros((width + 7) // 8 * 8, np.uint8), np.empty(width, np.intp)
+    marks, unlike = room_for_unlike(width)
     for row in range(max(rows[0] - 1, 0), rows[1]):
         for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
             p = unlike[s]
@@ -89,6 +89,13 @@ def fronts(
                         beside[found], sites[found] = labels[q], p
                         found += 1
     return group_sites(beside[:found], sites[:found], count)
+
+
+@njit(cache=True, nogil=True)
+def room_for_unlike(width: int) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
+    """`marks` and `sites` for `unlike_sites`, of rows so wide."""
+    room = (width + 7) // 8 * 8
+    return np.zeros(room, np.uint8), np.empty(room, np.intp)
 
 
 @njit(cache=True, nogil=True)
@@ -107,7 +114,7 @@ def unlike_sites(
     first, width : int
     marks : (m,) uint8
         Scratch: zeros, m the next multiple of eight from `width` on.
-    sites : (width,) int
+    sites : (m,) int
         Receives them.
 
     Returns
@@ -127,10 +134,10 @@ def unlike_sites(
     count = 0
     for k in range(len(eight)):
         if eight[k] != 0:
+            # Without branches, which no processor foretells here.
             for j in range(8 * k, 8 * k + 8):
-                if marks[j]:
-                    sites[count] = first + j
-                    count += 1
+                sites[count] = first + j
+                count += int(marks[j])
     return count
 
 
