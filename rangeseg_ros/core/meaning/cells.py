@@ -141,17 +141,21 @@ def _add_halves(
     number: NDArray[np.float32],
     sums: NDArray[np.float32],
 ) -> None:
-    """Sums of half cells from those of columns."""
-    half = size.columns // 2
+    """Sums of half cells from those of columns.
+
+    Two columns at once, as halves are multiples of two wide, with indices that have no sign.
+    """
+    one, two, pairs = np.uint64(1), np.uint64(2), np.uint64(size.columns // 4)
     for k in range(2):
         source = total if k == 0 else number
-        for side in range(2):
-            result = sums[3 + k, side]
-            result[:] = 0
-            for j in range(half):
-                part = source[side * half + j :: size.columns]
-                for c in range(len(result)):
-                    result[c] += part[c]
+        for c in range(sums.shape[2]):
+            for side in range(2):
+                j = np.uint64(2 * c + side) * two * pairs
+                value = source[j] + source[j + one]
+                for _ in range(pairs - one):
+                    j += two
+                    value = (value + source[j]) + source[j + one]
+                sums[3 + k, side, c] = value
 
 
 @njit(cache=True, inline='always')

@@ -25,8 +25,9 @@ from rangeseg_ros.core.meaning.ground_field import (
     ground_field,
     levels_of,
 )
-from rangeseg_ros.core.meaning.growth import grown, nearest_part
+from rangeseg_ros.core.meaning.growth import grown
 from rangeseg_ros.core.meaning.pixels import BLUR, Said, decide, pixels_of
+from rangeseg_ros.core.meaning.seed import nearest_part
 from rangeseg_ros.core.meaning.steps import BROAD, Steps, noise_of
 from rangeseg_ros.core.meaning.under_robot import Stand, stand
 from rangeseg_ros.core.runtime.threads import submit

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.meaning.cells import Cells
 from rangeseg_ros.core.meaning.steps import BROAD, Steps
-from rangeseg_ros.core.meaning.under_robot import NEAR, solve_plane
 from rangeseg_ros.core.significance import CERTAIN
 
 ROWS, COLUMNS = 2, 2
@@ -25,67 +24,11 @@ _BESIDE = (2, 1)
 _HIGH = 4
 # Cells that make a prediction: as many as two tiles have.
 _ENOUGH = 8
-# Cells that tell its plane.
-_PLENTY = 300
-
-
-@njit(cache=True, nogil=True)
-def nearest_part(
-    height: NDArray[np.float32],
-    place: NDArray[np.float32],
-    surface: NDArray[np.int32],
-    chosen: int,
-    tolerance: float,
-) -> NDArray[np.bool_]:
-    """Cells of a surface nearest to the robot that lie on one plane."""
-    rows, columns = surface.shape
-    nearest = np.inf
-    for i in range(rows):
-        for c in range(columns):
-            if surface[i, c] == chosen:
-                nearest = min(nearest, place[1, i, c] ** 2 + place[2, i, c] ** 2)
-    # It is grown from what is near to where it comes into view.
-    reach = (np.sqrt(nearest) + NEAR) ** 2
-    near = np.zeros((rows, columns), np.bool_)
-    count = 0
-    for i in range(rows):
-        for c in range(columns):
-            square = place[1, i, c] ** 2 + place[2, i, c] ** 2
-            near[i, c] = surface[i, c] == chosen and square <= reach
-            count += near[i, c]
-    # Some of them tell the plane as well as all.
-    step = max(count // _PLENTY, 1)
-    points = np.empty((3, -(-count // step)))
-    count = 0
-    for i in range(rows):
-        for c in range(columns):
-            if near[i, c]:
-                if count % step == 0:
-                    k = count // step
-                    points[0, k], points[1, k] = place[1, i, c], place[2, i, c]
-                    points[2, k] = height[i, c]
-                count += 1
-    x, y, h = points[0], points[1], points[2]
-    total = np.zeros(9)
-    p, q, r = np.median(h), 0.0, 0.0
-    for _ in range(3):
-        off = np.abs(h - p - q * x - r * y)
-        bound = max(tolerance, np.median(off))
-        total[:] = 0
-        for k in range(len(h)):
-            if off[k] <= bound:
-                entries = (1.0, x[k], y[k], x[k] * x[k], x[k] * y[k], y[k] * y[k], h[k])
-                for n in range(7):
-                    total[n] += entries[n]
-                total[7] += h[k] * x[k]
-                total[8] += h[k] * y[k]
-        p, q, r = solve_plane(total, 1e-9, 1e-9)
-    for i in range(rows):
-        for c in range(columns):
-            if near[i, c]:
-                off_plane = height[i, c] - p - q * place[1, i, c] - r * place[2, i, c]
-                near[i, c] = abs(off_plane) <= tolerance
-    return near
+# Sums over no cells: tuples, which the compiler keeps in registers.
+_NOTHING: tuple[float, ...] = (0.0,) * 10
+_NO_CELLS: tuple[float, ...] = (0.0,) * 4
+# Bits of the column of a tile in its number, and of its row.
+_BITS = 16
 
 
 def grown(
@@ -114,13 +57,9 @@ def grown(
     (rows, columns) bool
     """
     ground = seed.copy()
-    sums, rest, distance = _started(height, cells, candidate, seed)
-    # Numbers in the order of the distance, and then of the tiles: floats that are not negative
-    # are in the order of their bits.
-    tiles = np.flatnonzero(rest[..., 0])
-    keys = (distance.ravel()[tiles].view(np.int32).astype(np.int64) << 32) | tiles
-    keys.sort()
-    _grow(keys & 0xFFFFFFFF, height, cells, candidate, steps, sums, rest, ground)
+    sums, rest, order = _started(height, cells, candidate, seed)
+    order.sort()
+    _grow(order, height, cells, candidate, steps, sums, rest, ground)
     return ground
 
 
@@ -130,18 +69,19 @@ def _started(
     cells: Cells,
     candidate: NDArray[np.bool_],
     seed: NDArray[np.bool_],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
     """What the growth starts from.
 
     Returns
     -------
     sums : (M, columns of tiles, 10) float64
-        Of the ground in a block of tiles: sums of the regression.
+        Of the ground in a block of tiles and those above and below: sums of the regression.
     rest : (rows of tiles, columns of tiles, 4) float64
         Of the candidates in a tile that are not ground: their number, and sums of height and
         place.
-    distance : (rows of tiles, columns of tiles) float32
-        Of the nearest candidate of a tile, squared.
+    order : (N,) int64
+        Tiles with candidates that are not ground: the distance of the nearest one, then row and
+        column. Floats that are not negative are in the order of their bits.
     """
     rows, columns = height.shape
     place = cells.place
@@ -152,13 +92,23 @@ def _started(
     for i in range(rows):
         for c in range(columns):
             if seed[i, c]:
-                _add(sums, height, cells, i, c)
+                gain = _plus(_NOTHING, height, cells, i, c)
+                _add(sums, i // (ROWS * _HIGH), c // COLUMNS, gain)
             elif candidate[i, c]:
                 m, n = i // ROWS, c // COLUMNS
-                _count(rest[m, n], height, place, i, c, 1.0)
+                one = _plus_cell(_NO_CELLS, height, place, i, c)
+                for k in range(len(one)):
+                    rest[m, n, k] += one[k]
                 x, y = place[1, i, c], place[2, i, c]
                 distance[m, n] = min(distance[m, n], x * x + y * y)
-    return sums, rest, distance
+    order = np.empty(high * wide, np.int64)
+    bits, count = distance.view(np.int32), 0
+    for m in range(high):
+        for n in range(wide):
+            if rest[m, n, 0] > 0:
+                order[count] = (np.int64(bits[m, n]) << 32) | (m << _BITS) | n
+                count += 1
+    return sums, rest, order[:count]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -176,11 +126,10 @@ def _grow(
 
     Eight parameters: a kernel that changes three arrays.
     """
-    wide = rest.shape[1]
     for turn in range(2):
         for k in range(len(order)):
             tile = order[k] if turn == 0 else order[len(order) - 1 - k]
-            m, n = tile // wide, tile % wide
+            m, n = (tile >> _BITS) % (1 << _BITS), tile % (1 << _BITS)
             if rest[m, n, 0] > 0:
                 _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground)
 
@@ -231,70 +180,78 @@ def _grow_tile(
     if abs(off) > count * steps.least:
         return
     place = cells.place
+    gain, less = _NOTHING, _NO_CELLS
     for i in range(m * ROWS, min((m + 1) * ROWS, height.shape[0])):
         for c in range(n * COLUMNS, min((n + 1) * COLUMNS, height.shape[1])):
             if candidate[i, c] and not ground[i, c]:
                 expected = h + p * (place[1, i, c] - x) + q * (place[2, i, c] - y)
                 if abs(height[i, c] - expected) <= steps.least:
                     ground[i, c] = True
-                    _add(sums, height, cells, i, c)
-                    _count(rest[m, n], height, place, i, c, -1.0)
+                    gain = _plus(gain, height, cells, i, c)
+                    less = _plus_cell(less, height, place, i, c)
+    if less[0] > 0:
+        _add(sums, m // _HIGH, n, gain)
+        for k in range(len(less)):
+            rest[m, n, k] -= less[k]
+
+
+@njit(cache=True, inline='always')
+def _add(sums: NDArray[np.float64], b: int, n: int, gain: tuple[float, ...]) -> None:
+    """Add to the sums of a block and of those above and below it."""
+    for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
+        for k in range(len(gain)):
+            sums[i, n, k] += gain[k]
 
 
 @njit(cache=True, inline='always')
 def _around(sums: NDArray[np.float64], b: int, n: int) -> tuple[float, ...]:
     """Sums over three blocks by three, one by one, as the compiler keeps numbers in registers."""
     w = x = y = xx = xy = yy = h = xh = yh = number = 0.0
-    for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
-        for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
-            w += sums[i, j, 0]
-            x += sums[i, j, 1]
-            y += sums[i, j, 2]
-            xx += sums[i, j, 3]
-            xy += sums[i, j, 4]
-            yy += sums[i, j, 5]
-            h += sums[i, j, 6]
-            xh += sums[i, j, 7]
-            yh += sums[i, j, 8]
-            number += sums[i, j, 9]
+    for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
+        w += sums[b, j, 0]
+        x += sums[b, j, 1]
+        y += sums[b, j, 2]
+        xx += sums[b, j, 3]
+        xy += sums[b, j, 4]
+        yy += sums[b, j, 5]
+        h += sums[b, j, 6]
+        xh += sums[b, j, 7]
+        yh += sums[b, j, 8]
+        number += sums[b, j, 9]
     return w, x, y, xx, xy, yy, h, xh, yh, number
 
 
 @njit(cache=True, inline='always')
-def _count(
-    total: NDArray[np.float64],
+def _plus_cell(
+    total: tuple[float, ...],
     height: NDArray[np.float32],
     place: NDArray[np.float32],
     i: int,
     c: int,
-    sign: float,
-) -> None:
-    """Add a cell to the sums of a tile, or take it away."""
-    total[0] += sign
-    total[1] += sign * height[i, c]
-    total[2] += sign * place[1, i, c]
-    total[3] += sign * place[2, i, c]
+) -> tuple[float, ...]:
+    """Sums of a tile with one more cell."""
+    number, h, x, y = total
+    return number + 1.0, h + height[i, c], x + place[1, i, c], y + place[2, i, c]
 
 
 @njit(cache=True, inline='always')
-def _add(
-    sums: NDArray[np.float64],
-    height: NDArray[np.float32],
-    cells: Cells,
-    i: int,
-    c: int,
-) -> None:
-    total = sums[i // (ROWS * _HIGH), c // COLUMNS]
+def _plus(
+    total: tuple[float, ...], height: NDArray[np.float32], cells: Cells, i: int, c: int
+) -> tuple[float, ...]:
+    """Sums of the ground with one more cell."""
+    sw, sx, sy, sxx, sxy, syy, sh, sxh, syh, number = total
     w = 1 / max(cells.error[i, c] ** 2, np.float32(1e-10))
     place = cells.place
     x, y, h = place[1, i, c], place[2, i, c], height[i, c]
-    total[0] += w
-    total[1] += w * x
-    total[2] += w * y
-    total[3] += w * x * x
-    total[4] += w * x * y
-    total[5] += w * y * y
-    total[6] += w * h
-    total[7] += w * x * h
-    total[8] += w * y * h
-    total[9] += 1
+    return (
+        sw + w,
+        sx + w * x,
+        sy + w * y,
+        sxx + w * x * x,
+        sxy + w * x * y,
+        syy + w * y * y,
+        sh + w * h,
+        sxh + w * x * h,
+        syh + w * y * h,
+        number + 1.0,
+    )

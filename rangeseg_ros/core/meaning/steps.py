@@ -107,7 +107,7 @@ def _spreads(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.fl
 def _ranked(values: NDArray[np.float64], rank: int) -> float:
     """The value that so many are smaller than, of numbers that are not negative.
 
-    Sorted only among those of its power of two, as their bits are in the order of the numbers:
+    Told only among those of its power of two, as their bits are in the order of the numbers:
     several times faster than a partition of all.
     """
     power = (values.view(np.int64) >> 52).astype(np.int32)
@@ -124,7 +124,7 @@ def _ranked(values: NDArray[np.float64], rank: int) -> float:
         if power[k] == own:
             alike[count] = values[k]
             count += 1
-    return float(np.sort(alike)[rank])
+    return float(np.partition(alike, rank)[rank])
 
 
 @njit(cache=True, inline='always')
