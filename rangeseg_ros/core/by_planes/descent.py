@@ -93,8 +93,9 @@ def _take_nearest(
                     for j in range(bj * block, min((bj + 1) * block, width)):
                         p = i * width + j
                         value = np.float32(plane_cost(plane, p, problem))
-                        if value < cost[p]:
-                            labels[p], cost[p] = candidates[bj, k], value
+                        better = value < cost[p]
+                        labels[p] = candidates[bj, k] if better else labels[p]
+                        cost[p] = value if better else cost[p]
 
 
 @njit(cache=True, nogil=True)

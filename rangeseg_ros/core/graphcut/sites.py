@@ -11,6 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.sensing.marks import find_marked, no_marks
+
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
@@ -94,8 +96,8 @@ def fronts(
 @njit(cache=True, nogil=True)
 def room_for_unlike(width: int) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
     """`marks` and `sites` for `unlike_sites`, of rows so wide."""
-    room = (width + 7) // 8 * 8
-    return np.zeros(room, np.uint8), np.empty(room, np.intp)
+    marks = no_marks(width)
+    return marks, np.empty(len(marks), np.intp)
 
 
 @njit(cache=True, nogil=True)
@@ -113,7 +115,7 @@ def unlike_sites(
     labels : (n,) int32
     first, width : int
     marks : (m,) uint8
-        Scratch: zeros, m the next multiple of eight from `width` on.
+        Scratch, see `no_marks`.
     sites : (m,) int
         Receives them.
 
@@ -130,15 +132,7 @@ def unlike_sites(
         marks[j] = here[j] != right[j]
     for j in range(len(below)):
         marks[j] |= here[j] != below[j]
-    eight = marks.view(np.uint64)
-    count = 0
-    for k in range(len(eight)):
-        if eight[k] != 0:
-            # Without branches, which no processor foretells here.
-            for j in range(8 * k, 8 * k + 8):
-                sites[count] = first + j
-                count += int(marks[j])
-    return count
+    return find_marked(marks, first, sites)
 
 
 @njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, plane_of, plus_pixel
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SLOPE, plane_of, plus_pixel
 
 LANES = 32
 """Blocks side by side that are summed and fitted at a time."""
@@ -107,7 +107,7 @@ def fit_sums(lanes: NDArray[np.float64]) -> None:
         lanes[(_THETA + 2) * LANES + b], lanes[_RESIDUAL * LANES + b] = z, left
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def store_sums(
     lanes: NDArray[np.float64],
     moments: NDArray[np.float64],
@@ -116,11 +116,16 @@ def store_sums(
 ) -> None:
     """Moments (N, 13) of the blocks, and the attributes (N,) of `Blocks` of these names."""
     for b in range(len(moments)):
+        own = moments[b]
         for entry in range(COUNT + 1):
-            moments[b, entry] = lanes[(_SUMS + entry) * LANES + b]
-        moments[b, COUNT + 1 :] = 0
-        squared[b] = moments[b, CHI2] / max(moments[b, COUNT], 1.0)
-        residual[b] = lanes[_RESIDUAL * LANES + b]
+            own[entry] = lanes[(_SUMS + entry) * LANES + b]
+        own[RATIO] = own[SLOPE] = 0
+    # By themselves, so that the compiler takes many at a time.
+    square, count = lanes[(_SUMS + CHI2) * LANES :], lanes[(_SUMS + COUNT) * LANES :]
+    left = lanes[_RESIDUAL * LANES :]
+    for b in range(len(moments)):
+        squared[b] = square[b] / max(count[b], 1.0)
+        residual[b] = left[b]
 
 
 @njit(cache=True, inline='always')

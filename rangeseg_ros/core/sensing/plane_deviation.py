@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
+from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import OUTLIER
 
@@ -77,8 +78,8 @@ def _find_jumps(
     across = np.zeros(width + 1, np.bool_)
     # Of every second row in turn: deviations from the next, strong pixels, their columns and the
     # number of these, and on which side of their local mean they lie.
-    down, strong = np.zeros((2, width), np.bool_), np.zeros((2, width), np.bool_)
-    places, count = np.empty((2, width), np.int32), np.zeros(2, np.int32)
+    down, strong = np.zeros((2, width), np.bool_), np.stack((no_marks(width), no_marks(width)))
+    places, count = np.empty(strong.shape, np.int32), np.zeros(2, np.int32)
     side = np.zeros((2, width), np.bool_)
     for k in range(max(first - _MARGIN, 0), min(first + _MARGIN - 1, height)):
         _find_means(k, inverse, mean[k % _ROWS])
@@ -111,11 +112,7 @@ def _find_jumps(
         _leave(row, row[3:], row[6:], row[9:], limit[block % 2], across[1:width])
         for j in range(width):
             strong[now, j] = down[0, j] | down[1, j] | across[j] | across[j + 1]
-        count[now] = 0
-        for j in range(width):
-            if strong[now, j]:
-                places[now, count[now]] = j
-                count[now] += 1
+        count[now] = find_marked(strong[now], 0, places[now])
         if count[now] > 0:
             _find_sides(i, inverse, places[now, : count[now]], side[now])
         if i < after:
@@ -132,10 +129,14 @@ def _find_means(i: int, inverse: NDArray[np.float32], mean: NDArray[np.float32])
     """
     height, width = inverse.shape
     total, count = np.zeros(width + 2, np.float32), np.zeros(width + 2, np.float32)
-    for k in range(max(i - 1, 0), min(i + 2, height)):
-        for j in range(width):
-            total[j + 1] += inverse[k, j]
-            count[j + 1] += np.float32(inverse[k, j] > 0)
+    sums, known = total[1:-1], count[1:-1]
+    above, here, below = inverse[max(i - 1, 0)], inverse[i], inverse[min(i + 1, height - 1)]
+    # Outside of the image there is nothing.
+    upper, lower = np.float32(i > 0), np.float32(i + 1 < height)
+    for j in range(width):
+        a, b, c = upper * above[j], here[j], lower * below[j]
+        sums[j] = a + b + c
+        known[j] = np.float32(a > 0) + np.float32(b > 0) + np.float32(c > 0)
     for j in range(width):
         # 0 / 0 where there is none.
         mean[_MARGIN + j] = (total[j] + total[j + 1] + total[j + 2]) / (
@@ -203,7 +204,7 @@ def _find_sides(
 def _cross_right(
     i: int,
     inverse: NDArray[np.float32],
-    strong: NDArray[np.bool_],
+    strong: NDArray[np.uint8],
     side: NDArray[np.bool_],
     places: NDArray[np.int32],
     count: NDArray[np.int32],
@@ -231,7 +232,7 @@ def _cross_right(
 def _cross_down(
     i: int,
     inverse: NDArray[np.float32],
-    strong: NDArray[np.bool_],
+    strong: NDArray[np.uint8],
     side: NDArray[np.bool_],
     places: NDArray[np.int32],
     count: NDArray[np.int32],
