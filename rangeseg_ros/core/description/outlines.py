@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 from mapbox_earcut import triangulate_float64
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
@@ -22,7 +23,7 @@ TOLERANCE = 1.5
 _GRAZING = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Outline:
     """Border of a region, put on its plane when first asked for.
 
@@ -137,9 +138,23 @@ def lies_ahead(
     """
     if camera is None or not camera.pinhole:
         return np.zeros(len(boxes), np.bool_)
-    rays = camera.rays_at(boxes[:, [1, 1, 3, 3]] - 0.5, boxes[:, [0, 2, 0, 2]] - 0.5)
-    level = np.einsum('nci,ni->nc', rays, theta)
-    return (level > _GRAZING * np.abs(theta).max(axis=1)[:, None]).all(axis=1)
+    return _corners_lie_ahead(boxes, theta, (camera.fx, camera.fy, camera.cx, camera.cy))
+
+
+@njit(cache=True)
+def _corners_lie_ahead(
+    boxes: NDArray[np.intp], theta: NDArray[np.float64], lens: tuple[float, float, float, float]
+) -> NDArray[np.bool_]:
+    """Whether the corners of each box meet its plane, see `Outline._ahead`."""
+    fx, fy, cx, cy = lens
+    ahead = np.ones(len(boxes), np.bool_)
+    for k in range(len(boxes)):
+        for row in boxes[k, 0::2]:
+            for column in boxes[k, 1::2]:
+                x, y = (column - 0.5 - cx) / fx, (row - 0.5 - cy) / fy
+                level = theta[k, 0] * x + theta[k, 1] * y + theta[k, 2]
+                ahead[k] &= level > _GRAZING * np.abs(theta[k]).max()
+    return ahead
 
 
 def triangles(

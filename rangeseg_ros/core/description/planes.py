@@ -139,12 +139,7 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     if not len(found):
         return []
     surfaces = submit(common_surfaces, fits)
-    distance = np.zeros(len(theta))
-    distance[found] = 1 / np.linalg.norm(theta[found], axis=1)
-    normal = -theta * distance[:, None]
-    covariance = sandwiches(plane_jacobians(normal, distance), fits.covariance)
-
-    centroid, rms, confidence = _scatter(fits, normal, distance)
+    normal, distance, covariance, centroid, rms, confidence = _described(fits)
 
     shapes = Shapes(labels, image, theta, fits.inner)
     boxes = fits.boxes()
@@ -181,14 +176,19 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     ]
 
 
-@njit(cache=True)
-def _scatter(
-    fits: Fits, normal: NDArray[np.float64], distance: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Centroid (M + 1, 3), rms and confidence of regions 0...M; see `Plane`."""
-    regions = len(normal)
+@njit(cache=True, nogil=True)
+def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
+    """Normal, distance, covariance, centroid, rms and confidence of regions 0...M; see `Plane`."""
+    regions = len(fits.theta)
+    normal, distance = np.zeros((regions, 3)), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
     for k in range(regions):
+        a, b, c = fits.theta[k]
+        slope = np.sqrt(a * a + b * b + c * c)
+        if slope > 0:
+            distance[k] = 1 / slope
+        for a in range(3):
+            normal[k, a] = -fits.theta[k, a] * distance[k]
         sums, n, inliers = fits.explained[k], normal[k], max(fits.explained[k, COUNT], 1.0)
         offset = square = 0.0
         for a in range(3):
@@ -205,7 +205,8 @@ def _scatter(
         expected = distance[k] ** 2 * _expected_square(fits, k)
         share = 1 - fits.outliers[k] / max(fits.pixels[k], 1)
         confidence[k] = share * min(1.0, expected / max(square, 1e-18))
-    return centroid, rms, confidence
+    covariance = sandwiches(plane_jacobians(normal, distance), fits.covariance)
+    return normal, distance, covariance, centroid, rms, confidence
 
 
 @njit(cache=True)

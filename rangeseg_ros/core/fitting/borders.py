@@ -120,7 +120,7 @@ def _meet(
     hand[k, 2] += not linked
 
 
-@njit(cache=True)
+@njit(cache=True, inline='always')
 def _end(hand: NDArray[np.intp], k: int, over: list[tuple[int, int, int, int]]) -> None:
     """Note the stretch of border at hand, if any, from both sides."""
     m, links, cuts = hand[k]

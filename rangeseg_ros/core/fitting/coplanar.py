@@ -52,14 +52,17 @@ def common_surfaces(fits: Fits) -> NDArray[np.intp]:
         Label of the largest region of the group; 0 where there is no plane.
     """
     order = _by_falling_size(fits)
-    surface = np.zeros(len(fits.theta), np.intp)
+    surface, nothing = np.zeros(len(fits.theta), np.intp), np.zeros((3, 3))
     for rank in range(len(order)):
         k = order[rank]
         surface[k] = k
         least = _LIMIT
         for m in order[:rank]:
             if surface[m] == m:
-                value = _difference(fits, k, m, _LIMIT)
+                # Most are far apart, and need no call: it counts references to all of the fits.
+                value = _chi_squared(fits, k, m, nothing)
+                if value <= _LIMIT:
+                    value = _difference(fits, k, m)
                 if value < least:
                     least, surface[k] = value, m
     return surface
@@ -90,7 +93,7 @@ def group_coplanar(fits: Fits, borders: Borders, agreement: float) -> NDArray[np
         Label of the largest region of the group; 0 where there is no plane.
     """
     around = _around(fits, borders, agreement)
-    group = np.zeros(len(fits.theta), np.intp)
+    group, nothing = np.zeros(len(fits.theta), np.intp), np.zeros((3, 3))
     for k in _by_falling_size(fits):
         # 0 while the region around, then the smaller one, has had no turn.
         group[k] = group[around[k]]
@@ -105,7 +108,9 @@ def group_coplanar(fits: Fits, borders: Borders, agreement: float) -> NDArray[np
                 limit = _LIMIT if borders.links[e] > 0 else 0.0
                 if borders.links[e] >= borders.cuts[e]:
                     limit = _TOUCHING_LIMIT
-                value = _difference(fits, k, leader, limit)
+                value = _chi_squared(fits, k, leader, nothing)
+                if value <= limit:
+                    value = _difference(fits, k, leader)
                 if value < min(least, limit):
                     least, group[k] = value, leader
     return group
@@ -155,12 +160,9 @@ def _by_falling_size(fits: Fits) -> NDArray[np.intp]:
 
 
 @njit(cache=True)
-def _difference(fits: Fits, k: int, m: int, limit: float) -> float:
-    """Chi-squared of the difference of two planes; above `limit` it is only known to be."""
+def _difference(fits: Fits, k: int, m: int) -> float:
+    """Chi-squared of the difference of two planes, whose systematic errors are alike."""
     common = np.zeros((3, 3))
-    value = _chi_squared(fits, k, m, common)
-    if value > limit:
-        return value
     for a in fits.parts[fits.start[k] : fits.start[k + 1]]:
         for b in fits.parts[fits.start[m] : fits.start[m + 1]]:
             common += pairs(fits.cells, a, fits.theta[k], b, fits.theta[m], fits.systematic)
@@ -178,7 +180,7 @@ def _product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[n
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, inline='always')
 def _chi_squared(fits: Fits, k: int, m: int, common: NDArray[np.float64]) -> float:
     """Chi-squared of the difference of two planes whose covariance with each other is `common`."""
     # A sensor without errors still rounds: to 1e-9 / m.

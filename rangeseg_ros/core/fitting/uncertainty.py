@@ -138,14 +138,18 @@ def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return root
 
 
+@njit(cache=True)
 def plane_jacobians(
     normal: NDArray[np.float64], distance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Derivative (N, 4, 3) of (normal, distance) by theta = -normal / distance."""
-    tangent = np.eye(3) - normal[:, :, None] * normal[:, None, :]
     jacobian = np.empty((len(normal), 4, 3))
-    jacobian[:, :3] = -distance[:, None, None] * tangent
-    jacobian[:, 3] = distance[:, None] ** 2 * normal
+    for k in range(len(normal)):
+        for a in range(3):
+            for b in range(3):
+                tangent = (1.0 if a == b else 0.0) - normal[k, a] * normal[k, b]
+                jacobian[k, a, b] = -distance[k] * tangent
+            jacobian[k, 3, a] = distance[k] ** 2 * normal[k, a]
     return jacobian
 
 
@@ -168,7 +172,6 @@ def _covariances(
     sensor are two fields.
     """
     white = sensor.white if sensor.correlation > 0 else 1.0
-    part = np.empty((3, 3))
     for k in range(max(first, 1), after):
         if not theta[k].any():
             continue
@@ -183,13 +186,18 @@ def _covariances(
             # Squares of the same scale as the rays: variance times weight.
             level = level_of(own[c], theta[k])
             mean = own[c, WEIGHT] / own[c, COUNT]
+            of_random = mean * random_variance(sensor, level**2)
+            of_systematic = mean * systematic_variance(sensor, level**2)
             entry = 0
             for a in range(3):
                 for b in range(a, 3):
-                    part[a, b] = part[b, a] = own[c, entry]
+                    random_square[a, b] += of_random * own[c, entry]
+                    systematic_square[a, b] += of_systematic * own[c, entry]
                     entry += 1
-            random_square += mean * random_variance(sensor, level**2) * part
-            systematic_square += mean * systematic_variance(sensor, level**2) * part
+        for a in range(3):
+            for b in range(a):
+                random_square[a, b] = random_square[b, a]
+                systematic_square[a, b] = systematic_square[b, a]
         result = white * random_square
         # Sides of pixels overstate the length of a border by 4 / pi on average.
         share = np.pi / 4 * cells.border[k] / max(count, 1.0)
