@@ -175,6 +175,24 @@ def test_crossings_lie_on_the_ground_continued():
     assert (points[:, 3] < 0).all()
 
 
+@pytest.mark.parametrize('find', [drops, unseen])
+@pytest.mark.parametrize('edge', [1.7, 3.0])
+def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
+    """Cells of 5 cm, as far away as drops must be found; one more or less along the view."""
+    pit = (
+        Piece(slab(-3, edge, 0, 0, ALL), GROUND),
+        Piece(slab(edge + 0.9, 12, 0, 0, ALL), GROUND),
+        Piece(slab(edge, edge + 0.9, -0.1, -0.1, ALL), DROP, 0.1, 'nothing'),
+    )
+    terrain = scene(*(drop_of(0.3, edge) if find is drops else pit))
+    image, result, _ = found(terrain)
+    points = find(image, result.ground)[:, :3]
+    world = points @ terrain.pose.rotation.T + terrain.pose.position
+    lethal = {(x + n, y) for x, y in np.floor(world[:, :2] / 0.05).astype(int) for n in (-1, 0, 1)}
+    first = round(edge / 0.05) + 2
+    assert {(x, y) for x in range(first, first + 6) for y in range(-10, 10)} <= lethal
+
+
 def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
     hidden = (
         Piece(slab(-3, 1.5, 0, 0, ALL), GROUND),
