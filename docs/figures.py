@@ -195,7 +195,8 @@ def stages(image, config):
     labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)
     labels = labelling.labels
     pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
-    regions = labelling.flat(plane_regions(labels, labels > 0, grid, config.noise_regions, least))
+    regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
+    regions, _ = method.flat_regions(regions, bridges, fine, sensor, config.flatness)
     pictures['regions'] = overlay(image.inverse, regions)
     result = Segmenter(config).segment(image)
     pictures['planes'] = overlay(image.inverse, result.labels, result.planes)

@@ -1,11 +1,13 @@
 """What the documents say of the code is so."""
 
 import ast
+import importlib
 import re
 from pathlib import Path
 
 import pytest
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.sensitivity import find_constants
 
 ROOT = Path(__file__).parents[1]
@@ -56,6 +58,14 @@ def test_the_table_of_constants_is_that_of_the_code():
     told = {(module, name): value for module, name, value, *_ in rows}
     found = {(constant.module, constant.name): constant.source for constant in find_constants()}
     assert told == found
+
+
+def test_every_figure_is_drawn_by_the_present_code(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
+    figures = importlib.import_module('figures')
+    drawn = figures.stages(figures.frame('kinect', 8, 1), Config())
+    of_their_own = {'distortion', 'ground', 'map'}
+    assert {*drawn, *of_their_own} == {path.stem for path in (ROOT / 'docs/figures').glob('*.png')}
 
 
 def test_every_page_is_in_the_site():
