@@ -8,12 +8,16 @@ import pytest
 from click.testing import CliRunner
 
 from rangeseg_ros.cli.simulate import command
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, read_labels
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import curved_scene
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.stereo import RealSense
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.kinds import terrain_scene
 
 SMALL = ['--width', '160', '--height', '120']
 
@@ -95,3 +99,19 @@ def test_bad_option(tmp_path, option, value):
     assert result.exit_code == 2
     assert option in result.output and str(value) in result.output
     assert not any(tmp_path.iterdir())
+
+
+def test_terrain_is_seen_by_an_image_of_any_size(tmp_path):
+    output = tmp_path / 'terrain'
+    result = simulate(
+        'terrain', '--sensor', 'realsense', '--scenes', 1, '--seed', 5, '--kind', 'curb', *SMALL,
+        '--output', output,
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    camera = read_camera(output / 'camera.yaml')
+    # 90 degrees wide, as the sensor's own images.
+    assert camera == Camera(160, 120, 80.0, 80.0, 79.5, 59.5)
+    expected = simulate_terrain(terrain_scene('curb', 5), RealSense(5), camera, seed=5)
+    assert np.array_equal(read_depth(output / 'depth' / '000005.png'), expected.depth)
+    truth = cv2.imread(str(output / 'truth' / '000005.png'), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(truth, expected.terrain)

@@ -12,6 +12,7 @@ from rangeseg_ros.evaluation.terrain import TerrainTable
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 
@@ -31,13 +32,23 @@ from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
     '--seed', type=click.IntRange(min=0), default=0, show_default=True, help='Of the first scene.'
 )
 @click.option('--kind', type=click.Choice(list(KINDS)), help='Only scenes of this kind.')
+@click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own.")
+@click.option('--height', 'rows', type=click.IntRange(16, 4096), help="Rows; the sensor's own.")
 @click.option(
     '--output',
     type=click.Path(path_type=Path),
     required=True,
     help='Folder to make; it must not exist, or be empty.',
 )
-def command(sensor: str, scenes: int, seed: int, kind: str | None, output: Path) -> None:
+def command(
+    sensor: str,
+    scenes: int,
+    seed: int,
+    kind: str | None,
+    width: int | None,
+    rows: int | None,
+    output: Path,
+) -> None:
     """Ground, drops, stairs, ramps, curbs, mirrors and obstacles, from a robot.
 
     \b
@@ -51,18 +62,20 @@ def command(sensor: str, scenes: int, seed: int, kind: str | None, output: Path)
                                1 cm), stairs
     OUTPUT/camera.yaml         intrinsics
 
-    The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees. `rangeseg evaluate OUTPUT`
-    measures how well terrain is told.
+    The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees. Another width keeps the
+    horizontal field of view. `rangeseg evaluate OUTPUT` measures how well terrain is told.
     """
     names = [kind] if kind else list(KINDS)
+    camera = SENSORS[sensor](seed).camera
+    camera = resize(camera, width or camera.width, rows or camera.height)
     with (
         options.new_folder(output) as folder,
         TerrainTable(folder / 'terrain.csv') as table,
     ):
-        write_camera(folder / 'camera.yaml', SENSORS[sensor](0).camera)
+        write_camera(folder / 'camera.yaml', camera)
         for number in options.progress(range(seed, seed + scenes), scenes, 'image'):
             scene = terrain_scene(names[number % len(names)], number)
-            frame = simulate_terrain(scene, SENSORS[sensor](number), seed=number)
+            frame = simulate_terrain(scene, SENSORS[sensor](number), camera, seed=number)
             depth = frame.depth
             if depth.dtype != np.uint16:
                 depth = np.rint(1000 * depth).astype(np.uint16)
