@@ -226,8 +226,9 @@ def _terrain(
     verdict[large & (np.abs(side) <= blur)] = HIDDEN
     verdict[level] = GROUND
     # Little pieces beside a drop may be its own.
-    low = (verdict == DROP).take(surface).view(np.uint8)
-    if low.any():
+    fell = verdict == DROP
+    if fell.any():
+        low = fell.take(surface).view(np.uint8)
         by_it = cv2.dilate(low, np.ones(BLUR, np.uint8)) > 0
         beside = np.zeros(count + 1, np.bool_)
         beside[surface[by_it]] = True
