@@ -32,7 +32,7 @@ def ground_field(
 
     Parameters
     ----------
-    ground, measured : list of (M, N, 9) float64
+    ground, measured : list of (M, 9, N) float64
         See `levels_of`: of the ground, and of all cells.
     base : (3,) float64
         Plane under the robot.
@@ -59,12 +59,12 @@ def levels_of(cells: Cells, where: NDArray[np.bool_]) -> list[NDArray[np.float64
 
     Returns
     -------
-    list of (M, N, 9) float64
+    list of (M, 9, N) float64
         ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse over blocks, over 2 x 2 blocks, and so
         on up to the whole image.
     """
     levels = [_moments(cells.ray, cells.inverse, where)]
-    while max(levels[-1].shape[:2]) > 1:
+    while levels[-1].size > 9:
         levels.append(_halved(levels[-1]))
     return levels
 
@@ -76,7 +76,7 @@ def _moments(
     """See `levels_of`."""
     rows, columns = where.shape
     high = -(-rows // _ROWS)
-    sums = np.zeros((high, -(-columns // _COLUMNS), 9))
+    sums = np.zeros((high, 9, -(-columns // _COLUMNS)))
     # Of the columns by themselves, as vector instructions.
     total = np.empty((9, columns))
     for m in range(high):
@@ -97,25 +97,25 @@ def _moments(
                 total[6, c] += x * value
                 total[7, c] += y * value
                 total[8, c] += z * value
-        for c in range(columns):
-            for k in range(9):
-                sums[m, c // _COLUMNS, k] += total[k, c]
+        for k in range(9):
+            for c in range(columns):
+                sums[m, k, c // _COLUMNS] += total[k, c]
     return sums
 
 
 @njit(cache=True, nogil=True)
 def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums of 2 x 2 neighbours."""
-    rows, columns = sums.shape[:2]
-    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, 9))
+    rows, _, columns = sums.shape
+    result = np.zeros(((rows + 1) // 2, 9, (columns + 1) // 2))
     for i in range(rows):
-        for j in range(columns):
-            for k in range(9):
-                result[i // 2, j // 2, k] += sums[i, j, k]
+        for k in range(9):
+            for j in range(columns):
+                result[i // 2, k, j // 2] += sums[i, k, j]
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _fitted(
     sums: NDArray[np.float64], squares: NDArray[np.float64], prior: NDArray[np.float64]
 ) -> NDArray[np.float64]:
@@ -123,53 +123,57 @@ def _fitted(
 
     `prior` has a plane for 2 x 2 blocks.
     """
-    rows, columns = sums.shape[:2]
+    rows, _, columns = sums.shape
     theta = np.empty((rows, columns, 3))
-    # Sums of three blocks above each other.
-    high, wide = np.empty((2, columns, 9))
-    g, s = np.empty((2, 9))
+    # Sums of three blocks above each other, between two that are empty, and of windows.
+    high = np.zeros((9, columns + 2))
+    g, s = np.empty((2, 9, columns))
+    # The prior planes of a row, and what they become.
+    above, fit = np.empty((2, 3, columns))
     for i in range(rows):
-        _add_three(sums, i, high)
-        _add_three(squares, i, wide)
+        _add_around(sums, i, high, g)
+        _add_around(squares, i, high, s)
         for j in range(columns):
             p = prior[min(i // 2, prior.shape[0] - 1), min(j // 2, prior.shape[1] - 1)]
-            theta[i, j] = p
-            _add_beside(high, j, g)
-            if g[0] + g[3] + g[5] == 0:
-                continue
-            _add_beside(wide, j, s)
-            a, b, c = g[0] + _PRIOR * s[0], g[1] + _PRIOR * s[1], g[2] + _PRIOR * s[2]
-            d, e, f = g[3] + _PRIOR * s[3], g[4] + _PRIOR * s[4], g[5] + _PRIOR * s[5]
+            above[0, j], above[1, j], above[2, j] = p[0], p[1], p[2]
+        for j in range(columns):
+            p, q, r = above[0, j], above[1, j], above[2, j]
+            a, b, c = (
+                g[0, j] + _PRIOR * s[0, j],
+                g[1, j] + _PRIOR * s[1, j],
+                g[2, j] + _PRIOR * s[2, j],
+            )
+            d, e, f = (
+                g[3, j] + _PRIOR * s[3, j],
+                g[4, j] + _PRIOR * s[4, j],
+                g[5, j] + _PRIOR * s[5, j],
+            )
             # What the ground is off the prior plane.
-            x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
-            y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
-            z = g[8] - g[2] * p[0] - g[4] * p[1] - g[5] * p[2]
+            x = g[6, j] - g[0, j] * p - g[1, j] * q - g[2, j] * r
+            y = g[7, j] - g[1, j] * p - g[3, j] * q - g[4, j] * r
+            z = g[8, j] - g[2, j] * p - g[4, j] * q - g[5, j] * r
             aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-            if determinant <= 1e-13 * a * d * f:
-                continue
-            theta[i, j, 0] += (aa * x + bb * y + cc * z) / determinant
-            theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
-            theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
+            told = (g[0, j] + g[3, j] + g[5, j] != 0) & (determinant > 1e-13 * a * d * f)
+            fit[0, j] = p + (aa * x + bb * y + cc * z) / determinant if told else p
+            fit[1, j] = q + (bb * x + dd * y + ee * z) / determinant if told else q
+            fit[2, j] = r + (cc * x + ee * y + ff * z) / determinant if told else r
+        theta[i] = fit.T
     return theta
 
 
 @njit(cache=True, inline='always')
-def _add_three(sums: NDArray[np.float64], i: int, total: NDArray[np.float64]) -> None:
-    """Sums of row i and those beside it."""
-    total[:] = 0
-    for m in range(max(i - 1, 0), min(i + 2, sums.shape[0])):
-        for j in range(len(total)):
-            for k in range(9):
-                total[j, k] += sums[m, j, k]
-
-
-@njit(cache=True, inline='always')
-def _add_beside(sums: NDArray[np.float64], j: int, total: NDArray[np.float64]) -> None:
-    """Sums of column j and those beside it."""
-    total[:] = 0
-    for n in range(max(j - 1, 0), min(j + 2, sums.shape[0])):
-        for k in range(9):
-            total[k] += sums[n, k]
+def _add_around(
+    sums: NDArray[np.float64], i: int, high: NDArray[np.float64], total: NDArray[np.float64]
+) -> None:
+    """Sums of windows of 3 x 3 blocks around row i, (9, N), by those of three rows, `high`."""
+    for k in range(9):
+        for j in range(total.shape[1]):
+            high[k, j + 1] = 0
+        for m in range(max(i - 1, 0), min(i + 2, sums.shape[0])):
+            for j in range(total.shape[1]):
+                high[k, j + 1] += sums[m, k, j]
+        for j in range(total.shape[1]):
+            total[k, j] = high[k, j] + high[k, j + 1] + high[k, j + 2]
 
 
 class GroundField(NamedTuple):
