@@ -191,7 +191,7 @@ def _terrain(
     plane = under.theta
     continued = submit(_continued, cells, ground, measured.result(), plane, size, up)
     part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
-    part[steep | ground] = 0
+    part *= ~(steep | ground)  # several times faster than to set some to 0
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
     near = around(ground)
