@@ -46,10 +46,10 @@ def floor_depth(camera):
     return np.round(1000 * depth).astype(np.uint16)
 
 
-def transform(parent, child, stamp, rotation, shift):
+def transform(parent, child, stamp, quaternion, shift):
     message = TransformStamped(child_frame_id=child)
     message.header.stamp, message.header.frame_id = stamp, parent
-    for name, value in zip('xyzw', rotation.as_quat(), strict=True):
+    for name, value in zip('xyzw', quaternion, strict=True):
         setattr(message.transform.rotation, name, float(value))
     for name, value in zip('xyz', shift, strict=True):
         setattr(message.transform.translation, name, float(value))
@@ -64,19 +64,21 @@ class Robot:
         self.moving = bench.node.create_publisher(kind, '/tf', 100)
         self.static = bench.node.create_publisher(kind, '/tf_static', LATCHED)
         turn = Rotation.from_euler('y', PITCH) * Rotation.from_matrix(OPTICAL_IN_BODY)
-        none = Rotation.identity()
+        none = 0, 0, 0, 1
         self.static.publish(
             kind(
                 transforms=[
                     transform('base_footprint', 'base_link', Time().to_msg(), none, (0, 0, BASE)),
-                    transform('base_link', FRAME, Time().to_msg(), turn, (0, 0, HEIGHT - BASE)),
+                    transform(
+                        'base_link', FRAME, Time().to_msg(), turn.as_quat(), (0, 0, HEIGHT - BASE)
+                    ),
                 ]
             )
         )
 
     def at(self, stamp, x, yaw=0.0):
         """Where the robot is: x metres along the odometry's x axis."""
-        turn = Rotation.from_euler('z', yaw)
+        turn = Rotation.from_euler('z', yaw).as_quat()
         message = transform('odom', 'base_footprint', stamp, turn, (x, 0, 0))
         self.moving.publish(self.kind(transforms=[message]))
 
@@ -155,7 +157,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
     def message(stamp, parent, child, turn, shift):
         time = Time(nanoseconds=stamp).to_msg()
-        found = transform(parent, child, time, Rotation.from_quat(turn), shift)
+        found = transform(parent, child, time, turn, shift)
         return tf_messages(transforms=[found])
 
     words = [word for name, value in settings.items() for word in ('-p', f'{name}:={value}')]
@@ -212,7 +214,7 @@ def test_two_cameras_in_one_fixed_frame_have_a_node_and_a_map_each(tf_messages):
         node = benches['left'].node
         static = node.create_publisher(tf_messages, '/tf_static', LATCHED)
         stands = [
-            transform('odom', side, Time().to_msg(), turn, (0.0, y, HEIGHT))
+            transform('odom', side, Time().to_msg(), turn.as_quat(), (0.0, y, HEIGHT))
             for side, y in sides.items()
         ]
         static.publish(tf_messages(transforms=stands))
