@@ -286,6 +286,7 @@ def test_planes_are_in_the_target_frame_and_the_ground_is_told_by_tf(robot):
         np.testing.assert_allclose(normal, (0, 0, 1), atol=0.01)
         assert floor['distance'][0] == pytest.approx(BASE, abs=0.01)
     bench = robot.bench
+    bench.repeat(lambda: send(robot, 0.0), lambda: bench.received['markers'])
     markers = bench.received['markers'][-1]
     assert {m.header.frame_id for m in markers.markers} == {'base_link'}
     assert bench.received['labels'][-1].header.frame_id == FRAME
