@@ -183,8 +183,8 @@ def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
     normal, distance = np.zeros((regions, 3)), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
     for k in range(regions):
-        a, b, c = fits.theta[k]
-        slope = np.sqrt(a * a + b * b + c * c)
+        x, y, z = fits.theta[k]
+        slope = np.sqrt(x * x + y * y + z * z)
         if slope > 0:
             distance[k] = 1 / slope
         for a in range(3):

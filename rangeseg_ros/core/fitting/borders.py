@@ -9,6 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.marks import no_marks
 
 # Which neighbours of a pixel are of another region.
 _RIGHT, _BELOW = 1, 2
@@ -25,9 +26,9 @@ class Borders(NamedTuple):
     length : (M + 1,) int
         Sides of pixels where a region ends.
     start : (M + 2,) int
-        Where the regions that each touches begin among the following; region 0 touches none.
+        Where the regions that each one touches begin in `other`; region 0 touches none.
     other : (N,) int
-        They, by rising number.
+        The regions that touch region 1, 2, ..., those of each by rising number.
     links, cuts : (N,) int
         Edges of the grid that link the two, and those that a jump cuts.
     """
@@ -42,7 +43,17 @@ class Borders(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders:
-    """Borders of regions (H, W), of numbers below `count`."""
+    """Borders of regions.
+
+    Parameters
+    ----------
+    regions : (H, W) uint16
+        0...M, 0 for none.
+    grid : Grid
+        (H, W), whose edges tell links from cuts.
+    count : int
+        M + 1.
+    """
     height, width = regions.shape
     box, length = np.zeros((count, 4), np.intp), np.zeros(count, np.intp)
     box[:, 0], box[:, 1] = height, width
@@ -51,8 +62,8 @@ def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders
     hand = np.zeros((2, count, 3), np.intp)
     over = [(0, 0, 0, 0)]
     over.clear()
-    # With room for whole words, of which each tells of eight pixels whether there is a border.
-    edge = np.zeros((width + 7) // 8 * 8, np.uint8)
+    # Each word tells of eight pixels whether there is a border.
+    edge = no_marks(width)
     eight = edge.view(np.uint64)
     for i in range(height):
         row, below = regions[i], regions[min(i + 1, height - 1)]
