@@ -3,10 +3,14 @@
 import ast
 import importlib
 import re
+import shlex
+from contextlib import suppress
 from pathlib import Path
 
+import click
 import pytest
 
+from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.sensitivity import find_constants
 
@@ -27,6 +31,22 @@ def test_links_and_names_of_files_lead_somewhere(page):
     for name in re.findall(r'`((?:[\w.]+/)*\w+\.(?:py|md|toml|cff|rst))`', text):
         nested = [folder / name for folder in FOLDERS]
         assert any(path.exists() for path in nested) or any(PACKAGE.rglob(name)), name
+
+
+@pytest.mark.parametrize('page', PAGES, ids=lambda page: page.name)
+def test_commands_and_their_options_exist(page):
+    text = page.read_text().replace('\\\n', ' ')
+    told = re.findall(r'^(?:    |RUN .*&& )rangeseg ([^\n]+)|`rangeseg ([^`]+)`', text, re.M)
+    for words in told:
+        command, context = rangeseg, click.Context(rangeseg)
+        words = shlex.split(''.join(words), comments=True)
+        while isinstance(command, click.Group) and words and words[0][0] not in '-<':
+            name = words.pop(0)
+            command = command.get_command(context, name)
+            assert command, name
+            context = click.Context(command, parent=context)
+        with suppress(click.BadOptionUsage):  # named alone, without what it takes
+            command.make_parser(context).parse_args(words)
 
 
 def test_every_room_is_on_the_page_of_the_architecture():
