@@ -35,6 +35,7 @@ SIZES = (0.05, 0.075, 0.11, 0.2, 0.4)
 """Heights of obstacles that the table tells apart, metres."""
 _COLUMNS = ('name', 'kind', 'sensor', 'up_x', 'up_y', 'up_z', 'sensor_height')
 _STAIRS = ('direction', 'count', 'rise', 'run')
+_DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 'tiff'))
 
 
 class TerrainTable:
@@ -110,13 +111,13 @@ class TerrainTask:
     def run(self) -> Shares:
         """Segment the image and count its pixels."""
         name, reach = self.row['name'], REACH.get(self.row['sensor'], 3.5)
-        depth = read_depth(self.folder / 'depth' / f'{name}.png')
-        truth = read_label_image(self.folder / 'truth' / f'{name}.png').astype(np.uint8)
-        size, crossing, height = (
-            read_depth(self.folder / part / f'{name}.tiff')
-            for part in ('size', 'crossing', 'height')
+        camera = read_camera(self.folder / 'camera.yaml')
+        truth = _read_truth(self.folder / 'truth' / f'{name}.png', camera.shape)
+        depth, size, crossing, height = (
+            read_depth(self.folder / part / f'{name}.{suffix}', camera.shape)
+            for part, suffix in _DEPTHS
         )
-        image = RangeImage.from_depth(depth, read_camera(self.folder / 'camera.yaml'))
+        image = RangeImage.from_depth(depth, camera)
         result = Segmenter(self.config).segment(corrected(image, self.config))
         found, stairs = result.terrain, check_stairs(self.row, height, result.stairs)
         metres = np.where(truth == DROP, crossing, depth / 1000)
@@ -135,6 +136,17 @@ class TerrainTask:
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
             write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
         return Shares(name, self.row['kind'], pixels, table, stairs)
+
+
+def _read_truth(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """True classes (H, W); EvaluationError where they are no classes, or of another size."""
+    truth = read_label_image(path)
+    if truth.shape != shape:
+        sizes = ('x'.join(map(str, pair[::-1])) for pair in (truth.shape, shape))
+        raise EvaluationError('{}: truth is {}, its camera {}'.format(path, *sizes))
+    if truth.max(initial=0) > DROP:
+        raise EvaluationError(f'{path}: {truth.max()} is no class of terrain (0 to {DROP})')
+    return truth.astype(np.uint8)
 
 
 _COLOURS = np.array([[0, 0, 0], [0, 150, 0], [220, 0, 0], [0, 0, 240]], np.uint8)
@@ -174,6 +186,8 @@ def terrain_tasks(
     with path.open(newline='') as file:
         try:
             for row in csv.DictReader(file):
+                if not all(row[name] for name in _COLUMNS):
+                    raise ValueError
                 known: dict[str, Any] = {name: float(row[name]) for name in _COLUMNS[3:]}
                 if not know_height:
                     known['sensor_height'] = 0.0

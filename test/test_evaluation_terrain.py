@@ -1,0 +1,210 @@
+"""`rangeseg evaluate` of terrains whose shares are counted on paper.
+
+A camera looks straight down from 2 m onto a floor with a box on it and a pit in it, without noise:
+what is found of them, away from where they end, is plain. The truth is drawn by hand and wrong on
+purpose: what is found as one class counts as an error of another.
+"""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.io.cameras import write_camera
+
+CAMERA = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
+BOX = np.s_[20:60, 20:60]
+PIT = np.s_[20:60, 100:140]
+# Rows and columns of what is judged, its class, and what is found there.
+DRAWN = (
+    (np.s_[80:100, 10:50], GROUND),  # 800 pixels of floor
+    (np.s_[80:90, 60:70], OBSTACLE),  # 100 of floor
+    (np.s_[80:90, 90:130], DROP),  # 400 of floor
+    # 200 pixels each, of which 3 columns or rows of 20 are beside another class: 140 count.
+    (np.s_[30:50, 30:40], OBSTACLE),  # of the box
+    (np.s_[30:50, 40:50], GROUND),  # of the box
+    (np.s_[30:40, 110:130], DROP),  # of the pit
+    (np.s_[40:50, 110:130], GROUND),  # of the pit, 3 m away
+)
+HEADS = 'name kind sensor up_x up_y up_z sensor_height direction count rise run'
+# Where the rays cross the ground, metres; 2 elsewhere.
+CROSSING = (
+    (np.s_[80:90, 110:120], 3.0),  # 100 of the drop that is floor
+    (np.s_[80:90, 120:130], 3.6),  # 100 of them
+)
+# Reaches of 3.5 and of 2.5 m: pixels by true and found class, as the comments above add up.
+SENSORS = {'kinect': 'near', 'realsense': 'far'}
+KINECT = {
+    'ground_kept': 800 / 1080,
+    'ground_called_obstacle': 140 / 1080,
+    'ground_called_drop': 140 / 1080,
+    'obstacle_found': 140 / 240,
+    'obstacle_called_ground': 100 / 240,
+    'drop_found': 140 / 440,
+    'drop_called_ground': 300 / 440,
+}
+REALSENSE = {
+    'ground_kept': 800 / 940,
+    'ground_called_obstacle': 140 / 940,
+    'ground_called_drop': 0.0,
+    'obstacle_found': 140 / 240,
+    'obstacle_called_ground': 100 / 240,
+    'drop_found': 140 / 340,
+    'drop_called_ground': 200 / 340,
+}
+POOLED = {
+    'ground_kept': 1600 / 2020,
+    'ground_called_obstacle': 280 / 2020,
+    'ground_called_drop': 140 / 2020,
+    'obstacle_found': 280 / 480,
+    'obstacle_called_ground': 200 / 480,
+    'drop_found': 280 / 780,
+    'drop_called_ground': 500 / 780,
+}
+
+
+@pytest.fixture
+def drawn(tmp_path):
+    """Folder as `rangeseg simulate terrain` writes it: the same image of two sensors."""
+    folder = tmp_path / 'set'
+    depth = np.full(CAMERA.shape, 2000, np.uint16)
+    depth[BOX], depth[PIT] = 1600, 3000
+    truth = np.zeros(CAMERA.shape, np.uint8)
+    for where, class_ in DRAWN:
+        truth[where] = class_
+    crossing, size = np.full((2, *CAMERA.shape), 2.0, np.float32)
+    for where, metres in CROSSING:
+        crossing[where] = metres
+    size[:], size[BOX] = 0.05, 0.4
+    height = (2 - depth / 1000).astype(np.float32)
+    images = {'depth': depth, 'truth': truth, 'crossing': crossing, 'size': size, 'height': height}
+    for part, image in images.items():
+        (folder / part).mkdir(parents=True)
+        suffix = 'tiff' if image.dtype == np.float32 else 'png'
+        for name in SENSORS:
+            assert cv2.imwrite(str(folder / part / f'{name}.{suffix}'), image)
+    write_camera(folder / 'camera.yaml', CAMERA)
+    with (folder / 'terrain.csv').open('w', newline='') as file:
+        rows = csv.writer(file)
+        rows.writerow(HEADS.split())
+        for sensor, kind in SENSORS.items():
+            rows.writerow([sensor, kind, sensor, 0, 0, -1, 2, '', '', '', ''])
+    return folder
+
+
+@pytest.fixture
+def evaluate(run, tmp_path):
+    """Run `rangeseg evaluate`: exit code, figures (or None), standard output and error."""
+
+    def evaluated(folder, *arguments):
+        path = tmp_path / 'figures.json'
+        code, out, err = run('evaluate', folder, '--jobs', 1, '--json', path, *arguments)
+        return code, json.loads(path.read_text()) if path.exists() else None, out, err
+
+    return evaluated
+
+
+def test_shares_are_those_counted_on_paper(drawn, evaluate):
+    """Beside borders of classes 3 pixels do not count, nor what is beyond a sensor's reach.
+
+    That is told by its own distance, for a drop by that of the ground in its place.
+    """
+    code, figures, _, _ = evaluate(drawn)
+    assert code == 0 and figures['images'] == 2
+    assert figures['by_kind'] == {'far': pytest.approx(REALSENSE), 'near': pytest.approx(KINECT)}
+    assert figures['pooled'] == pytest.approx(POOLED)
+    # Obstacles of 0.05 m are floor 2 m away, that of 0.4 m is found, 1.6 m away.
+    sizes = figures['by_size']
+    told = {(k, m): v for k, row in sizes.items() for m, v in row.items() if v is not None}
+    assert told == {('0.05', '2'): 0.0, ('0.4', '1'): 1.0}
+    assert figures['drop_scenes_above_0.01'] == ['kinect', 'realsense']
+
+
+def test_the_table_tells_the_kinds_apart(drawn, evaluate):
+    _, _, out, _ = evaluate(drawn)
+    rows = {words[0]: words[1:] for words in map(str.split, out.splitlines()) if words}
+    for kind, expected in (('near', KINECT), ('far', REALSENSE), ('all', POOLED)):
+        assert rows[kind] == [f'{value:.4f}' for value in expected.values()]
+    assert rows['0.4'] == ['-', '1.0000', '-', '-']
+
+
+def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate):
+    """A height of 3 m makes the pit the ground, and all else obstacles."""
+    text = (drawn / 'terrain.csv').read_text()
+    (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,3,'))
+    pit = {'ground_kept': 140 / 1080, 'ground_called_obstacle': 940 / 1080}
+    near = evaluate(drawn)[1]['by_kind']['near']
+    assert {name: near[name] for name in pit} == pytest.approx(pit)
+    assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
+
+
+@pytest.mark.parametrize(
+    ('damage', 'says'),
+    [
+        (lambda folder: (folder / 'truth/kinect.png').unlink(), 'truth/kinect.png: No such file'),
+        (lambda folder: (folder / 'size/kinect.tiff').unlink(), 'size/kinect.tiff: No such file'),
+        (lambda folder: cut(folder / 'truth/kinect.png'), 'truth/kinect.png: truth is 8x4'),
+        (lambda folder: cut(folder / 'depth/kinect.png'), 'depth/kinect.png: depth image is 8x4'),
+        (lambda folder: cut(folder / 'crossing/kinect.tiff'), 'crossing/kinect.tiff: '),
+        (lambda folder: write_class(folder, 4), 'truth/kinect.png: 4 is no class'),
+        (lambda folder: change(folder, 'kind,sensor', 'sort,sensor'), 'malformed table'),
+        (lambda folder: change(folder, ',-1,2,', ',-1,high,'), 'malformed table'),
+        (lambda folder: change(folder, ',-1,2,,,,', ''), 'malformed table'),
+    ],
+)
+def test_errors_are_one_line(drawn, evaluate, damage, says):
+    damage(drawn)
+    code, figures, _, err = evaluate(drawn)
+    assert code == 2 and figures is None
+    assert len(err.splitlines()) == 1 and says in err
+
+
+def cut(path):
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert cv2.imwrite(str(path), image[:4, :8])
+
+
+def write_class(folder, number):
+    path = str(folder / 'truth' / 'kinect.png')
+    image = cv2.imread(path, cv2.IMREAD_UNCHANGED)
+    image[0, 0] = number
+    assert cv2.imwrite(path, image)
+
+
+def change(folder, old, new):
+    path = folder / 'terrain.csv'
+    assert old in path.read_text()
+    path.write_text(path.read_text().replace(old, new))
+
+
+def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, evaluate, tmp_path):
+    assert evaluate(drawn, '--output', tmp_path / 'pictures')[0] == 0
+    picture = cv2.imread(str(tmp_path / 'pictures' / 'kinect_near.png'))[..., ::-1]
+    true, found, wrong = np.split(picture, 3, axis=1)
+    black, green, red, blue = (0, 0, 0), (0, 150, 0), (220, 0, 0), (0, 0, 240)
+    for place, colours in (
+        ((90, 30), (green, green, black)),  # kept
+        ((85, 65), (red, green, green)),  # an obstacle called ground
+        ((40, 45), (green, red, red)),  # ground called an obstacle
+        ((31, 120), (blue, blue, black)),  # a drop that is found
+        ((85, 125), (blue, green, black)),  # out of reach
+    ):
+        assert [tuple(part[place]) for part in (true, found, wrong)] == list(colours)
+
+
+def test_a_simulated_set_is_measured(run, evaluate, tmp_path):
+    """Without noise, ground, obstacles and drops are told; of each kind of scene by itself."""
+    folder = tmp_path / 'simulated'
+    size = '--width', 160, '--height', 120
+    words = 'simulate', 'terrain', '--sensor', 'ideal', '--scenes', 6, *size, '--output', folder
+    assert run(*words)[0] == 0
+    code, figures, out, _ = evaluate(folder)
+    assert code == 0 and f'{folder}: 6 images' in out
+    assert list(figures['per_image']) == [f'{number:06d}' for number in range(6)]
+    assert list(figures['by_kind']) == ['clutter', 'drop', 'hole', 'low boxes', 'room', 'waves']
+    pooled = figures['pooled']
+    assert min(pooled[name] for name in ('ground_kept', 'obstacle_found', 'drop_found')) > 0.99
