@@ -257,6 +257,20 @@ def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
     assert 'up imu in imu_link' in bench.log()
 
 
+def test_frames_come_by_the_same_subscription_when_up_is_to_come_from_elsewhere(bench):
+    """One that is made anew loses what is sent until publishers have found it."""
+
+    def subscription():
+        (endpoint,) = bench.node.get_subscriptions_info_by_topic(DEPTH)
+        return bytes(endpoint.endpoint_gid)
+
+    before = subscription()
+    for used in (True, False):
+        assert bench.set_parameters(use_imu=used)[0].successful
+        bench.until(lambda wanted=used: bench.node.count_subscribers('/imu') == wanted)
+        assert subscription() == before
+
+
 def test_acceleration_is_smoothed_by_the_time_constant():
     still = Reading('optical', 10**9, np.array([0.0, -GRAVITY, 0.0]))
     tilted = np.array([GRAVITY, 0.0, 0.0])

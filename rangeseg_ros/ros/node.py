@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import warnings
+from operator import attrgetter
 from typing import NoReturn
 
 import rclpy
@@ -41,8 +42,9 @@ from rangeseg_ros.ros.settings import Settings
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
 
-# Parameters that decide what the node subscribes to.
-_SUBSCRIBED_FOR = ('input', 'raw', 'use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
+# Parameters that decide which frames the node subscribes to, and what tells where they are.
+_frames = attrgetter('input', 'raw')
+_places = attrgetter('use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
 # Seconds until a listener is noticed while frames come: none that a person would.
 _EVENT_INTERVAL = 0.1
 
@@ -136,10 +138,13 @@ class SegmentPlanes(Node):
         if config is None:
             return
         self._config = config
-        restart = any(getattr(config, name) != getattr(before, name) for name in _SUBSCRIBED_FOR)
-        if restart and self._input:
+        if self._input and _frames(config) != _frames(before):
             self._unsubscribe()
             self._follow_demand()
+        # No frame is lost for it.
+        elif self._input and _places(config) != _places(before):
+            self._pipeline.locator.unsubscribe()
+            self._pipeline.locator.subscribe(config)
 
     def _follow_demand(self) -> None:
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
