@@ -6,12 +6,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rangeseg_ros.core.config import Config
     from rangeseg_ros.core.description.planes import Plane
+    from rangeseg_ros.core.mapping.transforms import Transform
     from rangeseg_ros.core.meaning.roles import ROLES
     from rangeseg_ros.core.options import ConfigError
     from rangeseg_ros.core.segmentation import Segmentation
     from rangeseg_ros.core.segmenter import Segmenter
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+    from rangeseg_ros.core.sequence import SequenceSegmenter
     from rangeseg_ros.io.corrections import corrected
     from rangeseg_ros.messages.clouds import planes_from_message
 
@@ -28,6 +30,8 @@ __all__ = [
     'RangeImageError',
     'Segmentation',
     'Segmenter',
+    'SequenceSegmenter',
+    'Transform',
     '__version__',
     'corrected',
     'planes_from_message',
@@ -37,12 +41,14 @@ __all__ = [
 _HOMES = {
     'core.config': ('Config',),
     'core.description.planes': ('Plane',),
+    'core.mapping.transforms': ('Transform',),
     'core.meaning.roles': ('ROLES',),
     'core.options': ('ConfigError',),
     'core.segmentation': ('Segmentation',),
     'core.segmenter': ('Segmenter',),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
+    'core.sequence': ('SequenceSegmenter',),
     'io.corrections': ('corrected',),
     'messages.clouds': ('planes_from_message',),
 }

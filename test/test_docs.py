@@ -8,11 +8,16 @@ from contextlib import suppress
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 
+from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.sensitivity import find_constants
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'rangeseg_ros'
@@ -47,6 +52,16 @@ def test_commands_and_their_options_exist(page):
             context = click.Context(command, parent=context)
         with suppress(click.BadOptionUsage):  # named alone, without what it takes
             command.make_parser(context).parse_args(words)
+
+
+@pytest.mark.parametrize('page', ['README.md', 'docs/python.md'])
+def test_python_that_is_shown_runs(page):
+    seen = simulate(kinect_room(3), SENSORS['kinect'](1), seed=3)
+    points = RangeImage.from_depth(seen.depth, seen.camera).points
+    known = {'depth': seen.depth, 'points': points, 'frames': [(0, seen.depth, np.eye(4))]}
+    for code in re.findall(r'```python\n(.*?)```', (ROOT / page).read_text(), re.S):
+        exec(code, known)
+    assert known['result'].planes
 
 
 def test_every_room_is_on_the_page_of_the_architecture():
