@@ -38,7 +38,9 @@ class _Flow(NamedTuple):
     Attributes
     ----------
     neighbour : (n, 4) int32
-        Node on each side, -1 for none; for the other, this one is on side (k + 2) % 4.
+        Node on each side, -1 for none.
+    back : (n, 4) int8
+        Side of that node which this one is on.
     residual : (n, 4) float64
         What the edge to that side can still take.
     terminal : (n,) float64
@@ -56,6 +58,7 @@ class _Flow(NamedTuple):
     """
 
     neighbour: NDArray[np.int32]
+    back: NDArray[np.int8]
     residual: NDArray[np.float64]
     terminal: NDArray[np.float64]
     parent: NDArray[np.int8]
@@ -79,7 +82,8 @@ def minimum_cut(
     excess : (n,) float64
         Cost of choosing a node, of either sign.
     neighbour : (n, 4) int32
-        Node on each side, -1 for none; for that node, this one is on side (k + 2) % 4.
+        Node on each of four sides, -1 for none, none twice; for that node, this one is on one of
+        its sides.
     link : (n, 4) float64
         Cost of the edge to that side if its ends are not chosen alike, not negative; the same
         seen from either end.
@@ -87,6 +91,7 @@ def minimum_cut(
     count = len(excess)
     flow = _Flow(
         neighbour,
+        _sides(neighbour),
         link.copy(),
         excess.copy(),
         np.full(count, _FREE, np.int8),
@@ -116,7 +121,7 @@ def minimum_cut(
                 q = neighbour[p, k]
                 if q < 0:
                     continue
-                opposite = (k + 2) % 4
+                opposite = flow.back[p, k]
                 free = flow.residual[q, opposite] if flow.sink[p] else flow.residual[p, k]
                 if free <= 0:
                     continue
@@ -154,7 +159,7 @@ def minimum_cut(
                 r = neighbour[q, k]
                 if r < 0 or flow.parent[r] == _FREE or flow.sink[r] != flow.sink[q]:
                     continue
-                opposite = (k + 2) % 4
+                opposite = flow.back[q, k]
                 free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
                 if free > 0 and not flow.queued[r]:
                     flow.queue[last] = r
@@ -171,6 +176,19 @@ def minimum_cut(
     for p in range(count):
         chosen[p] = flow.parent[p] != _FREE and flow.sink[p]
     return chosen
+
+
+@njit(cache=True, nogil=True)
+def _sides(neighbour: NDArray[np.int32]) -> NDArray[np.int8]:
+    """Side of each neighbour (n, 4) that the node itself is on."""
+    back = np.zeros(neighbour.shape, np.int8)
+    for p in range(len(neighbour)):
+        for k in range(4):
+            q = neighbour[p, k]
+            for side in range(4 if q >= 0 else 0):
+                if neighbour[q, side] == p:
+                    back[p, k] = side
+    return back
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -192,27 +210,24 @@ def _push_between_neighbours(flow: _Flow) -> None:
             terminal[p] -= pushed
             terminal[q] += pushed
             residual[p, k] -= pushed
-            residual[q, (k + 2) % 4] += pushed
+            residual[q, flow.back[p, k]] += pushed
 
 
 @njit(cache=True, nogil=True)
 def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
-    neighbour, residual, terminal, parent = (
-        flow.neighbour,
-        flow.residual,
-        flow.terminal,
-        flow.parent,
-    )
+    neighbour, back, residual = flow.neighbour, flow.back, flow.residual
+    terminal, parent = flow.terminal, flow.parent
     if flow.sink[p]:
-        p, side = neighbour[p, side], (side + 2) % 4
+        p, side = neighbour[p, side], back[p, side]
     pushed = residual[p, side]
     # From p up to the source, against the flow, and from its neighbour on to the sink.
     a = p
     while parent[a] != _TERMINAL:
         k = parent[a]
-        a = neighbour[a, k]
-        pushed = min(pushed, residual[a, (k + 2) % 4])
+        above = neighbour[a, k]
+        pushed = min(pushed, residual[above, back[a, k]])
+        a = above
     pushed = min(pushed, terminal[a])
     b = neighbour[p, side]
     while parent[b] != _TERMINAL:
@@ -224,14 +239,14 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     found = 0
     residual[p, side] -= pushed
     b = neighbour[p, side]
-    residual[b, (side + 2) % 4] += pushed
+    residual[b, back[p, side]] += pushed
     a = p
     while parent[a] != _TERMINAL:
         k = parent[a]
         above = neighbour[a, k]
         residual[a, k] += pushed
-        residual[above, (k + 2) % 4] -= pushed
-        if residual[above, (k + 2) % 4] <= 0:
+        residual[above, back[a, k]] -= pushed
+        if residual[above, back[a, k]] <= 0:
             parent[a] = _ORPHAN
             orphans[found] = a
             found += 1
@@ -244,7 +259,7 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     while parent[b] != _TERMINAL:
         k = parent[b]
         above = neighbour[b, k]
-        residual[above, (k + 2) % 4] += pushed
+        residual[above, back[b, k]] += pushed
         residual[b, k] -= pushed
         if residual[b, k] <= 0:
             parent[b] = _ORPHAN
@@ -269,7 +284,7 @@ def _adopt(flow: _Flow, p: int, time: int) -> bool:
         q = neighbour[p, k]
         if q < 0 or parent[q] == _FREE or flow.sink[q] != flow.sink[p]:
             continue
-        free = flow.residual[p, k] if flow.sink[p] else flow.residual[q, (k + 2) % 4]
+        free = flow.residual[p, k] if flow.sink[p] else flow.residual[q, flow.back[p, k]]
         if free <= 0:
             continue
         steps, r = np.int32(0), q
