@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numba import njit
@@ -16,32 +18,48 @@ def around(where: NDArray[np.bool_]) -> NDArray[np.uint8]:
     return result.astype(np.uint8, copy=False)
 
 
+class Sides(NamedTuple):
+    """How surfaces lie beside the ground, (count + 1,), first what is none.
+
+    Attributes
+    ----------
+    sizes : (...) int64
+        Cells of the surface.
+    height, noise : (...) float64
+        Medians of the height of the cells beside the ground, or of all, and of what a pixel of
+        them may err by, metres; NaN for surfaces that are too small.
+    width : (...) int64
+        Columns that these cells are in.
+    beyond : (...) bool
+        Whether it is beyond an edge that the ground falls from.
+    """
+
+    sizes: NDArray[np.int64]
+    height: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    width: NDArray[np.int64]
+    beyond: NDArray[np.bool_]
+
+
 @njit(cache=True, nogil=True)
 def sides_of(
     height: NDArray[np.float32],
     unsure: NDArray[np.float32],
     surface: NDArray[np.int32],
-    near: NDArray[np.uint8],
     count: int,
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Sizes of surfaces, and how far they lie above the ground.
-
-    Returns
-    -------
-    sizes : (count + 1,) int64
-    side, noise : (count + 1,) float64
-        Medians of the height of the cells beside the ground, or of all, and of what a pixel of
-        them may err by, metres; NaN for surfaces that are too small.
-    width : (count + 1,) int64
-        Columns that these cells are in.
-    """
+    near: NDArray[np.uint8],
+    fallen: NDArray[np.bool_],
+) -> Sides:
+    """Of the surfaces 1...count of cells (rows, columns), where `near` is beside the ground."""
     rows, columns = surface.shape
     sizes = np.zeros(count + 1, np.int64)
     beside = np.zeros(count + 1, np.int64)
+    beyond = np.zeros(count + 1, np.bool_)
     for i in range(rows):
         for c in range(columns):
             sizes[surface[i, c]] += 1
             beside[surface[i, c]] += near[i, c]
+            beyond[surface[i, c]] |= fallen[i, c]
     sizes[0] = 0
     # Cells in the order of their surfaces.
     start = np.zeros(count + 2, np.int64)
@@ -67,4 +85,4 @@ def sides_of(
         if filled[k]:
             side[k] = np.median(heights[start[k] : start[k] + filled[k]])
             noise[k] = np.median(noises[start[k] : start[k] + filled[k]])
-    return sizes, side, noise, width
+    return Sides(sizes, side, noise, width, beyond)

@@ -9,31 +9,35 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.meaning.beside import around, sides_of
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, cells_of
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.meaning.classes import OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.continuity import join_cells, surfaces_of
 from rangeseg_ros.core.meaning.edges import below_edges, ends_of, feet_of
 from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
     cell_heights,
     ground_field,
-    levels_of,
+    sums_of,
 )
 from rangeseg_ros.core.meaning.growth import grown
-from rangeseg_ros.core.meaning.pixels import BLUR, Said, decide, pixels_of
+from rangeseg_ros.core.meaning.pixels import decide, pixels_of
 from rangeseg_ros.core.meaning.seed import nearest_part
 from rangeseg_ros.core.meaning.steps import BROAD, Steps, noise_of
 from rangeseg_ros.core.meaning.under_robot import Stand, stand
-from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.meaning.verdicts import (
+    add_level,
+    level_with_ground,
+    parts_of,
+    set_apart,
+    verdicts_of,
+)
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.significance import SAMPLES
 
 # Standard deviations of the noise within which the ground is the ground.
 _CERTAIN = 3.0
@@ -173,93 +177,64 @@ def _terrain(
     slope = float(np.tan(limits.slope + limits.tilt))
     steps = Steps.of(slope, least, noise, sensor.correlation / size.rows)
     surface, count, steep, broken, links = surfaces_of(cells, steps)
-    measured = submit(levels_of, cells, cells.inverse > 0)
+    measured = sums_of(cells, cells.inverse > 0)
     under = stand(cells, surface, count, up, sensor, known, limits.slope, limits.tilt)
     if under.surface == 0:
         return _without_ground(image, cells, size, steep, up, known, limits)
     flat = GroundField.of(under.theta[None, None], size, up)
     height = cell_heights(cells, flat, size)
-    # The top of a step may hang together with the ground beside it just as well as the bottom.
-    risen_too = submit(below_edges, height, cells, steps, steep, broken, turned, True)
     start = nearest_part(height, cells.place, surface, under.surface, steps.least)
     own = surface == under.surface
     fallen = below_edges(height, cells, steps, steep, broken, turned) & own
-    risen = risen_too.result() & own & ~fallen
+    # The top of a step may hang together with the ground beside it just as well as the bottom.
+    risen = below_edges(height, cells, steps, steep, broken, turned, True) & own & ~fallen
     own &= ~(fallen | risen)
     ground = grown(height, cells, own, start & own, steps)
     # What remains is judged surface by surface, by its height beside the ground.
     plane = under.theta
-    continued = submit(_continued, cells, ground, measured.result(), plane, size, up)
-    part = fallen.view(np.uint8) + np.uint8(2) * risen.view(np.uint8) + np.uint8(1)
-    part *= ~(steep | ground)  # several times faster than to set some to 0
+    field, height = _continued(cells, ground, measured, plane, size, up)
+    part = parts_of(fallen, risen, steep, ground)
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
     near = around(ground)
     for _ in range(2):
         surface, count = join_cells(links, part)
-        field, height = continued.result()
-        beyond = np.zeros(count + 1, np.bool_)
-        beyond[surface[fallen]] = True
-        sizes, side, blur, width = sides_of(height, unsure, surface, near, count)
-        large = sizes >= SAMPLES
-        # Beyond an edge, where the noise would hide a drop, it is not known what is level.
-        hidden = beyond & (blur > limits.drop - steps.least)
-        level = large & (np.abs(side) <= steps.least) & ~hidden
+        sides = sides_of(height, unsure, surface, count, near, fallen)
+        level = level_with_ground(sides, steps.least, limits.drop)
         # Most of the columns around have risen and the ground goes on in others: what is as low
         # as ground may be is looked at by itself, or a box beside it would be level with it.
-        mixed = risen & (height <= steps.least) & level.take(surface)
-        if not mixed.any():
+        if not set_apart(level, surface, height, steps.least, risen, part):
             break
-        part[mixed] = 1
-        risen &= ~mixed
     if level.any():
-        ground |= level.take(surface)  # several times faster than level[surface]
-        continued = submit(_continued, cells, ground, measured.result(), plane, size, up)
-    # Little pieces among the ground are its noise.
-    verdict = np.where(beyond, np.int8(UNKNOWN), np.int8(GROUND))
-    verdict[0] = UNKNOWN
-    verdict[large] = np.where(side[large] > 0, OBSTACLE, DROP)
-    # A surface of far cells is as sure as each of them, as their errors are alike; beyond an edge
-    # as all patches of the distortion along it together, as the ground before it errs likewise.
+        add_level(level, surface, ground)
+        field, height = _continued(cells, ground, measured, plane, size, up)
     patch = max(math.sqrt(4 * math.pi) * sensor.distortion_length / size.columns, 1.0)
-    blur[beyond] /= np.sqrt(np.maximum(width[beyond] / patch, 1.0))
-    verdict[large & (np.abs(side) <= blur)] = HIDDEN
-    verdict[level] = GROUND
-    # Little pieces beside a drop may be its own.
-    fell = verdict == DROP
-    if fell.any():
-        low = fell.take(surface).view(np.uint8)
-        by_it = cv2.dilate(low, np.ones(BLUR, np.uint8)) > 0
-        beside = np.zeros(count + 1, np.bool_)
-        beside[surface[by_it]] = True
-        verdict[beside & ~large & (verdict == GROUND)] = HIDDEN
+    verdict = verdicts_of(sides, level, surface, patch)
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
-    kind = np.where(ground, np.int8(GROUND), verdict.take(surface))
-    field, height = continued.result()
     foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
-    doubt = decide(kind, fallen, foot, height, unsure, _EXCUSED * least)
+    said = decide(verdict, surface, ground, fallen, foot, height, unsure, _EXCUSED * least)
     bounds = limits.obstacle / 2, limits.drop / 2
-    classes, heights = pixels_of(image, field, size, Said(kind, doubt, unsure), bounds)
+    classes, heights = pixels_of(image, field, size, said, bounds)
     if known[0] == 0:
-        stands, falls = ends_of(kind, height, steps.least, turned)
+        stands, falls = ends_of(said.kind, height, steps.least, turned)
         # The rule of succession: nothing but the edge of a surface tells a table from a floor.
         ends = (stands + 1) / (stands + falls + 2)
         under = under._replace(confidence=under.confidence * ends)
-    below = CellTerrain(cells.place, height, kind, unsure, turned)
+    below = CellTerrain(cells.place, height, said.kind, unsure, turned)
     return Terrain(classes, heights, under, field, below)
 
 
 def _continued(
     cells: Cells,
     ground: NDArray[np.bool_],
-    measured: list[NDArray[np.float64]],
+    measured: NDArray[np.float64],
     plane: NDArray[np.float64],
     size: CellSize,
     up: NDArray[np.float64],
 ) -> tuple[GroundField, NDArray[np.float32]]:
     """The ground everywhere, and the heights of cells above it."""
-    theta = ground_field(levels_of(cells, ground), measured, plane)
+    theta = ground_field(sums_of(cells, ground), measured, plane)
     field = GroundField.of(theta, size, up)
     return field, cell_heights(cells, field, size)
 

@@ -23,17 +23,16 @@ _ROWS, _COLUMNS = 8, 2
 _PRIOR = 1 / 4
 
 
+@njit(cache=True, nogil=True)
 def ground_field(
-    ground: list[NDArray[np.float64]],
-    measured: list[NDArray[np.float64]],
-    base: NDArray[np.float64],
+    ground: NDArray[np.float64], measured: NDArray[np.float64], base: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Planes theta of the ground: theta . ray is its inverse range.
 
     Parameters
     ----------
-    ground, measured : list of (M, 9, N) float64
-        See `levels_of`: of the ground, and of all cells.
+    ground, measured : (M, 9, N) float64
+        See `sums_of`: of the ground, and of all cells.
     base : (3,) float64
         Plane under the robot.
 
@@ -41,13 +40,18 @@ def ground_field(
     -------
     (M, N, 3) float64, one for each block of the image.
     """
-    theta = np.array(base, np.float64).reshape(1, 1, 3)
-    for sums, squares in zip(reversed(ground), reversed(measured), strict=True):
-        theta = _fitted(sums, squares, theta)
+    # Over blocks, over 2 x 2 blocks, and so on up to the whole image.
+    levels = [(ground, measured)]
+    while levels[-1][0].size > 9:
+        levels.append((_halved(levels[-1][0]), _halved(levels[-1][1])))
+    theta = base.copy().reshape(1, 1, 3)
+    for k in range(len(levels) - 1, -1, -1):
+        theta = _fitted(levels[k][0], levels[k][1], theta)
     return theta
 
 
-def levels_of(cells: Cells, where: NDArray[np.bool_]) -> list[NDArray[np.float64]]:
+@njit(cache=True, nogil=True)
+def sums_of(cells: Cells, where: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Sums of the regression of some measured cells.
 
     Parameters
@@ -59,21 +63,10 @@ def levels_of(cells: Cells, where: NDArray[np.bool_]) -> list[NDArray[np.float64
 
     Returns
     -------
-    list of (M, 9, N) float64
-        ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse over blocks, over 2 x 2 blocks, and so
-        on up to the whole image.
+    (M, 9, N) float64
+        ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse over blocks.
     """
-    levels = [_moments(cells.ray, cells.inverse, where)]
-    while levels[-1].size > 9:
-        levels.append(_halved(levels[-1]))
-    return levels
-
-
-@njit(cache=True, nogil=True)
-def _moments(
-    ray: NDArray[np.float32], inverse: NDArray[np.float32], where: NDArray[np.bool_]
-) -> NDArray[np.float64]:
-    """See `levels_of`."""
+    ray, inverse = cells.ray, cells.inverse
     rows, columns = where.shape
     high = -(-rows // _ROWS)
     sums = np.zeros((high, 9, -(-columns // _COLUMNS)))

@@ -11,13 +11,10 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.meaning.cells import CellSize
 from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.ground_field import GroundField, planes_of_row, spread_planes
+from rangeseg_ros.core.meaning.verdicts import BLUR
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
-
-BLUR = (5, 3)
-"""Cells that the edge of a drop is blurred over: two rows on either side, as many as a Kinect's
-noise is correlated over, and the next column."""
 
 
 class Said(NamedTuple):
@@ -41,50 +38,61 @@ class Said(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def decide(
-    kind: NDArray[np.int8],
+    verdict: NDArray[np.int8],
+    surface: NDArray[np.int32],
+    ground: NDArray[np.bool_],
     fallen: NDArray[np.bool_],
     foot: NDArray[np.bool_],
     height: NDArray[np.float32],
     unsure: NDArray[np.float32],
     most: float,
-) -> NDArray[np.float32]:
-    """Complete what the surfaces of cells are said to be, and how far that may be doubted.
+) -> Said:
+    """What is said of cells, by their surfaces and by themselves.
+
+    Eight parameters: a kernel that takes arrays.
 
     Parameters
     ----------
-    kind : (rows, columns) int8
-        Changed: what is unknown beyond an edge is hidden, feet of obstacles are obstacles.
-    fallen, foot : (rows, columns) bool
-        Beyond an edge that the ground falls from, and feet.
+    verdict : (N,) int8
+        What surfaces are.
+    surface : (rows, columns) int32
+        Of each cell.
+    ground, fallen, foot : (rows, columns) bool
+        Ground; beyond an edge that it falls from, where what is unknown is hidden; and feet of
+        obstacles, which are obstacles.
     height, unsure : (rows, columns) float32
         Above the ground, and its noise, metres.
     most : float
         No noise excuses more, metres.
-
-    Returns
-    -------
-    (rows, columns) float32
-        `doubt` of `Said`.
     """
-    rows, columns = kind.shape
+    rows, columns = surface.shape
+    kind = np.empty((rows, columns), np.int8)
     doubt = np.empty(kind.shape, np.float32)
     bound = np.float32(most)
     high, wide = BLUR[0] // 2, BLUR[1] // 2
     for i in range(rows):
         for c in range(columns):
-            if foot[i, c]:
-                kind[i, c] = OBSTACLE
-            elif fallen[i, c] and kind[i, c] == UNKNOWN:
-                kind[i, c] = HIDDEN
+            own = np.int8(GROUND) if ground[i, c] else verdict[surface[i, c]]
+            if fallen[i, c] and own == UNKNOWN:
+                own = np.int8(HIDDEN)
+            kind[i, c] = np.int8(OBSTACLE) if foot[i, c] else own
             doubt[i, c] = min(unsure[i, c], bound)
     # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
+    low = np.zeros((rows + 2 * high, columns + 2 * wide), np.bool_)
     for i in range(rows):
         for c in range(columns):
-            if kind[i, c] == DROP or (kind[i, c] == HIDDEN and height[i, c] < 0):
-                for k in range(max(i - high, 0), min(i + high + 1, rows)):
-                    for m in range(max(c - wide, 0), min(c + wide + 1, columns)):
-                        doubt[k, m] = 0
-    return doubt
+            hidden = (kind[i, c] == HIDDEN) & (height[i, c] < 0)
+            low[i + high, c + wide] = (kind[i, c] == DROP) | hidden
+    beside = np.empty(low.shape[1], np.bool_)
+    for i in range(rows):
+        beside[:] = False
+        for k in range(BLUR[0]):
+            for c in range(len(beside)):
+                beside[c] |= low[i + k, c]
+        for k in range(BLUR[1]):
+            for c in range(columns):
+                doubt[i, c] = np.float32(0) if beside[c + k] else doubt[i, c]
+    return Said(kind, doubt, unsure)
 
 
 def pixels_of(
@@ -143,14 +151,15 @@ def _classify(
     width = inverse.shape[1]
     spread = spread_planes(field, width, first * size.rows, after * size.rows)
     # Heights between which a pixel is ground, and beyond which it is a drop or an obstacle.
+    of_cells = np.empty((4, said.kind.shape[1]), np.float32)
     groups = np.empty((4, said.kind.shape[1] * size.rows), np.float32)
     limits = np.empty((4, said.kind.shape[1] * size.columns), np.float32)
     planes = np.empty((4, width), np.float32)
     ray = first_rays(rays, first * size.rows)
     for i in range(first, after):
         planes_of_row(spread, ((i + 0.5) * size.rows) / field.rows - 0.5, planes)
-        _bound(said, i, size.rows, bounds, groups)
-        _widen(groups, limits)
+        _bound(said, i, bounds, of_cells)
+        _widen(of_cells, groups, limits)
         for v in range(i * size.rows, min((i + 1) * size.rows, len(inverse))):
             next_rays(rays, pinhole, v, ray)
             for j in range(width):
@@ -170,34 +179,36 @@ def _classify(
 
 
 @njit(cache=True, inline='always')
-def _bound(
-    said: Said, i: int, number: int, bounds: tuple[float, float], limits: NDArray[np.float32]
-) -> None:
-    """Limits of row i of cells, each as often as it has groups of four pixels."""
-    for c in range(said.kind.shape[1]):
+def _bound(said: Said, i: int, bounds: tuple[float, float], limits: NDArray[np.float32]) -> None:
+    """Limits of row i of cells, without a branch, as vector instructions."""
+    deep, tall, endless = np.float32(-bounds[1]), np.float32(bounds[0]), np.float32(np.inf)
+    for c in range(limits.shape[1]):
         kind, doubt, unsure = said.kind[i, c], said.doubt[i, c], said.unsure[i, c]
-        low, high = np.float32(-bounds[1]), np.float32(bounds[0])
-        if kind == GROUND:
-            low, high = min(low, -doubt), max(high, doubt)
+        low = min(deep, -doubt) if kind == GROUND else deep
+        high = max(tall, doubt) if kind == GROUND else tall
         drop, obstacle = min(low, -unsure), max(high, unsure)
-        if kind == HIDDEN:
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-        elif kind > GROUND:
-            low, high = np.float32(np.inf), np.float32(-np.inf)
-            drop = high if kind == OBSTACLE else low
-            obstacle = drop
-        for j in range(c * number, (c + 1) * number):
-            limits[0, j], limits[1, j], limits[2, j], limits[3, j] = drop, low, high, obstacle
+        never = (kind == HIDDEN) | (kind > GROUND)
+        whole = -endless if kind == OBSTACLE else endless
+        limits[0, c] = whole if kind > GROUND else drop
+        limits[1, c] = endless if never else low
+        limits[2, c] = -endless if never else high
+        limits[3, c] = whole if kind > GROUND else obstacle
 
 
 @njit(cache=True, inline='always')
-def _widen(groups: NDArray[np.float32], limits: NDArray[np.float32]) -> None:
-    """Limits of pixels from those of groups of four, as cells are multiples of four wide.
+def _widen(
+    cells: NDArray[np.float32], groups: NDArray[np.float32], limits: NDArray[np.float32]
+) -> None:
+    """Limits of pixels from those of cells, by those of groups of four, as many as fit a cell.
 
     Written out and with indices that have no sign, the four are one vector instruction.
     """
     one, two, three, four = np.uint64(1), np.uint64(2), np.uint64(3), np.uint64(4)
-    for n in range(len(groups)):
+    number = np.uint64(groups.shape[1] // cells.shape[1])
+    for n in range(len(cells)):
+        for c in range(np.uint64(cells.shape[1])):
+            for k in range(number):
+                groups[n, c * number + k] = cells[n, c]
         for g in range(np.uint64(groups.shape[1])):
             value, j = groups[n, g], four * g
             limits[n, j] = value
