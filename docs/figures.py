@@ -196,7 +196,7 @@ def stages(image, config):
     labels = labelling.labels
     pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
     regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-    regions, _ = method.flat_regions(regions, bridges, fine, sensor, config.flatness)
+    regions, *_ = method.flat_regions(regions, bridges, fine, sensor, grid, config.flatness)
     pictures['regions'] = overlay(image.inverse, regions)
     result = Segmenter(config).segment(image)
     pictures['planes'] = overlay(image.inverse, result.labels, result.planes)

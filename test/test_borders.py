@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.fitting.borders import find_borders
+from rangeseg_ros.core.regions import drop_regions
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -16,14 +17,18 @@ def regions_of(seed):
     return regions[: height + 2, : 2 * width + 3].astype(np.uint16), random
 
 
-@pytest.mark.parametrize('seed', range(20))
-def test_borders_are_those_of_every_pixel(seed):
-    regions, random = regions_of(seed)
+def grid_of(regions, random):
     height, width = regions.shape
-    grid = Grid(
+    return Grid(
         random.integers(0, 2, (height, width - 1)).astype(np.float32),
         random.integers(0, 2, (height - 1, width)).astype(np.float32),
     )
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_borders_are_those_of_every_pixel(seed):
+    regions, random = regions_of(seed)
+    grid = grid_of(regions, random)
     borders = find_borders(regions, grid, 9)
     framed = np.pad(regions, 1)
     for k in range(1, 9):
@@ -52,3 +57,18 @@ def test_borders_are_those_of_every_pixel(seed):
         found.update({(k, m): count for m, count in zip(others, counts, strict=True)})
     assert found == met
     assert borders.start[-1] == len(borders.other)
+
+
+@pytest.mark.parametrize('seed', range(20))
+def test_borders_without_some_regions_are_those_of_the_others(seed):
+    regions, random = regions_of(seed)
+    grid, dropped = grid_of(regions, random), random.random(9) < 0.3
+    dropped[0] = False
+    kept = find_borders(drop_regions(regions, dropped), grid, np.count_nonzero(~dropped))
+    found = find_borders(regions, grid, 9).without(dropped)
+    # What ends region 0 are the others.
+    np.testing.assert_array_equal(found.box[1:], kept.box[1:])
+    np.testing.assert_array_equal(found.length[1:], kept.length[1:])
+    for own, other in zip(found[2:], kept[2:], strict=True):
+        np.testing.assert_array_equal(own, other)
+        assert own.dtype == other.dtype

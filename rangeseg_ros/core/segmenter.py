@@ -11,6 +11,7 @@ from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
+from rangeseg_ros.core.fitting.borders import Borders
 from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
@@ -98,8 +99,8 @@ class Segmenter:
         grid = weights(whole, jumps, config.weighting)
         watch.lap('edges')
         if config.method == 'planes':
-            regions, first, labelling = self._by_planes(whole, blocks, grid, sensor, config, watch)
-            regions, fits = by_planes.unite_regions(regions, first, image, blocks, sensor, grid)
+            flat, labelling = self._by_planes(whole, blocks, grid, sensor, config, watch)
+            regions, fits = by_planes.unite_regions(*flat, image, blocks, sensor)
         else:
             regions, labelling = self._by_normals(whole, grid, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
@@ -127,15 +128,15 @@ class Segmenter:
         sensor: SensorModel,
         config: Config,
         watch: Stopwatch,
-    ) -> tuple[NDArray[np.uint16], FirstPlanes, Labelling]:
-        """Regions, their first planes and the labelling they are made from: planes as labels."""
+    ) -> tuple[tuple[NDArray[np.uint16], FirstPlanes, Borders], Labelling]:
+        """Regions, their first planes and borders, and the labelling they are made from."""
         least = least_pixels(config.min_pixels, image.shape)
         labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
         labels = labelling.labels
         regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-        found = by_planes.flat_regions(regions, image, blocks, sensor, config.flatness)
+        found = by_planes.flat_regions(regions, image, blocks, sensor, grid, config.flatness)
         watch.lap('regions')
-        return *found, labelling
+        return found, labelling
 
     def _by_normals(
         self,

@@ -6,7 +6,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.quadratics import add_terms, explained
+from rangeseg_ros.core.by_planes.bends import Allowed, Residuals, find_bent, find_facets
+from rangeseg_ros.core.by_planes.quadratics import add_terms
+from rangeseg_ros.core.fitting.borders import Borders
 from rangeseg_ros.core.fitting.first_planes import STRIDE, FirstPlanes
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
@@ -14,26 +16,19 @@ from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, squares_left
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
-from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
-
-# The distortion of real Kinects over planes of A pixels, measured on hand-annotated frames, has a
-# quarter of its overall standard deviation over a square as wide as itself and grows as A^0.39.
-# Real planes stay within two and a half times that, and the distortion is measured to within a
-# tenth.
-_SHARE, _EXPONENT = 0.75**2, 0.78
-# Chi-squared of three terms of curvature, for pixels whose noise is independent.
-_CHI2_LIMIT = chi2_quantile(3, 0.99)
+from rangeseg_ros.core.significance import OUTLIER
 
 
 def find_curved(
     regions: NDArray[np.uint16],
     first: FirstPlanes,
+    borders: Borders,
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
     flatness: float,
 ) -> NDArray[np.bool_]:
-    """Test the second-order part of each region's residuals.
+    """Test the second-order part of the residuals of each region, and of those that touch.
 
     What is asked for is smooth: of a block of 4 x 4 pixels that a region fills its sums tell it,
     elsewhere every other row and column.
@@ -43,6 +38,8 @@ def find_curved(
     regions : (H, W) uint16
         0...M, 0 for no region.
     first : FirstPlanes
+        Of the regions.
+    borders : Borders
         Of the regions.
     image : RangeImage
         (H, W).
@@ -66,41 +63,24 @@ def find_curved(
     pixels = regions, filled, image.inverse, image.rays, image.pinhole
     planes = blocks, sensor, theta, slope, limit
     parts = map_halves(_normal_equations, len(filled), *pixels, *planes)
-    powers, right, sizes = (a + b for a, b in zip(*parts, strict=True))
+    powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
+    residuals = Residuals(powers, right, square, area, scale, covered, ratio)
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
-    return _bent(covered, ratio, powers, right, sizes, around, alike, float(flatness))
+    allowed = Allowed(around, alike, float(flatness))
+    bent = find_bent(residuals, allowed)
+    if not image.pinhole:
+        return bent
+    return find_facets(bent, borders, residuals, allowed, _planes(theta, image.rays), sensor)
 
 
-@njit(cache=True, nogil=True)
-def _bent(
-    covered: NDArray[np.float64],
-    ratio: NDArray[np.float64],
-    powers: NDArray[np.float64],
-    right: NDArray[np.float64],
-    sizes: NDArray[np.float64],
-    around: float,
-    alike: float,
-    flatness: float,
-) -> NDArray[np.bool_]:
-    """Which regions bend by more than distortion and noise do, and than `flatness`.
-
-    More than seven parameters: what is known of the regions, their pixels, the ratio of the
-    distortion to their noise and the three sums of `_normal_equations`; the pixels that the
-    distortion is alike `around`, and those whose noise is `alike`.
-    """
-    result = np.zeros(len(covered), np.bool_)
-    for k in range(1, len(result)):
-        size, (square, area, scale) = max(powers[k, 0], 1.0), sizes[:, k]
-        flat, more = explained(powers[k], right[k])
-        # What the quadratic explains more than its constant and linear terms do.
-        bending = more / size
-        distortion = _SHARE * ratio[k] * (covered[k] / around) ** _EXPONENT
-        # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
-        noise = max((square - flat - more) / size, 1.0)
-        visible = bending > distortion + alike * _CHI2_LIMIT * noise / size
-        wide = flatness**2 * area * covered[k] / size
-        result[k] = visible and bending * (scale / size) ** 2 > wide
-    return result
+def _planes(theta: NDArray[np.float64], rays: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Planes as `find_facets` takes them."""
+    height, width = rays.shape[:2]
+    first = rays[0, 0].astype(np.float64)
+    # Pixels are 2 / width apart, and the first is at -1 and -height / width.
+    across = (rays[0, -1] - first) * width / (2 * max(width - 1, 1))
+    down = (rays[-1, 0] - first) * width / (2 * max(height - 1, 1))
+    return theta @ np.column_stack([first + across + down * height / width, across, down])
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.borders import find_borders
+from rangeseg_ros.core.fitting.borders import Borders, find_borders
 from rangeseg_ros.core.fitting.coplanar import group_coplanar
 from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
@@ -111,24 +111,27 @@ def flat_regions(
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
+    grid: Grid,
     flatness: float,
-) -> tuple[NDArray[np.uint16], FirstPlanes]:
-    """Regions (H, W) without those that bend, numbered anew, and their first planes.
+) -> tuple[NDArray[np.uint16], FirstPlanes, Borders]:
+    """Regions (H, W) without those that bend, numbered anew, their first planes and borders.
 
     See `find_curved`.
     """
+    pending = submit(find_borders, regions, grid, int(regions.max()) + 1)
     first = FirstPlanes.of(regions, image, blocks, sensor)
-    curved = find_curved(regions, first, image, blocks, sensor, flatness)
-    return drop_regions(regions, curved), first.without(curved)
+    borders = pending.result()
+    curved = find_curved(regions, first, borders, image, blocks, sensor, flatness)
+    return drop_regions(regions, curved), first.without(curved), borders.without(curved)
 
 
 def unite_regions(
     regions: NDArray[np.uint16],
     first: FirstPlanes,
+    borders: Borders,
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
-    grid: Grid,
 ) -> tuple[NDArray[np.uint16], Fits]:
     """Unite regions that touch and whose planes agree; the regions and their planes.
 
@@ -138,17 +141,17 @@ def unite_regions(
         0...M.
     first : FirstPlanes
         Of the regions.
+    borders : Borders
+        Of the regions.
     image : RangeImage
         (H, W).
     blocks : Blocks
         Of the image.
     sensor : SensorModel
-    grid : Grid
     """
     count = len(first.theta)
-    borders = submit(find_borders, regions, grid, count)
     fits = Fits.of(regions, image, sensor, blocks, first, borders)
-    group = group_coplanar(fits, borders.result(), sensor.agreement)
+    group = group_coplanar(fits, borders, sensor.agreement)
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)

@@ -40,6 +40,17 @@ class Borders(NamedTuple):
     links: NDArray[np.intp]
     cuts: NDArray[np.intp]
 
+    def without(self, dropped: NDArray[np.bool_]) -> Borders:
+        """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
+        if not dropped.any():
+            return self
+        table, kept = np.cumsum(~dropped) - 1, ~dropped
+        one = np.arange(len(kept)).repeat(np.diff(self.start))
+        both = kept[one] & kept[self.other]
+        start = np.cumsum([0, *np.bincount(table[one[both]], minlength=kept.sum())])
+        touching = table[self.other[both]], self.links[both], self.cuts[both]
+        return Borders(self.box[kept], self.length[kept], start, *touching)
+
 
 @njit(cache=True, nogil=True)
 def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders:

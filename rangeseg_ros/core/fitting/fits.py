@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -22,7 +21,6 @@ from rangeseg_ros.core.fitting.uncertainty import (
     systematic_field,
     theta_covariances,
 )
-from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.moments import COUNT, SIZE, cofactors, fit_all
@@ -84,7 +82,7 @@ class Fits(NamedTuple):
         sensor: SensorModel,
         blocks: Blocks | None = None,
         first: FirstPlanes | None = None,
-        borders: Future[Borders] | None = None,
+        borders: Borders | None = None,
     ) -> Fits:
         """Fit a plane to every region.
 
@@ -107,15 +105,15 @@ class Fits(NamedTuple):
             Of the image, where they are known.
         first : FirstPlanes, optional
             Of the labels, where they are known.
-        borders : Future of Borders, optional
-            Of the labels, where they are asked for already.
+        borders : Borders, optional
+            Of the labels, where they are known.
         """
         blocks = blocks or Blocks.of(image)
         first = first or FirstPlanes.of(labels, image, blocks, sensor)
         count = len(first.theta)
-        borders = borders or submit(find_borders, labels, weights(image), count)
+        borders = borders or find_borders(labels, weights(image), count)
         inner = interior(labels, first.filled)
-        cells = Cells.empty(borders.result().box, borders.result().length)
+        cells = Cells.empty(borders.box, borders.length)
         cells, pixels, outliers, explained = sums_without_doubtful(
             cells, labels, image, first.theta, sensor, blocks, inner
         )
