@@ -39,7 +39,7 @@ class _Flow(NamedTuple):
     ----------
     neighbour : (n, 4) int32
         Node on each side, -1 for none.
-    back : (n, 4) int8
+    back : (n, 4) uint8
         Side of that node which this one is on.
     residual : (n, 4) float64
         What the edge to that side can still take.
@@ -58,7 +58,7 @@ class _Flow(NamedTuple):
     """
 
     neighbour: NDArray[np.int32]
-    back: NDArray[np.int8]
+    back: NDArray[np.uint8]
     residual: NDArray[np.float64]
     terminal: NDArray[np.float64]
     parent: NDArray[np.int8]
@@ -179,15 +179,16 @@ def minimum_cut(
 
 
 @njit(cache=True, nogil=True)
-def _sides(neighbour: NDArray[np.int32]) -> NDArray[np.int8]:
+def _sides(neighbour: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Side of each neighbour (n, 4) that the node itself is on."""
-    back = np.zeros(neighbour.shape, np.int8)
+    back = np.zeros(neighbour.shape, np.uint8)
     for p in range(len(neighbour)):
         for k in range(4):
-            q = neighbour[p, k]
-            for side in range(4 if q >= 0 else 0):
-                if neighbour[q, side] == p:
-                    back[p, k] = side
+            q, side = neighbour[p, k], (k + 2) % 4
+            # In a grid it is that one.
+            while q >= 0 and neighbour[q, side] != p:
+                side = (side + 1) % 4
+            back[p, k] = side
     return back
 
 
