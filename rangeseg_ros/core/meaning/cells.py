@@ -115,7 +115,8 @@ def _means(
     # Of the left and the right halves: sums of rays and inverse ranges, and their number.
     sums = np.empty((5, 2, cells.inverse.shape[1]), np.float32)
     upper, lower = first_rays(rays, first * size.rows), first_rays(rays, first * size.rows)
-    # The same of rays as if all pixels were measured.
+    # The same of rays as if all pixels were measured, and half the pixels of a half.
+    half = np.float32(0.5) * np.float32(size.rows * (size.columns // 2))
     all_rays = np.empty((3, 2, cells.inverse.shape[1]), np.float32)
     for i in range(first, after):
         top, bottom = i * size.rows, min((i + 1) * size.rows, inverse.shape[0])
@@ -127,8 +128,10 @@ def _means(
         next_rays(rays, pinhole, top, upper)
         next_rays(rays, pinhole, bottom - 1, lower)
         for k in range(3):
-            if k == 1 or not pinhole or i == first:
+            if not pinhole or i == first:
                 _add_rays(size, upper[k], lower[k], all_rays[k])
+            elif k == 1:  # the same in a whole row
+                all_rays[k] = (upper[k, 0] + lower[k, 0]) * half
         _add_halves(size, total, number, sums)
         _add_single(top, bottom, inverse, rays, size, all_rays, sums)
         _divide(i, sums, size, axes, sensor, cells)

@@ -74,11 +74,12 @@ def _started(
 
     Returns
     -------
-    sums : (M, columns of tiles, 10) float64
+    sums : (M, columns of tiles + 2, 10) float64
         Of the ground in a block of tiles and those above and below: sums of the regression.
-    rest : (rows of tiles, columns of tiles, 4) float64
+    rest : (rows of tiles + 2 * 2, columns of tiles + 2 * 1, 4) float64
         Of the candidates in a tile that are not ground: their number, and sums of height and
-        place.
+        place. As of `sums`, a rim of zeros has every window the same size, which the compiler
+        writes out.
     order : (N,) int64
         Tiles with candidates that are not ground: the distance of the nearest one, then row and
         column. Floats that are not negative are in the order of their bits.
@@ -86,8 +87,8 @@ def _started(
     rows, columns = height.shape
     place = cells.place
     high, wide = -(-rows // ROWS), -(-columns // COLUMNS)
-    sums = np.zeros((-(-high // _HIGH), wide, 10))
-    rest = np.zeros((high, wide, 4))
+    sums = np.zeros((-(-high // _HIGH), wide + 2, 10))
+    rest = np.zeros((high + 2 * _BESIDE[0], wide + 2 * _BESIDE[1], 4))
     distance = np.full((high, wide), np.float32(np.inf))
     for i in range(rows):
         for c in range(columns):
@@ -98,14 +99,14 @@ def _started(
                 m, n = i // ROWS, c // COLUMNS
                 one = _plus_cell(_NO_CELLS, height, place, i, c)
                 for k in range(len(one)):
-                    rest[m, n, k] += one[k]
+                    rest[m + _BESIDE[0], n + _BESIDE[1], k] += one[k]
                 x, y = place[1, i, c], place[2, i, c]
                 distance[m, n] = min(distance[m, n], x * x + y * y)
     order = np.empty(high * wide, np.int64)
     bits, count = distance.view(np.int32), 0
     for m in range(high):
         for n in range(wide):
-            if rest[m, n, 0] > 0:
+            if rest[m + _BESIDE[0], n + _BESIDE[1], 0] > 0:
                 order[count] = (np.int64(bits[m, n]) << 32) | (m << _BITS) | n
                 count += 1
     return sums, rest, order[:count]
@@ -130,7 +131,7 @@ def _grow(
         for k in range(len(order)):
             tile = order[k] if turn == 0 else order[len(order) - 1 - k]
             m, n = (tile >> _BITS) % (1 << _BITS), tile % (1 << _BITS)
-            if rest[m, n, 0] > 0:
+            if rest[m + _BESIDE[0], n + _BESIDE[1], 0] > 0:
                 _grow_tile(m, n, height, cells, candidate, steps, sums, rest, ground)
 
 
@@ -170,12 +171,12 @@ def _grow_tile(
         p, q = p * steps.slope / steepness, q * steps.slope / steepness
     # Noise lets single cells of a step through, not the mean of what is not yet ground around.
     count = rise = ahead = aside = 0.0
-    for i in range(max(m - _BESIDE[0], 0), min(m + _BESIDE[0] + 1, rest.shape[0])):
-        for j in range(max(n - _BESIDE[1], 0), min(n + _BESIDE[1] + 1, rest.shape[1])):
-            count += rest[i, j, 0]
-            rise += rest[i, j, 1]
-            ahead += rest[i, j, 2]
-            aside += rest[i, j, 3]
+    for i in range(2 * _BESIDE[0] + 1):
+        for j in range(2 * _BESIDE[1] + 1):
+            count += rest[m + i, n + j, 0]
+            rise += rest[m + i, n + j, 1]
+            ahead += rest[m + i, n + j, 2]
+            aside += rest[m + i, n + j, 3]
     off = rise - count * h - p * (ahead - count * x) - q * (aside - count * y)
     if abs(off) > count * steps.least:
         return
@@ -192,7 +193,7 @@ def _grow_tile(
     if less[0] > 0:
         _add(sums, m // _HIGH, n, gain)
         for k in range(len(less)):
-            rest[m, n, k] -= less[k]
+            rest[m + _BESIDE[0], n + _BESIDE[1], k] -= less[k]
 
 
 @njit(cache=True, inline='always')
@@ -200,14 +201,14 @@ def _add(sums: NDArray[np.float64], b: int, n: int, gain: tuple[float, ...]) -> 
     """Add to the sums of a block and of those above and below it."""
     for i in range(max(b - 1, 0), min(b + 2, sums.shape[0])):
         for k in range(len(gain)):
-            sums[i, n, k] += gain[k]
+            sums[i, n + 1, k] += gain[k]
 
 
 @njit(cache=True, inline='always')
 def _around(sums: NDArray[np.float64], b: int, n: int) -> tuple[float, ...]:
     """Sums over three blocks by three, one by one, as the compiler keeps numbers in registers."""
     w = x = y = xx = xy = yy = h = xh = yh = number = 0.0
-    for j in range(max(n - 1, 0), min(n + 2, sums.shape[1])):
+    for j in range(n, n + 3):
         w += sums[b, j, 0]
         x += sums[b, j, 1]
         y += sums[b, j, 2]
