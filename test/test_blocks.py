@@ -6,6 +6,7 @@ import pytest
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks, slope_of
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -133,6 +134,16 @@ def test_slopes_and_residuals_are_those_of_the_planes():
     # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
     expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
     assert slope_of(blocks, i, j, (1.0, 1.0)) == pytest.approx(max(expected, 0), rel=1e-4)
+
+
+@pytest.mark.parametrize('theta', [(0.0, 0.0, 0.3), (0.1, -0.8, 0.9), (-0.6, 0.1, 1.5)])
+def test_an_exact_plane_leaves_no_more_than_float32_rounds(theta):
+    """Pixels of a large image are so near in direction that its planes are hardly determined."""
+    camera = Camera(1280, 720, 700.0, 700.0, 639.5, 359.5)
+    inverse = np.maximum(camera.rays.astype(float) @ theta, 0).astype(np.float32)
+    blocks = Blocks.of(RangeImage(camera.rays, inverse, camera))
+    whole = blocks.moments[..., COUNT] == 16
+    assert np.quantile(np.sqrt(blocks.residual[whole] / 13), 0.99) < 2e-5
 
 
 def test_weights_count_in_variances_of_the_sensor():

@@ -154,6 +154,19 @@ def test_the_stronger_planes_bend_the_more_distortion_is_measured(bend):
     assert 0.5 * bend < sensor.distortion < 1.5 * bend
 
 
+@pytest.mark.parametrize('width', [8, 14, 20, 28])
+def test_errors_that_are_smooth_alone_are_measured(width):
+    """As of stereo matched by networks: no pixel errs other than those beside it.
+
+    The widest vary little within the largest blocks that there are enough of.
+    """
+    measured = []
+    for seed in range(3):
+        field = smooth_field(CAMERA.shape, (width, width), np.random.default_rng(seed))
+        measured.append(sensor_of(three_planes() + 0.0012 * field).distortion)
+    assert np.mean(measured) == pytest.approx(0.0012, rel=0.3)
+
+
 def test_holes_hide_no_distortion():
     """Of every second row, and of a third of all pixels, that are missing."""
     random = np.random.default_rng(7)

@@ -20,12 +20,19 @@ from rangeseg_ros.core.fitting.scale import (
     variance_ratio,
 )
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, merged_alone, slope_of
+from rangeseg_ros.core.sensing.sensor import correlated_residuals
 from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 # Chi-squared of 9 degrees of freedom, of what one plane through four blocks leaves, over its mean:
 # what is rougher is no part of a plane, and the median.
 _BENT = chi2_quantile(9) / 9
 _MEDIAN = chi2_quantile(9, 0.5) / 9
+# Widths of a Gaussian kernel in quarters of a block's side. What one plane leaves beyond those of
+# four such blocks of a field smoothed with it, over that of white noise; and by how many times
+# this exceeds what it is of blocks half as large.
+_WIDTHS = 1.4 * 2.0 ** (np.arange(13) / 4)
+_APART = np.array([correlated_residuals(width)[3] for width in _WIDTHS])
+_GROWTH = _APART / np.array([correlated_residuals(2 * width)[3] for width in _WIDTHS])
 
 
 class Compared(NamedTuple):
@@ -111,6 +118,7 @@ def over_scales(
     way: tuple[float, float],
     in_range: bool,
     shown: Errors,
+    length: float,
 ) -> Nested:
     """What blocks of 8 pixels show, and larger ones as long as there are enough of them.
 
@@ -126,6 +134,8 @@ def over_scales(
         Whether the sensor errs in range: lasers do so alone.
     shown : Errors
         Those new in every pixel, as the smallest blocks show them.
+    length : float
+        Of the distortion at most, pixels.
     """
     none = Errors(0.0, 0.0, 0.0)
     distortion, side = none, 2 * BLOCK
@@ -133,6 +143,8 @@ def over_scales(
     within.clear()
     freedom.clear()
     between = filled = 1.0
+    before = most = 0.0
+    hidden = 1.0
     while compared.enough:
         scale = compared.scale
         relative, excess = np.empty(len(scale.place)), np.empty(len(scale.place))
@@ -152,14 +164,32 @@ def over_scales(
             filled = pixels / BLOCK**2
         # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
         smooth = Errors(8 / pixels * bending.constant, 8 / pixels * bending.quartic, 0.0)
-        if _typical(smooth, scale) > _typical(distortion, scale):
-            distortion = smooth
+        typical = _typical(smooth, scale)
+        # Where smaller blocks show nothing, only that it may be as wide as it is known to be.
+        hidden = _hidden(typical / before, 8 * length / side) if before > 0 else 1.0
+        before = typical
+        if typical > most:
+            most, distortion = typical, smooth
         flat = _not_bent(compared, blocks, way, shown, bending)
         side *= 2
         larger = merged_alone(blocks, rays, side)
         compared = compare(flat, blocks.residual, compared.level, larger, way)
         blocks = larger
+    # Where the largest blocks show the most, larger ones would show more.
+    if before == most > 0:
+        distortion = Errors(hidden * distortion.constant, hidden * distortion.quartic, 0.0)
     return Nested(np.array(within), np.array(freedom), between, filled, distortion)
+
+
+@njit(cache=True)
+def _hidden(growth: float, widest: float) -> float:
+    """Variance of a distortion over 8 M / n, where M / n is so many times that of half the side.
+
+    Of one wider than the blocks, as such growth tells: by a Gaussian kernel of the width that
+    grows so, of so many quarters of their side at most.
+    """
+    width = min(np.interp(growth, _GROWTH, _WIDTHS), widest)
+    return max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
 
 
 @njit(cache=True, nogil=True)

@@ -84,10 +84,12 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if not compared.enough:
         return prior
     quantile, freedom = smallest.result()
-    # What is new in every pixel shows in the smallest blocks.
+    # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
     shown = noise.times(quantile / share(freedom))
+    shown = shown._replace(constant=max(shown.constant, rounding**2))
     # Lasers err in range alone.
-    nested = over_scales(compared, coarse, image.rays, way, noise.quartic > 0, shown)
+    length = prior.distortion_length
+    nested = over_scales(compared, coarse, image.rays, way, noise.quartic > 0, shown, length)
     shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
     within = list(np.array([quantile, *nested.within]) / shares)
     distortion = nested.distortion

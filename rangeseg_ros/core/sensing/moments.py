@@ -100,7 +100,10 @@ def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
     x = (aa * p + bb * q + cc * r) / determinant if known else 0.0
     y = (bb * p + dd * q + ee * r) / determinant if known else 0.0
     z = (cc * p + ee * q + ff * r) / determinant if known else 0.0
-    left = square - x * p - y * q - z * r
+    # Not square - x p - y q - z r: what the plane is off by, as pixels lie in nearly one
+    # direction, counts there at once, here by its square.
+    left = square - 2 * (x * p + y * q + z * r)
+    left += x * (a * x + 2 * (b * y + c * z)) + y * (d * y + 2 * e * z) + f * z * z
     return x, y, z, left if left > 0 else 0.0
 
 
@@ -134,23 +137,26 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
     return moments[CHI2] - 2 * (a * moments[6] + b * moments[7] + c * moments[8]) + square
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
     """Weighted sum of the squared residuals of one plane for two of N moment vectors (N, 13).
 
     What `fit` returns for their sum, without memory traffic, views and their reference counts:
     growing spends its time here.
     """
-    a, b = moments[k, 0] + moments[m, 0], moments[k, 1] + moments[m, 1]
-    c, d = moments[k, 2] + moments[m, 2], moments[k, 3] + moments[m, 3]
-    e, f = moments[k, 4] + moments[m, 4], moments[k, 5] + moments[m, 5]
-    p, q = moments[k, 6] + moments[m, 6], moments[k, 7] + moments[m, 7]
-    r, square = moments[k, 8] + moments[m, 8], moments[k, CHI2] + moments[m, CHI2]
-    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-    if determinant <= 1e-13 * a * d * f:
-        return square
-    explained = p * (aa * p + 2 * (bb * q + cc * r)) + q * (dd * q + 2 * ee * r) + ff * r * r
-    return max(square - explained / determinant, 0.0)
+    sums = (
+        moments[k, 0] + moments[m, 0],
+        moments[k, 1] + moments[m, 1],
+        moments[k, 2] + moments[m, 2],
+        moments[k, 3] + moments[m, 3],
+        moments[k, 4] + moments[m, 4],
+        moments[k, 5] + moments[m, 5],
+        moments[k, 6] + moments[m, 6],
+        moments[k, 7] + moments[m, 7],
+        moments[k, 8] + moments[m, 8],
+        moments[k, CHI2] + moments[m, CHI2],
+    )
+    return plane_of(sums)[3]
 
 
 @njit(cache=True)
