@@ -38,6 +38,25 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(mo
     assert set(came[2]) > set(FIRST) and came[3] is True
 
 
+def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
+    release = Event()
+
+    def prepare(config, kinds, report, outputs):
+        if outputs != FIRST:
+            release.wait()
+
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    first = used.in_use()
+    other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
+    used.want(other)
+    assert used.in_use() is other is not first and not used.pending
+    used.want(normals)
+    assert used.in_use() is other and used.pending
+    release.set()
+    used.close()
+
+
 def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     release = Event()
     monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())

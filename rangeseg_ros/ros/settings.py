@@ -64,10 +64,15 @@ class Settings:
     def want(self, config: NodeConfig) -> None:
         """Ask for another configuration."""
         self._wanted = config
-        if _needs(config) in self._prepared:
+        # What runs the kernels of the one in use need not wait for those of other outputs.
+        if _needs(config) in self._prepared or self._serves(config):
             self._use(config)
         else:
             self._jobs.put(config)
+
+    def _serves(self, config: NodeConfig) -> bool:
+        current = self._in_use
+        return current is not None and _needs(current) == _needs(config)
 
     def in_use(self) -> NodeConfig | None:
         """The configuration for the next frame; waits for the first. None once closed."""
