@@ -78,6 +78,20 @@ def test_beyond_an_edge_it_has_fallen_though_noise_makes_a_gap_in_it():
     np.testing.assert_array_equal(fallen(height[::-1], broken, turned=True), expected[::-1])
 
 
+def test_what_hides_an_edge_hides_no_drop_and_a_plank_across_it_stays():
+    """In more columns than those on either side can outvote."""
+    height = np.zeros((ROWS, COLUMNS))
+    height[:30] = -0.06
+    broken = np.zeros((ROWS, COLUMNS), np.bool_)
+    broken[29] = True
+    broken[29, 4:19] = False
+    expected = np.zeros_like(broken)
+    expected[:30] = True
+    np.testing.assert_array_equal(fallen(height, broken), expected)
+    height[:30, 4:19] = 0
+    assert not fallen(height, broken)[:, 7:16].any()
+
+
 def test_a_hole_ends_where_the_ground_comes_back():
     height = np.zeros((ROWS, COLUMNS))
     height[20:30] = -0.06
@@ -210,7 +224,7 @@ def test_little_is_called_ground_that_the_noise_nearly_hides(kind, seed, class_)
     assert inside.sum() > 2000 and (terrain[inside] == GROUND).mean() < 0.008
 
 
-@pytest.mark.parametrize(('seed', 'most'), [(1710099, 0.014), (1710061, 0.0)])
+@pytest.mark.parametrize(('seed', 'most'), [(1710099, 0.014), (1710061, 0.0), (1920182, 0.03)])
 def test_a_level_beyond_an_edge_is_told_as_a_whole(seed, most):
     """5 cm down at more than 2 m: no pixel of a stereo camera tells, all of them together do."""
     scene, sensor = terrain_scene('drop', seed), SENSORS['realsense'](seed)

@@ -44,9 +44,11 @@ def below_edges(
     rise : bool
         The same where the ground rises.
     """
-    return _most(
-        _fallen(-height if rise else height, cells.place, steps, steep, broken, turned, rise)
-    )
+    signed = -height if rise else height
+    fallen, before = _fallen(signed, cells.place, steps, steep, broken, turned, rise)
+    most = _most(fallen)
+    _close_gaps(most, signed, before, steps.least, turned)
+    return most
 
 
 @njit(cache=True, nogil=True)
@@ -77,6 +79,44 @@ def _most(fallen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def _close_gaps(
+    fallen: NDArray[np.bool_],
+    height: NDArray[np.float32],
+    before: NDArray[np.float32],
+    least: float,
+    turned: bool,
+) -> None:
+    """Let what lies between fallen columns have fallen as well, from where it lies as low.
+
+    Something may hide an edge in more columns than there are on either side to outvote them. What
+    is as high as the ground before the edge on both sides, such as a plank, is left.
+    """
+    rows, columns = fallen.shape
+    reach = _BESIDE[1]
+    for m in range(rows):  # outwards
+        i = m if turned else rows - 1 - m
+        nearer = max(m - 1, 0) if turned else min(i + 1, rows - 1)
+        last = -1
+        for c in range(columns):
+            if not fallen[i, c]:
+                continue
+            if last >= 0 and 1 < c - last <= reach + 1:
+                level = low = 0.0
+                known = seen = 0
+                closed = 2 * fallen[nearer, last + 1 : c].sum() > c - last - 1
+                for k in range(max(last - reach, 0), min(c + reach + 1, columns)):
+                    if before[i, k] == before[i, k]:
+                        level += before[i, k]
+                        known += 1
+                    if last < k < c and height[i, k] == height[i, k]:
+                        low += height[i, k]
+                        seen += 1
+                if closed or level / known - low / seen > least:
+                    fallen[i, last + 1 : c] = True
+            last = c
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def _fallen(
     height: NDArray[np.float32],
     place: NDArray[np.float32],
@@ -85,14 +125,17 @@ def _fallen(
     broken: NDArray[np.bool_],
     turned: bool,
     rise: bool,
-) -> NDArray[np.bool_]:
+) -> tuple[NDArray[np.bool_], NDArray[np.float32]]:
     """The same of each column by itself, of heights that fall; `rise` if they are those of a rise.
+
+    And the mean height of the ground before, NaN for cells that have not fallen.
 
     How far the mean of the ground before lags behind counts for a ramp up alone: one down is a
     drop in doubt.
     """
     rows, columns = height.shape
     result = np.zeros((rows, columns), np.bool_)
+    before_edge = np.full((rows, columns), np.float32(np.nan))
     # Of each column: mean height of the ground before, where that is, or its last cell, whether an
     # edge was passed since, and whether it has fallen.
     near, (x, y) = np.full(columns, np.nan), np.zeros((2, columns))
@@ -114,6 +157,7 @@ def _fallen(
                 edge[c] = False
         for c in range(columns):
             result[i, c] = fallen[c] & level[c]
+            before_edge[i, c] = np.float32(near[c]) if result[i, c] else np.float32(np.nan)
             first = near[c] != near[c]
             share = 1.0 if first or not rise else 1.0 / _MEAN
             own = height[i, c] if first else near[c] + (height[i, c] - near[c]) / _MEAN
@@ -125,7 +169,7 @@ def _fallen(
             near[c] = own if goes_on else near[c]
             x[c] = ahead if goes_on else x[c]
             y[c] = aside if goes_on else y[c]
-    return result
+    return result, before_edge
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
