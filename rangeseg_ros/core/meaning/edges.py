@@ -86,13 +86,13 @@ def _close_gaps(
     least: float,
     turned: bool,
 ) -> None:
-    """Let what lies between fallen columns have fallen as well, from where it lies as low.
+    """Let what lies between `fallen` columns have fallen as well, from where it lies as low.
 
     Something may hide an edge in more columns than there are on either side to outvote them. What
-    is as high as the ground before the edge on both sides, such as a plank, is left.
+    is as high as the ground before the edge on both sides, such as a plank, is left. All are
+    (rows, columns), `height` and that of the ground `before` in metres.
     """
     rows, columns = fallen.shape
-    reach = _BESIDE[1]
     for m in range(rows):  # outwards
         i = m if turned else rows - 1 - m
         nearer = max(m - 1, 0) if turned else min(i + 1, rows - 1)
@@ -100,20 +100,32 @@ def _close_gaps(
         for c in range(columns):
             if not fallen[i, c]:
                 continue
-            if last >= 0 and 1 < c - last <= reach + 1:
-                level = low = 0.0
-                known = seen = 0
-                closed = 2 * fallen[nearer, last + 1 : c].sum() > c - last - 1
-                for k in range(max(last - reach, 0), min(c + reach + 1, columns)):
-                    if before[i, k] == before[i, k]:
-                        level += before[i, k]
-                        known += 1
-                    if last < k < c and height[i, k] == height[i, k]:
-                        low += height[i, k]
-                        seen += 1
-                if closed or level / known - low / seen > least:
+            gap = c - last - 1
+            if last >= 0 and 0 < gap <= _BESIDE[1]:
+                closed = 2 * fallen[nearer, last + 1 : c].sum() > gap
+                if closed or _depth(height, before, i, last, c) > least:
                     fallen[i, last + 1 : c] = True
             last = c
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _depth(
+    height: NDArray[np.float32], before: NDArray[np.float32], i: int, last: int, c: int
+) -> float:
+    """Depth of what lies between two columns of row i below the ground before the edges beside it.
+
+    Metres; NaN where either was not measured.
+    """
+    level = low = 0.0
+    known = seen = 0
+    for k in range(max(last - _BESIDE[1], 0), min(c + _BESIDE[1] + 1, height.shape[1])):
+        if before[i, k] == before[i, k]:
+            level += before[i, k]
+            known += 1
+        if last < k < c and height[i, k] == height[i, k]:
+            low += height[i, k]
+            seen += 1
+    return level / known - low / seen
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
