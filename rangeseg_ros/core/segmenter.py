@@ -18,6 +18,8 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions
+from rangeseg_ros.core.runtime.boxing import box_safely
+from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
 from rangeseg_ros.core.runtime.threads import submit
@@ -46,6 +48,8 @@ class Segmenter:
         self._coarse = _for_half_the_size(self.config)
         self.reset()
         keep_freed_memory()
+        box_safely()
+        load_lazily()
 
     def reset(self) -> None:
         """Forget the frame before, from which `warm_start` begins."""
