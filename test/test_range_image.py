@@ -1,11 +1,14 @@
 """Depth images and organised clouds become rays, inverse range and validity."""
 
+import pickle
 import warnings
 
 import numpy as np
 import pytest
+from scanner_points import scanned
 
 from rangeseg_ros import Camera, RangeImage
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.sensing.range_image import RangeImageError, UnitWarning
 
 CAMERA = Camera(4, 3, 2.0, 3.0, 1.5, 1.0)
@@ -118,12 +121,22 @@ def test_the_cloud_of_a_pinhole_camera_is_its_depth_image(camera, holes):
     assert image.rays is RangeImage.from_points(np.stack([x, y, z], axis=2)).rays
 
 
-def scanned(camera):
-    """Rays (H, W, 3) at even angles, as of a scanner that turns."""
-    azimuth = (np.arange(camera.width) - camera.cx) / camera.fx
-    elevation = ((np.arange(camera.height) - camera.cy) / camera.fy)[:, None]
-    rays = np.sin(azimuth) * np.cos(elevation), np.sin(elevation), np.cos(azimuth)
-    return np.stack(np.broadcast_arrays(*rays[:2], rays[2] * np.cos(elevation)), axis=2)
+@pytest.mark.parametrize('camera', CAMERAS)
+@pytest.mark.parametrize('turn', [(0, 0, 0.5), (1.2, -1.2, 1.2), (2.0, 1.0, -0.5), (0, np.pi, 0)])
+def test_the_camera_of_a_cloud_in_another_frame_is_found(camera, turn):
+    turn = rotation_by(turn)
+    z = np.random.default_rng(3).uniform(0.4, 6, camera.shape)
+    z[np.random.default_rng(4).random(camera.shape) < 0.3] = np.nan
+    points = camera.rays_at(*np.indices(camera.shape, float)[::-1]) * z[..., None]
+    image = RangeImage.from_points((points @ turn.T).astype(np.float32))
+    np.testing.assert_allclose(image.camera.matrix, camera.matrix, atol=4e-3)
+    np.testing.assert_allclose(image.axes, turn, atol=1e-5)
+    np.testing.assert_allclose(image.inverse[image.valid], 1 / z[image.valid], rtol=1e-5)
+    # Frames share it, whatever their noise.
+    again = RangeImage.from_points((1.5 * points @ turn.T).astype(np.float32))
+    assert again.camera == image.camera and again.rays is image.rays
+    back = [pickle.loads(pickle.dumps(image.camera)), image.camera.halved]
+    assert back[0] == image.camera and back[1].turn == image.camera.turn
 
 
 def bent(camera):
@@ -138,12 +151,24 @@ def bent(camera):
         scanned(CAMERAS[0]),
         bent(CAMERAS[0]),
         CAMERAS[0].rays[:, ::-1],
-        CAMERAS[0].rays[..., [2, 0, 1]],
+        CAMERAS[0].rays[..., [1, 0, 2]],
+        bent(CAMERAS[0])[..., [2, 0, 1]],
+        scanned(CAMERAS[0]) @ rotation_by((1.0, 2.0, 0.5)),
         CAMERAS[0].rays[:1],
         CAMERAS[0].rays[:, :1],
         np.where(np.arange(160)[:, None] < 60, CAMERAS[0].rays, np.nan),
     ],
-    ids=['scanner', 'lens', 'mirrored', 'x forward', 'row', 'column', 'part'],
+    ids=[
+        'scanner',
+        'lens',
+        'mirrored',
+        'axes mirrored',
+        'lens, turned',
+        'scanner, turned',
+        'row',
+        'column',
+        'part',
+    ],
 )
 def test_no_camera_is_seen_in_other_clouds(rays):
     depth = np.random.default_rng(3).uniform(0.4, 6, rays.shape[:2])

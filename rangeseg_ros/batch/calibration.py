@@ -199,7 +199,7 @@ class ResidualsOfFrame:
         for version in (image, self.distortion.corrected(image)):
             result = segmenter.segment(version)
             residual = np.full(image.shape, np.nan, np.float32)
-            along = np.where(version.valid, version.rays[..., 2], 1)
+            along = np.where(version.valid, version.along, 1)
             for plane in result.planes:
                 mask = result.labels == plane.label
                 theta = -plane.normal / plane.distance

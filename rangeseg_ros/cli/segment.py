@@ -84,7 +84,7 @@ def command(
         except (RangeImageError, DistortionError) as error:
             raise click.ClickException(f'{path}: {error}') from None
         result = segmenter.segment(image)
-        result = replace(result, planes=with_roles(result.planes, segmenter.config))
+        result = replace(result, planes=with_roles(result.planes, segmenter.config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
             click.echo(f'{path}: {len(result.planes)} planes, {result.ground}')

@@ -234,7 +234,8 @@ class Config:
     up_x: float = option(0.0, 'up in the frame of the image, x', low=-1000.0, high=1000.0)
     up_y: float = option(
         -1.0,
-        'up in the frame of the image, y; the default is that of a level camera',
+        'up in the frame of the image, y; the default, 0, -1, 0, is that of a level camera, '
+        'which is z of clouds in frames that do not look along z',
         low=-1000.0,
         high=1000.0,
     )
@@ -367,6 +368,11 @@ class Config:
             raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:
             raise ConfigError('parameters up_x, up_y, up_z must not all be 0')
+
+    @property
+    def level(self) -> bool:
+        """Whether no other up is stated than that of a level camera."""
+        return (self.up_x, self.up_y, self.up_z) == (0, -1, 0)
 
     @property
     def map_frame(self) -> str:

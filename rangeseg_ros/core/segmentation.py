@@ -130,12 +130,16 @@ class Segmentation:
         return stairs_of(self.ground)
 
     @property
+    def up(self) -> NDArray[np.float64] | None:
+        """(3,) unit vector in the frame of the image; None where no ground was asked for."""
+        if self.survey is None:
+            return None
+        return self.survey.up if isinstance(self.survey, Survey) else self.survey.field.up
+
+    @property
     def ramps(self) -> list[Ramp]:
         """Ramps among planes that have roles."""
-        if self.survey is None:
-            return []
-        known = self.survey.up if isinstance(self.survey, Survey) else self.survey.field.up
-        return ramps_of(self.planes, known)
+        return [] if self.up is None else ramps_of(self.planes, self.up)
 
     @property
     def terrain(self) -> NDArray[np.uint8]:

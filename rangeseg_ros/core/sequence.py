@@ -119,12 +119,13 @@ class SequenceSegmenter:
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
         planes = self._tracker.track(result.labels, result.planes, stamp, motion)
+        up = result.up if up is None else unit(up)
         planes = with_roles(planes, self.config, up)
         if self._tracker.contradicted:
             # The fixed frame has jumped: the map would have everything twice.
             self.map.clear('the fixed frame has jumped')
         if self.config.odometry:
-            self._follow(result.labels, planes, stamp, up)
+            self._follow(result.labels, planes, stamp, up, image.axes)
             if not self.config.fixed_frame and self.motion:
                 pose = self.motion.pose
         self.pose = pose
@@ -132,7 +133,7 @@ class SequenceSegmenter:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
         if up is not None and isinstance(survey, Survey):
-            survey = replace(survey, up=unit(up))
+            survey = replace(survey, up=up)
         if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
             survey = replace(survey, sensor_height=height)
         if isinstance(survey, Survey):
@@ -140,13 +141,18 @@ class SequenceSegmenter:
         return replace(result, planes=planes, survey=survey)
 
     def _follow(
-        self, labels: NDArray[np.uint16], planes: list[Plane], stamp: int, up: ArrayLike | None
+        self,
+        labels: NDArray[np.uint16],
+        planes: list[Plane],
+        stamp: int,
+        up: NDArray[np.float64] | None,
+        axes: NDArray[np.float64],
     ) -> None:
         """Find where the camera is now."""
         config = self.config
         towards = (config.up_x, config.up_y, config.up_z) if up is None else up
         seen = views(labels, planes, config.distortion_length)
-        self.motion = self._odometry.add(planes, seen, stamp, unit(towards))
+        self.motion = self._odometry.add(planes, seen, stamp, unit(towards), axes)
         if not self.motion.held and len(self.map) and not config.fixed_frame:
             self.map.clear('no plane held the camera')
 

@@ -77,6 +77,7 @@ def segment(
     normals = observed_normals(image, grid, config)
     lap('normals')
     labels_of = directions(config.directions, config.direction_count, config.seed)
+    labels_of = labels_of @ image.axes.T
     problem = normals, labels_of, grid, config.smoothness
     if config.exact:
         labels = exact.minimise(*problem, config.moves, config.cycles)

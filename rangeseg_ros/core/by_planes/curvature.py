@@ -68,7 +68,7 @@ def find_curved(
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
     allowed = Allowed(around, alike, float(flatness))
     bent = find_bent(residuals, allowed)
-    if not image.pinhole:
+    if image.camera is None or not image.camera.pinhole:
         return bent
     return find_facets(bent, borders, residuals, allowed, _planes(theta, image.rays), sensor)
 

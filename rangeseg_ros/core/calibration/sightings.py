@@ -124,11 +124,11 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
 def plane_pixels(
     labels: NDArray[np.uint16], image: RangeImage
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels of planes without their rims (H, W); inverse depth and rays (H, W, 3) at z = 1."""
+    """Pixels of planes without their rims (H, W); inverse depth, rays (H, W, 3) at depth 1."""
     kernel = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
-    inner = (labels > 0) & image.valid & (image.rays[..., 2] > 0)
+    inner = (labels > 0) & image.valid & (image.along > 0)
     inner &= cv2.erode(labels, kernel) == cv2.dilate(labels, kernel)
-    along = np.where(inner, image.rays[..., 2], 1).astype(np.float64)
+    along = np.where(inner, image.along, 1).astype(np.float64)
     inverse, rays = image.inverse.astype(np.float64), image.rays.astype(np.float64)
     return inner, inverse / along, rays / along[..., None]
 

@@ -41,7 +41,7 @@ def areas_and_axes(
     area : (M + 1,) float64
         Of the pixels' footprints on the plane, square metres.
     major : (M + 1, 3) float64
-        Unit vector in the plane of the largest second moment of the area; x >= 0.
+        Unit vector in the plane of the largest second moment of the area, to the image's right.
     """
     arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents, inner
     upper, lower = map_halves(_area_moments, len(labels), *arrays)
@@ -55,7 +55,7 @@ def areas_and_axes(
     )
     turn = 0.5 * np.arctan2(2 * uv, uu - vv)[:, None]
     major = np.cos(turn) * tangents[:, 0] + np.sin(turn) * tangents[:, 1]
-    return area, major * np.where(major[:, :1] < 0, -1.0, 1.0)
+    return area, major * np.where(major @ image.axes[:, :1] < 0, -1.0, 1.0)
 
 
 def rectangles(
@@ -85,7 +85,7 @@ def rectangles(
     camera = image.camera
     half = (0.5 / camera.fx, 0.5 / camera.fy) if camera and camera.pinhole else (0.0, 0.0)
     arrays = labels, image.inverse, image.rays, theta, axes, inner
-    upper, lower = map_halves(_limits, len(labels), *arrays, *half)
+    upper, lower = map_halves(_limits, len(labels), *arrays, image.axes[:, :2] * half)
     # Smallest and largest.
     return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
 
@@ -193,13 +193,15 @@ def _limits(
     theta: NDArray[np.float64],
     axes: NDArray[np.float64],
     inner: NDArray[np.uint16],
-    half_x: float,
-    half_y: float,
+    half: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Smallest and largest coordinates (M + 1, 2, 2) along the axes."""
+    """Smallest and largest coordinates (M + 1, 2, 2) along the axes.
+
+    `half` (3, 2) are the ways from the middle of a pixel to its right and to its lower side.
+    """
     limits = np.empty((len(theta), 2, 2))
     limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
-    corners = 1 if half_x == 0 else 4
+    corners = 4 if half.any() else 1
     height, width = labels.shape
     for i in range(first, after):
         within = inner[i // BLOCK]
@@ -215,9 +217,10 @@ def _limits(
                 continue
             plane = theta[label]
             for corner in range(corners):
-                x = rays[i, j, 0] + half_x * (1 - 2 * (corner & 1))
-                y = rays[i, j, 1] + half_y * (1 - (corner & 2))
-                z = float(rays[i, j, 2])
+                right, down = 1 - 2 * (corner & 1), 1 - (corner & 2)
+                x = rays[i, j, 0] + half[0, 0] * right + half[0, 1] * down
+                y = rays[i, j, 1] + half[1, 0] * right + half[1, 1] * down
+                z = rays[i, j, 2] + half[2, 0] * right + half[2, 1] * down
                 level = plane[0] * x + plane[1] * y + plane[2] * z
                 if level * _FAR < inverse[i, j]:
                     continue

@@ -138,14 +138,15 @@ def lies_ahead(
     """
     if camera is None or not camera.pinhole:
         return np.zeros(len(boxes), np.bool_)
-    return _corners_lie_ahead(boxes, theta, (camera.fx, camera.fy, camera.cx, camera.cy))
+    lens = camera.fx, camera.fy, camera.cx, camera.cy
+    return _corners_lie_ahead(boxes, theta @ camera.axes, lens)
 
 
 @njit(cache=True)
 def _corners_lie_ahead(
     boxes: NDArray[np.intp], theta: NDArray[np.float64], lens: tuple[float, float, float, float]
 ) -> NDArray[np.bool_]:
-    """Whether the corners of each box meet its plane, see `Outline._ahead`."""
+    """Whether the corners of each box meet its plane, optical frame: see `Outline._ahead`."""
     fx, fy, cx, cy = lens
     ahead = np.ones(len(boxes), np.bool_)
     for k in range(len(boxes)):

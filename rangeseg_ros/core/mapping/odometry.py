@@ -118,6 +118,7 @@ class PlaneOdometry:
         view: NDArray[np.float64],
         stamp: int,
         up: ArrayLike,
+        axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ) -> Motion:
         """Take in the next frame.
 
@@ -131,9 +132,11 @@ class PlaneOdometry:
             Nanoseconds; when it does not tell, as much as is common has passed.
         up : (3,) float
             In the frame of the image; counts for the first one.
+        axes : (3, 3) float
+            What is right, down and forward in the image; the identity in an optical frame.
         """
         if self._pose is None:
-            self._pose = Transform(_level(np.array(up, np.float64)), np.zeros(3))
+            self._pose = Transform(_level(np.array(up, np.float64), np.array(axes)), np.zeros(3))
         else:
             elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
             self._predict(elapsed)
@@ -306,11 +309,12 @@ def _betas(count: int) -> NDArray[np.intp]:
     return np.asarray(places.ravel(), np.intp)
 
 
-def _level(up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation from a camera that sees `up` to x forward and z up."""
     up = up / np.linalg.norm(up)
     # Straight up or down, forward is where the top of the image is.
-    ahead = np.array([0.0, 0.0, 1.0]) if abs(up[2]) < 0.99 else np.array([0.0, -1.0, 0.0])
+    _, down, ahead = axes.T
+    ahead = ahead if abs(up @ ahead) < 0.99 else -down
     forward = ahead - (ahead @ up) * up
     forward /= np.linalg.norm(forward)
     return np.stack([forward, np.cross(up, forward), up])

@@ -46,7 +46,7 @@ def may_be_in_sight(
         ]
     )
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    return (centres @ sides.T >= -radii[:, None]).all(axis=1)
+    return (centres @ camera.axes @ sides.T >= -radii[:, None]).all(axis=1)
 
 
 def find_sightings(
@@ -77,10 +77,11 @@ def find_sightings(
     camera = image.camera
     if camera is None:
         return found
-    ahead = points[:, 2] > 0
-    depth = np.where(ahead, points[:, 2], 1)
-    column = np.rint(camera.fx * points[:, 0] / depth + camera.cx)
-    row = np.rint(camera.fy * points[:, 1] / depth + camera.cy)
+    x, y, z = (points @ camera.axes).T
+    ahead = z > 0
+    depth = np.where(ahead, z, 1)
+    column = np.rint(camera.fx * x / depth + camera.cx)
+    row = np.rint(camera.fy * y / depth + camera.cy)
     slope = np.abs((points * normals).sum(axis=1))
     inside = ahead & (slope > _GRAZING * np.linalg.norm(points, axis=1))
     inside &= (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)

@@ -147,13 +147,14 @@ def terrain_of(
         when nothing is known.
     limits : Limits
     """
-    if abs(up[0]) <= abs(up[1]):
-        return _terrain(image, sensor, up, known, limits, bool(up[1] > 0))
+    right, down, _ = up @ image.axes
+    if abs(right) <= abs(down):
+        return _terrain(image, sensor, up, known, limits, bool(down > 0))
     # A camera on its side: columns are along up in the image with rows and columns exchanged.
     rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
     rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
     turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
-    found = _terrain(turned, sensor, up, known, limits, bool(up[0] > 0))
+    found = _terrain(turned, sensor, up, known, limits, bool(right > 0))
     return found._replace(
         classes=np.ascontiguousarray(found.classes.T),
         height=np.ascontiguousarray(found.height.T),

@@ -49,14 +49,19 @@ class Survey:
     def of(
         cls, image: RangeImage, sensor: SensorModel, config: Config, up: ArrayLike | None = None
     ) -> Survey:
-        """With the parameters of `config`, and its direction `up` when none is given."""
+        """With the parameters of `config`, and its direction `up` when none is given.
+
+        The default is that of a level camera, see `RangeImage.level_up`.
+        """
         limits = Limits(
             float(np.radians(config.ground_slope)),
             config.obstacle_height,
             config.drop_height,
             float(np.radians(config.up_noise)),
         )
-        direction = unit((config.up_x, config.up_y, config.up_z) if up is None else up)
+        if up is None:
+            up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
+        direction = unit(up)
         height = config.sensor_height, config.sensor_height_noise
         return cls(image, sensor, direction, *height, limits)
 

@@ -12,11 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.rotations import rotation_matrix
 from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
 _STEEPEST = 1000.0
+# By which the square of a unit quaternion may be off: decimals of files.
+_UNIT = 1e-6
+OPTICAL = (0.0, 0.0, 0.0, 1.0)
+"""The turn of a camera in its own optical frame: none."""
 
 
 class CameraError(ValueError):
@@ -29,7 +34,7 @@ class CameraWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera in the ROS optical frame (REP 103): x right, y down, z forward.
+    """A camera, by default in the ROS optical frame (REP 103): x right, y down, z forward.
 
     Parameters
     ----------
@@ -45,12 +50,14 @@ class Camera:
         Of the lens of raw images, see `lens.MODELS`; empty for rectified ones.
     d : tuple of float
         Coefficients of the model, as in CameraInfo.
+    turn : tuple of 4 float
+        Frame of the rays from the optical one, a unit quaternion x, y, z, w.
 
     Raises
     ------
     CameraError
         Empty image, non-finite intrinsics, a focal length that is not positive, pixels that look
-        across the optical axis, or an unknown lens.
+        across the optical axis, an unknown lens, or a turn of another length.
     """
 
     width: int
@@ -62,6 +69,7 @@ class Camera:
     skew: float = 0.0
     distortion_model: str = ''
     d: tuple[float, ...] = ()
+    turn: tuple[float, ...] = OPTICAL
 
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {
@@ -75,6 +83,9 @@ class Camera:
         except (TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CameraError(str(error)) from None
         checked['distortion_model'], checked['d'] = lens
+        checked['turn'] = tuple(_finite('turn', part) for part in self.turn)
+        if len(self.turn) != 4 or abs(sum(q * q for q in checked['turn']) - 1) > _UNIT:
+            raise CameraError(f'turn must be a unit quaternion x, y, z, w, not {self.turn!r}')
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         for name in ('fx', 'fy'):
@@ -233,6 +244,11 @@ class Camera:
         """Whether rays are evenly spaced: neither skew nor a lens that distorts."""
         return not self.distortion_model and self.skew == 0
 
+    @cached_property
+    def axes(self) -> NDArray[np.float64]:
+        """(3, 3) what is right, down and forward for the camera, as columns."""
+        return rotation_matrix(self.turn)
+
     @property
     def matrix(self) -> NDArray[np.float64]:
         """The 3x3 camera matrix K."""
@@ -240,7 +256,7 @@ class Camera:
 
     @cached_property
     def rays(self) -> NDArray[np.float32]:
-        """Directions of the pixels scaled to z = 1, (H, W, 3), so that point = depth * ray.
+        """Directions of the pixels scaled to depth 1, (H, W, 3), so that point = depth * ray.
 
         Zeros where a lens shows no ray.
         """
@@ -250,7 +266,7 @@ class Camera:
         return rays
 
     def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Directions scaled to z = 1, (..., 3), of places in the image.
+        """Directions scaled to depth 1, (..., 3), of places in the image.
 
         Parameters
         ----------
@@ -269,7 +285,8 @@ class Camera:
             x, y, z = (np.where(shown, value, np.nan) for value in (x, y, np.ones_like(x)))
         else:
             z = np.ones_like(x)
-        return np.stack([x, y, z], axis=-1)
+        rays = np.stack([x, y, z], axis=-1)
+        return rays if self.turn == OPTICAL else rays @ self.axes.T
 
     def _distorted(
         self, u: NDArray[np.floating], v: NDArray[np.floating]

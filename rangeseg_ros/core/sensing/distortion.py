@@ -20,7 +20,7 @@ class DistortionError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class DistortionMap:
-    """Error of the inverse depth 1/z of every pixel, z along the optical axis.
+    """Error of the inverse depth of every pixel, along the optical axis.
 
     The error at an inverse depth y is offset + slope (y - reference).
 
@@ -49,7 +49,7 @@ class DistortionMap:
     def corrected(self, image: RangeImage) -> RangeImage:
         """`image` without the distortion.
 
-        An inverse range along unit rays r, as of clouds, is the inverse depth times r_z = z/range,
+        An inverse range along unit rays, as of clouds, is the inverse depth times depth/range,
         and so is its error.
 
         Raises
@@ -58,14 +58,13 @@ class DistortionMap:
             The image has another size, or another camera.
         """
         self._check(image)
-        along = image.rays[..., 2]
+        along = image.along
         error = self.offset
         if self.slope is not None:
             with np.errstate(divide='ignore', invalid='ignore'):
                 inverse_depth = image.inverse / along
             error = error + self.slope * (inverse_depth - np.float32(self.reference))
-        if image.camera is None:
-            error = error * along
+        error = error * along
         inverse = np.where(image.inverse > 0, image.inverse - error, np.float32(0))
         # What remains beyond infinity was not measured.
         inverse = np.where(inverse > 0, inverse, np.float32(0))

@@ -1,21 +1,21 @@
-"""The camera of an organised cloud, where its points show one."""
+"""The camera of an organised cloud, where its points show one, and which way its frame looks."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.camera import Camera, CameraError
+from rangeseg_ros.core.rotations import quaternions, rotation_matrix
+from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, CameraError
 
-# Rounding errors of a coordinate: those of the intrinsics, of the depth, of what takes one to the
-# other, and of their quotient.
-_ROUNDINGS = 8
-_PRECISION = _ROUNDINGS * 2.0**-24
 # To which intrinsics are rounded, pixels: frames of a sensor share a camera. A power of two, as
 # numbers of few decimals are never halfway between two of these.
 _STEP = 2.0**-10
+# The same of quaternions: 0.001 pixels in the middle of an image of 1000.
+_TURN = 2.0**-20
 # Largest error of the camera, pixels: less than any sensor's.
 _CLOSE = 0.01
 # Rows and columns that tell the camera, about.
@@ -25,13 +25,13 @@ _TELLING = 64
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
     """The pinhole camera that points lie on the rays of.
 
-    x / z is linear in the column then, and y / z in the row, to the precision of float32. Lenses
-    and scanners bend the lines by far more.
+    In its optical frame x / z is linear in the column then, and y / z in the row. Lenses and
+    scanners bend the lines by far more than what is let pass.
 
     Parameters
     ----------
     points : (H, W, 3) float
-        In an optical frame, metres.
+        In a frame of any axes with the camera at its origin, metres.
     valid : (H, W) bool
         Which of them were measured.
 
@@ -45,22 +45,94 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
     # Odd steps, as holes come in every second row or column.
     down, across = max(height // _TELLING, 1) | 1, max(width // _TELLING, 1) | 1
     v, u = np.nonzero(valid[::down, ::across])
-    x, y, z = points[::down, ::across][v, u].astype(np.float64).T
-    if not (z > 0).all():
-        return None
-    columns, rows = _line(u * across, x / z, width), _line(v * down, y / z, height)
-    if columns is None or rows is None:
-        return None
-    camera = _camera(width, height, columns[0], rows[0], columns[1], rows[1])
-    if camera is None:
-        return None
-    z = points[..., 2]
+    told = points[::down, ::across][v, u].astype(np.float64)
+    u, v = u * across, v * down
+    for turn in _turns(told, u, v, valid.shape):
+        axes = rotation_matrix(turn)
+        x, y, z = (told @ axes).T
+        if not (z > 0).all():
+            continue
+        columns, rows = _line(u, x / z, width), _line(v, y / z, height)
+        if columns is None or rows is None:
+            continue
+        lens = columns[0], rows[0], columns[1], rows[1]
+        camera = _camera(width, height, *lens, turn=turn)
+        if camera is not None and _on_rays(points, valid, camera):
+            return camera
+    return None
+
+
+def depth_of(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floating]:
+    """(H, W) along the optical axis, of points (H, W, 3) in the frame of the camera's rays."""
+    if camera.turn == OPTICAL:
+        return points[..., 2]
     with np.errstate(invalid='ignore', over='ignore'):
-        for axis, focal in ((0, camera.fx), (1, camera.fy)):
-            error = np.abs(points[..., axis] - z * camera.rays[..., axis])
-            if (valid & ~(error <= _CLOSE / focal * z)).any():
-                return None
-    return camera
+        depth: NDArray[np.floating] = points @ camera.axes[:, 2]
+    return depth
+
+
+def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """(3, 3) which axes of a cloud's frame are right, down and forward in it, as columns.
+
+    Those nearest to them: which way a scanner looks is nothing exact.
+
+    Parameters
+    ----------
+    rays : (H, W, 3) float32
+        Unit vectors.
+    valid : (H, W) bool
+        Where they are known.
+    """
+    width = valid.shape[1]
+    # Of a scanner that turns all the way, the other half looks back.
+    across = max(width // _TELLING, 1)
+    front = slice(width // 4, width - width // 4, across)
+    forward = _nearest_axis(rays[:, front][valid[:, front]].sum(axis=0, dtype=np.float64))
+    both = (valid[1:] & valid[:-1])[:, ::across]
+    steps = np.diff(rays[:, ::across], axis=0)[both].sum(axis=0, dtype=np.float64)
+    down = _nearest_axis(steps, forward)
+    return np.stack([np.cross(down, forward), down, forward], axis=1)
+
+
+def _nearest_axis(
+    vector: NDArray[np.float64], beside: ArrayLike = (0, 0, 0)
+) -> NDArray[np.float64]:
+    """Unit vector (3,) of the axis along which `vector` is longest, other than `beside`."""
+    k = int(np.argmax(np.where(np.equal(beside, 0), np.abs(vector), -1.0)))
+    return np.eye(3)[k] * (-1.0 if vector[k] < 0 else 1.0)
+
+
+def _turns(
+    points: NDArray[np.float64],
+    u: NDArray[np.intp],
+    v: NDArray[np.intp],
+    shape: tuple[int, int],
+) -> Iterator[tuple[float, ...]]:
+    """The frames that points (N, 3) of pixels may be in: optical, or the one that they show.
+
+    Rays are a homography of the pixels then, whose part that is a rotation is that of the frame
+    (direct linear transform: R. Hartley, A. Zisserman, Multiple View Geometry, 4.1).
+    """
+    yield OPTICAL
+    if not len(points):
+        return
+    middle, unit = (np.array(shape[::-1]) - 1) / 2, max(shape) / 2
+    place = np.stack([(u - middle[0]) / unit, (v - middle[1]) / unit, np.ones(len(u))], axis=1)
+    ray = points / np.abs(points).max(axis=1, keepdims=True)  # whose squares are finite
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    # What of a ray's homography lies across it is 0.
+    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
+    squares = place[:, :, None] * place[:, None, :]
+    equations = np.einsum('nab,nij->aibj', across, squares, optimize=True).reshape(9, 9)
+    found = np.linalg.eigh(equations)[1][:, 0].reshape(3, 3)
+    if np.einsum('na,ai,ni->', ray, found, place) < 0:
+        found = -found
+    axes, lens = np.linalg.qr(found)
+    axes = axes * np.where(np.diag(lens) < 0, -1.0, 1.0)
+    if np.linalg.det(axes) > 0:
+        turn = np.rint(quaternions(axes) / _TURN)
+        turn *= np.sign(turn[turn != 0][-1]) / np.linalg.norm(turn)  # of half a turn, one of two
+        yield tuple(turn.tolist())
 
 
 def _line(
@@ -72,15 +144,35 @@ def _line(
     away = place - place.mean()
     step = (away @ slope) / (away @ away)
     error = np.abs(slope - slope.mean() - step * away)
-    if step <= 0 or error.max() > _PRECISION * np.abs(slope).max():
+    if step <= 0 or error.max() > _CLOSE * step:
         return None
     return tuple(round(n / _STEP) * _STEP for n in (1 / step, place.mean() - slope.mean() / step))
 
 
 @lru_cache(maxsize=4)
-def _camera(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Camera | None:
+def _camera(
+    width: int,
+    height: int,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    turn: tuple[float, ...],
+) -> Camera | None:
     """One for all frames, as its rays are worked out once."""
     try:
-        return Camera(width, height, fx, fy, cx, cy)
+        return Camera(width, height, fx, fy, cx, cy, turn=turn)
     except CameraError:
         return None
+
+
+def _on_rays(points: NDArray[np.floating], valid: NDArray[np.bool_], camera: Camera) -> bool:
+    """Whether all points that were measured lie on the rays of a camera."""
+    depth = depth_of(points, camera)
+    with np.errstate(invalid='ignore', over='ignore'):
+        allowed = _CLOSE / max(camera.fx, camera.fy) * depth
+        for axis in range(2 if camera.turn == OPTICAL else 3):
+            error = np.abs(points[..., axis] - depth * camera.rays[..., axis])
+            if (valid & ~(error <= allowed)).any():
+                return False
+    return True

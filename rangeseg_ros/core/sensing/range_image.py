@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.pinhole import camera_of
+from rangeseg_ros.core.sensing.camera import OPTICAL, Camera
+from rangeseg_ros.core.sensing.pinhole import axes_of_frame, camera_of, depth_of
 
 
 class RangeImageError(ValueError):
@@ -39,7 +39,8 @@ class RangeImage:
     Attributes
     ----------
     rays : (H, W, 3) float32
-        Ray of each pixel; undefined where invalid when the image comes from points.
+        Ray of each pixel, in the frame of the camera or of the points; undefined where invalid
+        when the image comes from points.
     inverse : (H, W) float32
         Inverse depth (pinhole) or inverse range (cloud), 1/m; 0 where nothing was measured.
     camera : Camera or None
@@ -97,20 +98,22 @@ class RangeImage:
         if hidden is not None:
             inverse[hidden] = 0
         if camera.distortion_model:
-            inverse[camera.rays[..., 2] == 0] = 0
+            inverse[~camera.rays.any(axis=2)] = 0
         return cls(camera.rays, inverse, camera)
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> RangeImage:
         """Range image of an organised cloud of any sensor.
 
-        That of a pinhole camera is what its depth image is (see `camera_of`).
+        That of a pinhole camera is what its depth image is (see `camera_of`), in the frame of
+        the points.
 
         Parameters
         ----------
         points : (H, W, 3) float
-            Points in metres, the sensor at the origin; any coordinate that is not finite or
-            hidden by the mask of a masked array, or a point at the origin, is invalid.
+            Points in metres, the sensor at the origin of a frame of any axes; any coordinate that
+            is not finite or hidden by the mask of a masked array, or a point at the origin, is
+            invalid.
 
         Raises
         ------
@@ -134,7 +137,7 @@ class RangeImage:
             known &= ~hidden.any(axis=2)
         camera = camera_of(array, known)
         if camera is not None:
-            image = cls.from_depth(np.where(known, z, 0), camera)
+            image = cls.from_depth(np.where(known, depth_of(array, camera), 0), camera)
         else:
             cloud = np.where(known[..., None], array, 0).astype(np.float64)
             with np.errstate(over='ignore'):
@@ -206,7 +209,34 @@ class RangeImage:
     @property
     def pinhole(self) -> bool:
         """Whether rays differ along the rows in x alone, and along the columns in y alone."""
-        return self.camera is not None and self.camera.pinhole
+        return self.camera is not None and self.camera.pinhole and self.camera.turn == OPTICAL
+
+    @cached_property
+    def axes(self) -> NDArray[np.float64]:
+        """(3, 3) what is right, down and forward in the image, as columns, in its frame.
+
+        The identity in an optical frame. Of clouds of other sensors, the nearest axes.
+        """
+        if self.camera is not None:
+            return self.camera.axes
+        return axes_of_frame(self.rays, self.valid)
+
+    @property
+    def level_up(self) -> NDArray[np.float64]:
+        """(3,) up in the frame of the image where that is level.
+
+        By REP 103: -y in optical frames, which look along z, and z in all others.
+        """
+        looks = self.axes[:, 2]
+        return np.array([0.0, -1, 0] if looks[2] > np.abs(looks[:2]).max() else [0.0, 0, 1])
+
+    @property
+    def along(self) -> NDArray[np.float32]:
+        """(H, W) inverse range over inverse depth, the distance along the optical axis."""
+        if self.camera is not None:
+            return np.ones(self.shape, np.float32)
+        along: NDArray[np.float32] = self.rays @ self.axes[:, 2].astype(np.float32)
+        return along
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
