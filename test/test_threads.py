@@ -1,6 +1,8 @@
 """Work on strips of rows and beside the caller."""
 
 import multiprocessing
+import subprocess
+import sys
 import threading
 import time
 
@@ -39,9 +41,9 @@ def test_halves_do_not_depend_on_the_number_of_threads(threads):
 
 @pytest.mark.parametrize('threads', [2, 7], indirect=True)
 def test_strips_are_worked_on_at_the_same_time(threads):
-    """Each waits for another; alone they would for ever."""
+    """As many as there are threads wait for each other; alone they would for ever."""
     barrier = threading.Barrier(min(threads, 4), timeout=20)
-    run_rows(lambda first, after: barrier.wait(), 100)
+    run_rows(lambda first, after: barrier.wait(), 1000)
 
 
 @pytest.mark.parametrize('threads', [1], indirect=True)
@@ -53,21 +55,54 @@ def test_one_thread_is_the_callers_own(threads):
 
 @pytest.mark.parametrize('threads', [2], indirect=True)
 def test_frames_with_a_core_each_have_no_helpers(threads):
-    def workers():
-        found = set()
-        run_rows(lambda first, after: found.add(threading.get_ident()), 100)
-        found.add(submit(threading.get_ident).result())
-        return found
+    def worker():
+        """Who has done a task that nobody has asked for yet."""
+        done = threading.Event()
+        task = submit(lambda: (threading.get_ident(), done.set()))
+        assert done.wait(20)
+        return task.result()[0]
 
-    me = {threading.get_ident()}
+    me = threading.get_ident()
     with sharing_cores():
-        assert workers() > me
+        assert worker() != me
         with sharing_cores():
-            assert workers() == me
-        assert workers() > me
+            assert worker() == me
+        assert worker() != me
     with pytest.raises(ValueError), sharing_cores(), sharing_cores():
         raise ValueError
-    assert workers() > me
+    assert worker() != me
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_a_task_that_waits_for_a_helper_is_done_by_who_needs_it(threads):
+    """The only helper is at work for as long as the other task is not done."""
+    begun, free = threading.Event(), threading.Event()
+    busy = submit(lambda: (begun.set(), free.wait(20)))
+    assert begun.wait(20)
+    assert submit(threading.get_ident).result() == threading.get_ident()
+    free.set()
+    assert busy.result() == (None, True)
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_tasks_may_have_tasks(threads):
+    """Also where no helper is free for them."""
+
+    def depth(left):
+        return 1 + max(submit(depth, left - 1).result() for _ in range(2)) if left else 0
+
+    assert depth(5) == 5
+
+
+def test_a_program_ends_after_its_tasks():
+    """A kernel that is at work when the interpreter is gone may bring down the process."""
+    program = (
+        'import time, cv2; from rangeseg_ros.core.runtime.threads import submit\n'
+        'cv2.setNumThreads(2); submit(lambda: (time.sleep(0.5), print("over", flush=True)))\n'
+        'time.sleep(0.1)'
+    )
+    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, 'over\n')
 
 
 def test_errors_come_back():

@@ -2,19 +2,21 @@
 
 Threads of our own and none of numba's: those do not survive a fork, and the default ones may not
 be entered from two threads. There are as many as OpenCV uses, so that `cv2.setNumThreads` sets
-both.
+both. Nor those of `concurrent.futures`: most tasks take less than a millisecond, of which waking
+a thread is a good part. Here whoever needs a task that no helper has begun does it by itself.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from itertools import pairwise
-from threading import Lock
-from typing import Any, TypeVar
+from queue import SimpleQueue
+from threading import Lock, Thread
+from typing import Any, Generic, TypeVar
 
 import cv2
 
@@ -22,19 +24,82 @@ T = TypeVar('T')
 
 # More would wait for the memory.
 _MAX_THREADS = 4
-# Rows that are worth the handing over.
-_ROWS = 16
+# Rows that are worth the handing over, and strips for each thread: who is done first, as its rows
+# are the easier ones or as it was awake sooner, takes one more.
+_ROWS, _STRIPS = 16, 2
 # Rows on either side of the middle of the image that are looked at again.
 _SEAM = 8
 
 
+class Task(Generic[T]):
+    """A call that a helper makes, or whoever asks for its result before that."""
+
+    def __init__(self, function: Callable[..., T], arguments: tuple[Any, ...]) -> None:
+        self._function, self._arguments = function, arguments
+        self._begun, self._over = Lock(), Lock()
+        self._over.acquire()
+        self._error: BaseException | None = None
+
+    def run(self) -> None:
+        """Make the call, unless somebody has begun to."""
+        if not self._begun.acquire(blocking=False):
+            return
+        try:
+            self._value = self._function(*self._arguments)
+        except BaseException as error:
+            self._error = error
+        self._over.release()
+
+    def result(self) -> T:
+        """What the call returns or raises; waits for it if a helper is at it."""
+        self.run()
+        with self._over:
+            if self._error is not None:
+                raise self._error
+            return self._value
+
+
+class _Helpers:
+    """Threads that take tasks, as many as there may be at work beside the caller's."""
+
+    def __init__(self) -> None:
+        self._tasks: SimpleQueue[Task[Any] | None] = SimpleQueue()
+        self._threads: list[Thread] = []
+        self._lock = Lock()
+
+    def add(self, task: Task[Any]) -> None:
+        with self._lock:
+            if len(self._threads) < min(cv2.getNumThreads(), _MAX_THREADS) - 1:
+                name = f'rangeseg_{len(self._threads)}'
+                self._threads.append(Thread(target=self._work, name=name, daemon=True))
+                self._threads[-1].start()
+        self._tasks.put(task)
+
+    def end(self) -> None:
+        """Have the threads end: none may be at work when the interpreter is no more."""
+        for _ in self._threads:
+            self._tasks.put(None)
+        for thread in self._threads:
+            thread.join()
+
+    def _work(self) -> None:
+        while task := self._tasks.get():
+            task.run()
+            del task
+
+
 @cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(_MAX_THREADS, 'rangeseg')
+def _helpers() -> _Helpers:
+    return _Helpers()
+
+
+@atexit.register
+def _end_helpers() -> None:
+    _helpers().end()
 
 
 if hasattr(os, 'register_at_fork'):  # not on Windows, which does not fork
-    os.register_at_fork(after_in_child=_pool.cache_clear)
+    os.register_at_fork(after_in_child=_helpers.cache_clear)
 
 
 _sharing = 0
@@ -68,12 +133,15 @@ def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     What one strip writes no other may touch: then the result is the same for any number of
     threads.
     """
-    count = max(min(_cores(), _MAX_THREADS, rows // _ROWS), 1)
+    threads = min(_cores(), _MAX_THREADS)
+    count = max(min(_STRIPS * threads, rows // _ROWS), 1) if threads > 1 else 1
     bounds = [rows * part // count for part in range(count + 1)]
     others = [
-        _pool().submit(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])
+        _handed_over(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])
     ]
     kernel(0, bounds[1], *arguments)
+    for other in others:
+        other.run()
     for other in others:
         other.result()
 
@@ -101,10 +169,16 @@ def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
     kernel((max(middle - _SEAM, 0), min(middle + _SEAM, height)), *arguments)
 
 
-def submit(task: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Start a task that has no subtasks here, beside what the caller does until `result()`."""
+def submit(task: Callable[..., T], *arguments: Any) -> Task[T]:
+    """Start a task beside what the caller does until `result()`, or do it with a single core."""
     if _cores() > 1:
-        return _pool().submit(task, *arguments)
-    future: Future[T] = Future()
-    future.set_result(task(*arguments))
-    return future
+        return _handed_over(task, *arguments)
+    done = Task(task, arguments)
+    done.run()
+    return done
+
+
+def _handed_over(task: Callable[..., T], *arguments: Any) -> Task[T]:
+    given = Task(task, arguments)
+    _helpers().add(given)
+    return given
