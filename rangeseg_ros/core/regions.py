@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -9,6 +11,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import CHUNK, Grid
+from rangeseg_ros.core.sensing.marks import no_marks
 
 # Pixels of an image of the ABW set, which the thesis's experiments are about.
 _IMAGE = 512 * 512
@@ -47,23 +50,52 @@ def plane_regions(
     (H, W) uint16
         0 = no plane, 1...M by falling size.
     """
-    regions = connected_components(labels, grid, valid)
-    area, perimeter = _measures(regions)
+    components = connected_components(labels, grid, valid)
+    area, perimeter = _measures(components)
+    noise = _thin(area, perimeter, labels.shape)
+    if noise_regions == 'merge':
+        regions = merge(components.image(), noise)
+        area = np.bincount(regions.ravel(), minlength=len(area))
     if noise_regions != 'leave':
-        noise = _thin(area, perimeter, regions.shape)
-        if noise_regions == 'merge':
-            regions = merge(regions, noise)
-            area = np.bincount(regions.ravel(), minlength=len(area))
         area = np.where(noise, 0, area)
     area[0] = 0
-    return relabel(regions, by_falling_size(np.where(area < min_pixels, 0, area)))
+    table = by_falling_size(np.where(area < min_pixels, 0, area))
+    return relabel(regions, table) if noise_regions == 'merge' else components.renamed(table)
+
+
+class Components(NamedTuple):
+    """Connected components 1...M of an image.
+
+    Attributes
+    ----------
+    most : int
+        M.
+    found : (H, W) int32
+        A name of the component that each pixel is in; 0 for none.
+    number : (N,) int32
+        Component that each name stands for: some have several.
+    """
+
+    most: int
+    found: NDArray[np.int32]
+    number: NDArray[np.int32]
+
+    def image(self) -> NDArray[np.int32]:
+        """Component (H, W) of each pixel, 0 for none."""
+        return self.number[self.found]
+
+    def renamed(self, table: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """Components (H, W) by another name: `table` (M + 1,) uint16 has the one of each."""
+        result = np.empty(self.found.shape, np.uint16)
+        run_rows(_rename, len(result), self.found, self.number, table, result)
+        return result
 
 
 def connected_components(
     labels: NDArray[np.integer],
     grid: Grid,
     valid: NDArray[np.bool_] | None = None,
-) -> NDArray[np.int32]:
+) -> Components:
     """4-connected components of like labels that cross no disconnected edge.
 
     Parameters
@@ -72,11 +104,6 @@ def connected_components(
     grid : Grid
     valid : (H, W) bool, optional
         Pixels to look at, all by default.
-
-    Returns
-    -------
-    (H, W) int32
-        1...N, 0 where not `valid`.
     """
     if valid is None:
         valid = np.ones(labels.shape, np.bool_)
@@ -84,8 +111,7 @@ def connected_components(
     found = np.empty((height, width), np.int32)
     parent = np.empty(height * width + 1, np.int32)
     counts = map_halves(_find_components, height, labels, grid, valid, found, parent)
-    run_rows(_renumber, height, found, _unite_halves(labels, grid, found, parent, *counts))
-    return found
+    return Components(*_unite_halves(labels, grid, found, parent, *counts))
 
 
 @njit(cache=True, nogil=True)
@@ -164,8 +190,8 @@ def _unite_halves(
     parent: NDArray[np.int32],
     upper: int,
     lower: int,
-) -> NDArray[np.int32]:
-    """New number of each number in `found`, of so many in the halves of the rows: without gaps."""
+) -> tuple[int, NDArray[np.int32], NDArray[np.int32]]:
+    """Components, of which the halves of the rows have found so many."""
     height, width = labels.shape
     middle = height // 2
     if middle > 0:
@@ -184,15 +210,22 @@ def _unite_halves(
                 number[k] = last
             else:
                 number[k] = number[parent[k]]
-    return number
+    return last, found, number
 
 
 @njit(cache=True, nogil=True)
-def _renumber(first: int, after: int, found: NDArray[np.int32], number: NDArray[np.int32]) -> None:
-    """The second pass over some rows."""
+def _rename(
+    first: int,
+    after: int,
+    found: NDArray[np.int32],
+    number: NDArray[np.int32],
+    table: NDArray[np.uint16],
+    result: NDArray[np.uint16],
+) -> None:
+    """What `Components.renamed` returns, of some rows."""
     for i in range(first, after):
         for j in range(found.shape[1]):
-            found[i, j] = number[found[i, j]]
+            result[i, j] = table[number[found[i, j]]]
 
 
 def _thin(
@@ -209,28 +242,34 @@ def _thin(
     return noise
 
 
-def _measures(regions: NDArray[np.int32]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Number of pixels of each region, and of those that touch another or the border."""
-    count = int(regions.max(initial=0)) + 1
-    (upper, upper_rim), (lower, lower_rim) = map_halves(_counts, len(regions), regions, count)
+def _measures(components: Components) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Number of pixels of each component, and of those that touch another or the border."""
+    halves = map_halves(_counts, len(components.found), *components)
+    (upper, upper_rim), (lower, lower_rim) = halves
     return upper + lower, upper_rim + lower_rim
 
 
 @njit(cache=True, nogil=True)
 def _counts(
-    first: int, after: int, regions: NDArray[np.int32], count: int
+    first: int, after: int, most: int, found: NDArray[np.int32], number: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    height, width = regions.shape
-    area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    """What `_measures` returns, of some rows."""
+    height, width = found.shape
+    area, perimeter = np.zeros(most + 1, np.int64), np.zeros(most + 1, np.int64)
+    # Components of three rows in turn: the one at hand, above and below it.
+    rows = np.empty((3, width), np.int32)
     # With room for whole words, of which each tells of eight pixels whether there is a rim.
-    rim = np.zeros((width + 7) // 8 * 8, np.uint8)
+    rim = no_marks(width)
     eight = rim.view(np.uint64)
     for i in range(first, after):
-        own = regions[i]
+        for k in range(i + 1 if i > first else max(i - 1, 0), min(i + 2, height)):
+            for j in range(width):
+                rows[k % 3, j] = number[found[k, j]]
+        own = rows[i % 3]
         if i in (0, height - 1):
             rim[:width] = 1
         else:
-            _find_rim(own, regions[i - 1], regions[i + 1], rim)
+            _find_rim(own, rows[(i - 1) % 3], rows[(i + 1) % 3], rim)
         for k in range(len(eight)):
             start, stop = 8 * k, min(8 * k + 8, width)
             if eight[k] == 0:

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.marks import no_marks
 
@@ -52,7 +53,6 @@ class Borders(NamedTuple):
         return Borders(self.box[kept], self.length[kept], start, *touching)
 
 
-@njit(cache=True, nogil=True)
 def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders:
     """Borders of regions.
 
@@ -65,18 +65,30 @@ def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders
     count : int
         M + 1.
     """
+    return _put_together(*map_halves(_find_stretches, len(regions), regions, grid, count))
+
+
+@njit(cache=True, nogil=True)
+def _find_stretches(
+    first: int, after: int, regions: NDArray[np.uint16], grid: Grid, count: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """Borders that some rows of pixels have to their right and below, and with the image's.
+
+    Box and length of the regions as far as these tell them, and stretches (N, 4) of border, from
+    either side: a region, one that it touches, links and cuts between the two.
+    """
     height, width = regions.shape
     box, length = np.zeros((count, 4), np.intp), np.zeros(count, np.intp)
     box[:, 0], box[:, 1] = height, width
-    # Stretches of border: the one at hand of each region, to the right and below, as most pixels
-    # lead where the one before does; and those that are over, each from either side.
+    # The stretch at hand of each region, to the right and below, as most pixels lead where the one
+    # before does; and those that are over.
     hand = np.zeros((2, count, 3), np.intp)
     over = [(0, 0, 0, 0)]
     over.clear()
     # Each word tells of eight pixels whether there is a border.
     edge = no_marks(width)
     eight = edge.view(np.uint64)
-    for i in range(height):
+    for i in range(first, after):
         row, below = regions[i], regions[min(i + 1, height - 1)]
         _find_edges(row, below, edge)
         _reach(box, length, 0, row[0], 1, 0)
@@ -97,14 +109,33 @@ def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders
                     if min(k, m) > 0:
                         _meet(hand[1], k, m, grid.below[i, j] > 0, over)
     for j in range(width):
-        _reach(box, length, 0, regions[0, j], 0, 0)
-        _reach(box, length, regions[height - 1, j], 0, 0, height)
+        if first == 0:
+            _reach(box, length, 0, regions[0, j], 0, 0)
+        if after == height:
+            _reach(box, length, regions[height - 1, j], 0, 0, height)
     for k in range(count):
-        if k == 0 or box[k, 2] == 0:
-            box[k] = 0
         for axis in range(2):
             _end(hand[axis], k, over)
-    return Borders(box, length, *_summed(over, count))
+    stretches = np.empty((len(over), 4), np.intp)
+    for e in range(len(over)):
+        stretches[e, 0], stretches[e, 1], stretches[e, 2], stretches[e, 3] = over[e]
+    return box, length, stretches
+
+
+@njit(cache=True, nogil=True)
+def _put_together(
+    upper: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]],
+    lower: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]],
+) -> Borders:
+    """Borders, of what `_find_stretches` finds in the upper and in the lower rows."""
+    box, length = upper[0].copy(), upper[1] + lower[1]
+    for k in range(len(box)):
+        for axis in range(2):
+            box[k, axis] = min(box[k, axis], lower[0][k, axis])
+            box[k, 2 + axis] = max(box[k, 2 + axis], lower[0][k, 2 + axis])
+        if k == 0 or box[k, 2] == 0:
+            box[k] = 0
+    return Borders(box, length, *_summed(np.concatenate((upper[2], lower[2])), len(box)))
 
 
 @njit(cache=True, nogil=True)
@@ -153,22 +184,21 @@ def _end(hand: NDArray[np.intp], k: int, over: list[tuple[int, int, int, int]]) 
 
 @njit(cache=True)
 def _summed(
-    stretches: list[tuple[int, int, int, int]], count: int
+    stretches: NDArray[np.intp], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """What `Borders` has of the regions that touch."""
-    one = np.array([stretch[0] for stretch in stretches], np.intp)
-    two = np.array([stretch[1] for stretch in stretches], np.intp)
+    one, two = stretches[:, 0], stretches[:, 1]
     order = _sorted(one, _sorted(two, np.arange(len(two)), count), count)
     start = np.zeros(count + 1, np.intp)
-    other, links, cuts = np.zeros_like(two), np.zeros_like(two), np.zeros_like(two)
+    other, links, cuts = np.zeros((3, len(two)), np.intp)
     last, before = -1, 0
     for e in order:
         if last < 0 or one[e] != one[before] or two[e] != two[before]:
             last += 1
             start[one[e] + 1] += 1
             other[last] = two[e]
-        links[last] += stretches[e][2]
-        cuts[last] += stretches[e][3]
+        links[last] += stretches[e, 2]
+        cuts[last] += stretches[e, 3]
         before = e
     return np.cumsum(start), other[: last + 1], links[: last + 1], cuts[: last + 1]
 
