@@ -8,7 +8,7 @@ import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.descent import descended
+from rangeseg_ros.core.by_planes.descent import descend, nearest
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
@@ -215,7 +215,9 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
     """Nor by none: the labels of the neighbours it is connected with are what it may take."""
     problem, models, _ = random_case(seed, 20, 24, 4)
     blocks = np.random.default_rng(seed).integers(0, 5, (5, 6)).astype(np.int32)
-    labels, cost = (array.reshape(20, 24) for array in descended(problem, blocks, models))
+    labels, cost = nearest(problem, blocks, models)
+    descend((0, 20), labels, cost, problem, models)
+    labels, cost = labels.reshape(20, 24), cost.reshape(20, 24)
     measured = problem.weight.reshape(20, 24) > 0
     assert not labels[~measured].any()
     np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
@@ -250,7 +252,7 @@ def small_room(seed=900):
 
 
 def test_each_stage_lowers_the_energy(monkeypatch):
-    """From no plane at all over the descent through every expansion."""
+    """From no plane at all over the nearest through descent and every expansion."""
     problem, (surface, blocks, moments), sensor = small_room()
     values = []
 
@@ -268,7 +270,7 @@ def test_each_stage_lowers_the_energy(monkeypatch):
 
         monkeypatch.setattr(refinement, name, run)
 
-    watched('descended', lambda arguments, result: (result[0], arguments[2]))
+    watched('nearest', lambda arguments, result: (result[0], arguments[2]))
     watched('_minimise', lambda arguments, result: (arguments[0], arguments[3]))
     labels, models = refine(problem, surface, blocks, moments, sensor)
     assert len(values) == 3

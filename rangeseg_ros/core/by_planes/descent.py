@@ -18,7 +18,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.graphcut.sites import room_for_unlike, unlike_sites
-from rangeseg_ros.core.runtime.threads import run_halves, run_rows
+from rangeseg_ros.core.runtime.threads import run_rows
 
 REACH = 2
 """Blocks from a surface in which its label may win pixels."""
@@ -26,14 +26,16 @@ REACH = 2
 _NONE = np.int32(np.iinfo(np.int32).max)
 
 
-def descended(
+def nearest(
     problem: Problem, surfaces: NDArray[np.int32], models: Models
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """A labelling that no pixel improves by a linked neighbour's label or none, and its costs."""
+    """The cheapest label of each pixel (n,) among those of the blocks around it, and its cost.
+
+    Costs in blocks with one label around them, for which none competes, are 0.
+    """
     labels = np.empty(len(problem.inverse), np.int32)
     cost = np.empty(len(labels), np.float32)
     run_rows(_take_nearest, len(surfaces), surfaces, problem, models, labels, cost)
-    run_halves(_descend, len(labels) // problem.width, labels, cost, problem, models)
     return labels, cost
 
 
@@ -47,10 +49,7 @@ def _take_nearest(
     labels: NDArray[np.int32],
     cost: NDArray[np.float32],
 ) -> None:
-    """Give each pixel of rows of blocks the cheapest label among those of the blocks around it.
-
-    Costs in blocks with one label around them, for which none competes, stay 0.
-    """
+    """What `nearest` returns, of some rows of blocks."""
     columns, most = surfaces.shape[1], (2 * REACH + 1) ** 2
     width, block = problem.width, problem.block
     height = len(labels) // width
@@ -182,7 +181,7 @@ def _take_first(
 
 
 @njit(cache=True, nogil=True)
-def _descend(
+def descend(
     rows: tuple[int, int],
     labels: NDArray[np.int32],
     cost: NDArray[np.float32],

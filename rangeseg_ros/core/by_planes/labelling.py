@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.descent import REACH, descended
+from rangeseg_ros.core.by_planes.descent import REACH, descend, nearest
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     Models,
@@ -78,7 +78,7 @@ def refine(
     """
     starts = surfaces.astype(np.int32)
     models = _shifted(Models.of(moments, problem.smooth), starts, blocks, sensor, problem.block)
-    labels, cost = descended(problem, starts, models)
+    labels, cost = nearest(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
     value = energy(labels, problem, models) if refits else 0.0
@@ -124,15 +124,19 @@ def _minimise(
     domains: Sites | None,
     cuts: float,
 ) -> None:
-    """Expand the labels near their boundaries, or in their domains until none helps; in place."""
-    if domains is None:
-        labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
-        run_halves(_expand_near, len(labels) // problem.width, labelling, problem, models, cuts)
-        return
-    cost = costs(labels, problem, models)
+    """Descend, then expand the labels near their boundaries, or in their domains; in place.
+
+    Near boundaries once, in domains until no expansion helps.
+    """
+    height = len(labels) // problem.width
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
-    everywhere = 0, len(labels) // problem.width
-    while _expand_each((0, len(models.theta)), everywhere, labelling, problem, models, domains, 1):
+    if domains is None:
+        run_halves(_improve, height, labelling, problem, models, cuts)
+        return
+    run_halves(descend, height, labels, cost, problem, models)
+    labelling = labelling._replace(data=costs(labels, problem, models))
+    chosen = 0, len(models.theta)
+    while _expand_each(chosen, (0, height), labelling, problem, models, domains, 1):
         pass
 
 
@@ -148,6 +152,18 @@ def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites
         domains.append(np.flatnonzero(pixels[:height, :width] & measured))
     start = np.cumsum([0, *map(len, domains)])
     return start, np.concatenate(domains).astype(np.int32)
+
+
+def _improve(
+    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models, cuts: float
+) -> None:
+    """Descend in some rows, then expand the labels there; in place.
+
+    Both in one go, as a half of the image in which the one takes long may soon be through with
+    the other.
+    """
+    descend(rows, labelling.labels, labelling.data, problem, models)
+    _expand_near(rows, labelling, problem, models, cuts)
 
 
 @njit(cache=True, nogil=True)
