@@ -9,7 +9,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import alike, quantiles
+from rangeseg_ros.core.fitting.alike import Sets, alike, quantiles
 from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.sensing.sensor import FLOOR
 from rangeseg_ros.core.significance import CERTAIN, chi2_quantile, f_quantile
@@ -43,15 +43,15 @@ class Errors(NamedTuple):
 
 
 class ByTurn(NamedTuple):
-    """Of sets of blocks (S,) that slope alike more down the columns than along the rows.
+    """Sets of blocks (S,) that slope alike more down the columns than along the rows.
 
-    The medians of the squared inverse ranges and slopes, and a quantile of the variances.
+    The medians of the squared inverse ranges and slopes.
     """
 
+    sets: Sets
     squared: NDArray[np.float64]
     across: NDArray[np.float64]
     down: NDArray[np.float64]
-    variance: NDArray[np.float64]
 
 
 @register_jitable
@@ -101,11 +101,7 @@ def explaining(
 
 @njit(cache=True, nogil=True)
 def by_turn(
-    squared: NDArray[np.float64],
-    across: NDArray[np.float64],
-    down: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    quantile: float,
+    squared: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
 ) -> ByTurn:
     """What tells the way in which directions err.
 
@@ -117,19 +113,21 @@ def by_turn(
         quantiles(across, sets, 0.5),
         quantiles(down, sets, 0.5),
     )
-    return ByTurn(*medians, quantiles(variance, sets, quantile))
+    return ByTurn(sets, *medians)
 
 
 @njit(cache=True, nogil=True)
 def turning(
-    sets: ByTurn, blocks: float, noise: Errors, least: Errors
+    turns: ByTurn, variance: NDArray[np.float64], quantile: float, noise: Errors, least: Errors
 ) -> tuple[float, tuple[float, float]]:
     """Tilt of the `noise`, and the way in which directions err: BOTH, or certainly one alone.
 
-    Of sets of so many blocks.
+    Of blocks that have such a `variance` (N,), most of them by this quantile.
     """
-    squared, across, down = sets.squared, sets.across, sets.down
-    shown = np.maximum(sets.variance, variances(least, squared, across))
+    sets, squared, across, down = turns
+    blocks = len(variance) / len(squared)
+    shown = quantiles(variance, sets, quantile)
+    shown = np.maximum(shown, variances(least, squared, across))
     there = variances(Errors(noise.constant, noise.quartic, 0.0), squared, across)
     _, cameras = _likeliest(across + down, shown, there, blocks)
     rows, along = _likeliest(across, shown, there, blocks)

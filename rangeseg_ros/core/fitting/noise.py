@@ -27,7 +27,9 @@ from rangeseg_ros.core.fitting.scale import (
     Ratio,
     Scale,
     choose,
+    every,
     mean_of_sets,
+    scale_of,
     share,
     variance_ratio,
 )
@@ -62,19 +64,19 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     # slopes of its own.
     coarse = blocks.merged(image.rays, 2 * BLOCK)
     quanta = submit(quantisation, image.inverse)
-    used, scale, across, down, ratio = _telling(coarse)
+    used, place, squared, across, down = _telling(coarse)
     if used < SAMPLES:
         return prior
+    turns = submit(by_turn, squared, across, down)
+    scale, ratio = _shown(coarse, place)
     variance = ratio.values / share(ratio.freedom)
-    sets = submit(by_turn, scale.squared, across, down, variance, QUANTILE)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
     none, rounded = Errors(0.0, 0.0, 0.0), Errors(rounding**2, range_rounding**2, 0.0)
     noise = explaining(scale, variance, QUANTILE, True, rounded, none)
-    each = len(variance) / len(sets.result().variance)
-    tilt, way = turning(sets.result(), each, noise, rounded)
+    tilt, way = turning(turns.result(), variance, QUANTILE, noise, rounded)
     noise = noise._replace(tilt=tilt)
     level, flat = _flat_blocks(blocks, coarse, noise, way)
     if not flat.any():
@@ -115,11 +117,11 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
 @njit(cache=True, nogil=True)
 def _telling(
     blocks: Blocks,
-) -> tuple[int, Scale, NDArray[np.float64], NDArray[np.float64], Ratio]:
+) -> tuple[int, NDArray[np.intp], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Those blocks of a scale that tell the kind of the noise.
 
-    How many there are, those that are looked at, their squared slopes (N,) along the row and down
-    the column, and what they show of a variance of 1.
+    How many there are, and of those that are looked at the numbers (N,), the squared inverse
+    ranges, and the squared slopes along the row and down the column.
     """
     count = blocks.moments[..., COUNT]
     rows, columns = count.shape
@@ -132,12 +134,20 @@ def _telling(
         for j in range(columns):
             used[i, j] = 2 * count[i, j] >= most
             found += used[i, j]
-    scale = choose(blocks, used, BOTH, MOST)
-    across, down = np.empty(len(scale.place)), np.empty(len(scale.place))
-    for k, place in enumerate(scale.place):
-        across[k] = blocks.across[place // columns, place % columns]
-        down[k] = blocks.down[place // columns, place % columns]
-    return found, scale, across, down, variance_ratio(scale, blocks, np.ones((rows, columns)))
+    place = every(used, MOST)
+    squared, across, down = np.empty(len(place)), np.empty(len(place)), np.empty(len(place))
+    for k in range(len(place)):
+        i, j = place[k] // columns, place[k] % columns
+        squared[k] = blocks.squared[i, j]
+        across[k], down[k] = blocks.across[i, j], blocks.down[i, j]
+    return found, place, squared, across, down
+
+
+@njit(cache=True, nogil=True)
+def _shown(blocks: Blocks, place: NDArray[np.intp]) -> tuple[Scale, Ratio]:
+    """The scale of blocks of such numbers (N,), and what they show of a variance of 1."""
+    scale = scale_of(blocks, place, BOTH)
+    return scale, variance_ratio(scale, blocks, np.ones(blocks.squared.shape))
 
 
 @njit(cache=True, nogil=True)

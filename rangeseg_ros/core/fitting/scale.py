@@ -63,6 +63,12 @@ class Ratio(NamedTuple):
 @njit(cache=True, nogil=True)
 def choose(blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], most: int) -> Scale:
     """Of the blocks `used` (rows, columns), every n-th: about as many as `most`."""
+    return scale_of(blocks, every(used, most), way)
+
+
+@njit(cache=True, nogil=True)
+def every(used: NDArray[np.bool_], most: int) -> NDArray[np.intp]:
+    """Numbers (N,) of every n-th of the blocks `used` (rows, columns): about as many as `most`."""
     rows, columns = used.shape
     count = 0
     for i in range(rows):
@@ -70,19 +76,27 @@ def choose(blocks: Blocks, used: NDArray[np.bool_], way: tuple[float, float], mo
             count += used[i, j]
     # Odd, as rows of blocks are rarely odd: not the same columns of every row.
     stride = max(count // most, 1) | 1
-    count = (count + stride - 1) // stride
-    place = np.empty(count, np.intp)
-    squared, slope = np.empty(count), np.empty(count)
+    place = np.empty((count + stride - 1) // stride, np.intp)
     seen = k = 0
     for i in range(rows):
         for j in range(columns):
             if not used[i, j]:
                 continue
             if seen % stride == 0:
-                place[k], squared[k] = i * columns + j, blocks.squared[i, j]
-                slope[k] = slope_of(blocks, i, j, way)
+                place[k] = i * columns + j
                 k += 1
             seen += 1
+    return place
+
+
+@njit(cache=True, nogil=True)
+def scale_of(blocks: Blocks, place: NDArray[np.intp], way: tuple[float, float]) -> Scale:
+    """Scale of the blocks of such numbers (N,)."""
+    columns = blocks.squared.shape[1]
+    squared, slope = np.empty(len(place)), np.empty(len(place))
+    for k in range(len(place)):
+        i, j = place[k] // columns, place[k] % columns
+        squared[k], slope[k] = blocks.squared[i, j], slope_of(blocks, i, j, way)
     return Scale(place, squared, slope, alike(squared, slope))
 
 
