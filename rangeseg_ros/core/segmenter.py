@@ -109,13 +109,14 @@ class Segmenter:
             regions, labelling = self._by_normals(whole, grid, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             fits = Fits.of(regions, image, stated, blocks)
+        measured = submit(np.multiply, regions, image.valid)
         planes = describe_regions(regions, whole, fits)
-        if len(planes) < regions.max():
+        labels = measured.result()
+        if len(planes) < len(fits.theta) - 1:
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
-            kept = np.zeros(int(regions.max()) + 1, np.uint16)
+            kept = np.zeros(len(fits.theta), np.uint16)
             kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
-            regions = kept[regions]
-        labels = regions * image.valid
+            labels = kept[labels]
         watch.lap('planes')
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)

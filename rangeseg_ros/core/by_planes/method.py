@@ -122,7 +122,9 @@ def flat_regions(
     first = FirstPlanes.of(regions, image, blocks, sensor)
     borders = pending.result()
     curved = find_curved(regions, first, borders, image, blocks, sensor, flatness)
-    return drop_regions(regions, curved), first.without(curved), borders.without(curved)
+    flat = submit(drop_regions, regions, curved)
+    others = first.without(curved), borders.without(curved)
+    return flat.result(), *others
 
 
 def unite_regions(
@@ -158,4 +160,6 @@ def unite_regions(
     np.add.at(pixels, group, fits.pixels)
     pixels[0] = 0
     table = by_falling_size(pixels)[group]
-    return relabel(regions, table), fits.united(table, image.camera is not None)
+    united = submit(relabel, regions, table)
+    fits = fits.united(table, image.camera is not None)
+    return united.result(), fits
