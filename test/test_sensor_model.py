@@ -163,7 +163,9 @@ def test_errors_that_are_smooth_alone_are_measured(width):
     measured = []
     for seed in range(3):
         field = smooth_field(CAMERA.shape, (width, width), np.random.default_rng(seed))
-        measured.append(sensor_of(three_planes() + 0.0012 * field).distortion)
+        sensor = sensor_of(three_planes() + 0.0012 * field)
+        measured.append(sensor.distortion)
+        assert sensor.shown_length == pytest.approx(width, rel=0.5)
     assert np.mean(measured) == pytest.approx(0.0012, rel=0.3)
 
 
@@ -279,5 +281,7 @@ def test_what_is_said_of_the_errors():
     width = 9 / (2 * np.sqrt(np.pi))
     stereo = SensorModel(0.0034, 0.0, 0.1, width, 0.005, 0.0, 35.0)
     assert str(stereo) == 'noise 0.0034 1/m, correlated over 9 px, distortion 0.005 1/m'
+    told = str(stereo._replace(shown_length=10.0, quantum=0.001))
+    assert told == f'{stereo}, smooth over 35 px, steps of 0.001 1/m'
     laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)
     assert str(laser) == 'range noise 0.012 m, steps of 0.001 m'

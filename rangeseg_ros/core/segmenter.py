@@ -187,6 +187,7 @@ def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
     sensor = sensor._replace(
         correlation=2 * sensor.correlation,
         distortion_length=2 * sensor.distortion_length,
+        shown_length=2 * sensor.shown_length,
         column_noise=2 * sensor.column_noise,
         row_noise=2 * sensor.row_noise,
     )

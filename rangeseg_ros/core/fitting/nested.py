@@ -29,7 +29,7 @@ _BENT = chi2_quantile(9) / 9
 _MEDIAN = chi2_quantile(9, 0.5) / 9
 # Widths of a Gaussian kernel in quarters of a block's side. What one plane leaves beyond those of
 # four such blocks of a field smoothed with it, over that of white noise; and by how many times
-# this exceeds what it is of blocks half as large.
+# this exceeds what it is of blocks half as large, which tells how wide it is.
 _WIDTHS = 1.4 * 2.0 ** (np.arange(13) / 4)
 _APART = np.array([correlated_residuals(width)[3] for width in _WIDTHS])
 _GROWTH = _APART / np.array([correlated_residuals(2 * width)[3] for width in _WIDTHS])
@@ -73,6 +73,9 @@ class Nested(NamedTuple):
         Measured share of most blocks.
     distortion : Errors
         The largest that any scale shows.
+    length : float
+        Width of the Gaussian kernel that it looks smoothed with there, pixels; 0 where one scale
+        does not tell.
     """
 
     within: NDArray[np.float64]
@@ -80,6 +83,7 @@ class Nested(NamedTuple):
     between: float
     filled: float
     distortion: Errors
+    length: float
 
 
 @njit(cache=True, nogil=True)
@@ -143,8 +147,7 @@ def over_scales(
     within.clear()
     freedom.clear()
     between = filled = 1.0
-    before = most = 0.0
-    hidden = 1.0
+    before = most = width = wide = 0.0
     while compared.enough:
         scale = compared.scale
         relative, excess = np.empty(len(scale.place)), np.empty(len(scale.place))
@@ -166,8 +169,11 @@ def over_scales(
         smooth = Errors(8 / pixels * bending.constant, 8 / pixels * bending.quartic, 0.0)
         typical = _typical(smooth, scale)
         # Where smaller blocks show nothing, only that it may be as wide as it is known to be.
-        hidden = _hidden(typical / before, 8 * length / side) if before > 0 else 1.0
+        told = np.interp(typical / before, _GROWTH, _WIDTHS) if before > 0 else 0.0
+        width = min(told, 8 * length / side)
         before = typical
+        if typical > most or wide == 0:
+            wide = width * side / 8
         if typical > most:
             most, distortion = typical, smooth
         flat = _not_bent(compared, blocks, way, shown, bending)
@@ -176,20 +182,10 @@ def over_scales(
         compared = compare(flat, blocks.residual, compared.level, larger, way)
         blocks = larger
     # Where the largest blocks show the most, larger ones would show more.
-    if before == most > 0:
+    if before == most > 0 and width > 0:
+        hidden = max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
         distortion = Errors(hidden * distortion.constant, hidden * distortion.quartic, 0.0)
-    return Nested(np.array(within), np.array(freedom), between, filled, distortion)
-
-
-@njit(cache=True)
-def _hidden(growth: float, widest: float) -> float:
-    """Variance of a distortion over 8 M / n, where M / n is so many times that of half the side.
-
-    Of one wider than the blocks, as such growth tells: by a Gaussian kernel of the width that
-    grows so, of so many quarters of their side at most.
-    """
-    width = min(np.interp(growth, _GROWTH, _WIDTHS), widest)
-    return max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
+    return Nested(np.array(within), np.array(freedom), between, filled, distortion, wide)
 
 
 @njit(cache=True, nogil=True)

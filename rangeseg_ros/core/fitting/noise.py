@@ -109,6 +109,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),
         range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
+        shown_length=float(nested.length),
         quantum=quantum,
         range_quantum=range_quantum,
     )

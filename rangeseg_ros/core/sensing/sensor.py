@@ -33,7 +33,7 @@ class SensorModel(NamedTuple):
     range_distortion : float
         Smooth systematic error of the range, metres.
     distortion_length : float
-        Width of the Gaussian kernel the distortion looks smoothed with, pixels.
+        Width of the Gaussian kernel the distortion is smoothed with at most, pixels: as stated.
     column_noise, row_noise : float
         Random error of a pixel's direction, along its row and down its column, pixels: what
         surfaces seen at a grazing angle are noisier by.
@@ -41,6 +41,9 @@ class SensorModel(NamedTuple):
         Step that the inverse range is rounded to, 1/m; 0 for none.
     range_quantum : float
         Step that the range is rounded to, metres.
+    shown_length : float
+        Width of the kernel that the distortion of an image looks smoothed with, pixels; 0 where
+        that was not measured. Nothing is decided by it.
     """
 
     noise: float
@@ -54,6 +57,7 @@ class SensorModel(NamedTuple):
     row_noise: float = 0.0
     quantum: float = 0.0
     range_quantum: float = 0.0
+    shown_length: float = 0.0
 
     @classmethod
     def from_config(cls, config: Config, shape: tuple[int, int] = (480, 640)) -> SensorModel:
@@ -73,24 +77,18 @@ class SensorModel(NamedTuple):
     def __str__(self) -> str:
         """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ...
 
-        Correlated over as many pixels as the correlation along a line sums to.
+        Correlated and smooth over as many pixels as the correlation along a line sums to.
         """
-        said = [
-            f'{name} {value:.2g} {unit}'
-            for name, value, unit in (
-                ('noise', self.noise, '1/m'),
-                ('range noise', self.range_noise, 'm'),
-                ('distortion', self.distortion, '1/m'),
-                ('range distortion', self.range_distortion, 'm'),
-                ('steps of', self.quantum, '1/m'),
-                ('steps of', self.range_quantum, 'm'),
-            )
-            if value > 0
-        ]
-        over = 2 * np.sqrt(np.pi) * self.correlation
-        if self.white < 0.5 and over > 1:
-            said.insert(1, f'correlated over {over:.0f} px')
-        return ', '.join(said)
+        line = 2 * np.sqrt(np.pi)
+        said = _listed(('noise', self.noise, '1/m'), ('range noise', self.range_noise, 'm'))
+        if self.white < 0.5 and line * self.correlation > 1:
+            said.insert(1, f'correlated over {line * self.correlation:.0f} px')
+        smooth = ('distortion', self.distortion, '1/m')
+        said += _listed(smooth, ('range distortion', self.range_distortion, 'm'))
+        if self.shown_length > 0:
+            said.append(f'smooth over {line * self.shown_length:.0f} px')
+        steps = ('steps of', self.quantum, '1/m'), ('steps of', self.range_quantum, 'm')
+        return ', '.join(said + _listed(*steps))
 
     @property
     def patch(self) -> float:
@@ -122,6 +120,11 @@ class SensorModel(NamedTuple):
         if self.correlation == 0:
             return 1.0
         return self.white + (1 - self.white) * correlated_residuals(self.correlation)[3]
+
+
+def _listed(*errors: tuple[str, float, str]) -> list[str]:
+    """Those that there are."""
+    return [f'{name} {value:.2g} {unit}' for name, value, unit in errors if value > 0]
 
 
 def length_of_distortion(stated: float, shape: tuple[int, int]) -> float:
