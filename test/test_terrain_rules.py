@@ -55,14 +55,14 @@ def test_cells_are_the_means_of_their_pixels(lens):
         assert cells.place[:, i, c] == pytest.approx(axes_of(up) @ ray / value, abs=1e-4)
 
 
-def fallen(height, broken, steep=None, turned=False):
+def fallen(height, broken, steep=None, turned=False, rise=False):
     """`below_edges` of cells on straight columns at heights (ROWS, COLUMNS)."""
     place = np.zeros((3, ROWS, COLUMNS), np.float32)
     place[0], place[1], place[2] = height, AHEAD, 0.02 * np.arange(COLUMNS)
     flat = np.ones((ROWS, COLUMNS), np.float32)
     cells = Cells(place, flat, place, flat, place[:2])
     steep = np.zeros_like(broken) if steep is None else steep
-    return below_edges(height.astype(np.float32), cells, STEPS, steep, broken, turned)
+    return below_edges(height.astype(np.float32), cells, STEPS, steep, broken, turned, rise)
 
 
 def test_beyond_an_edge_it_has_fallen_though_noise_makes_a_gap_in_it():
@@ -78,18 +78,34 @@ def test_beyond_an_edge_it_has_fallen_though_noise_makes_a_gap_in_it():
     np.testing.assert_array_equal(fallen(height[::-1], broken, turned=True), expected[::-1])
 
 
-def test_what_hides_an_edge_hides_no_drop_and_a_plank_across_it_stays():
-    """In more columns than those on either side can outvote."""
+@pytest.mark.parametrize('rise', [False, True])
+def test_what_hides_an_edge_hides_no_drop_and_a_plank_across_it_stays(rise):
+    """In more columns than those on either side can outvote; the same where the ground rises."""
     height = np.zeros((ROWS, COLUMNS))
-    height[:30] = -0.06
+    height[:30] = 0.06 if rise else -0.06
     broken = np.zeros((ROWS, COLUMNS), np.bool_)
     broken[29] = True
     broken[29, 4:19] = False
     expected = np.zeros_like(broken)
     expected[:30] = True
-    np.testing.assert_array_equal(fallen(height, broken), expected)
+    np.testing.assert_array_equal(fallen(height, broken, rise=rise), expected)
     height[:30, 4:19] = 0
-    assert not fallen(height, broken)[:, 7:16].any()
+    assert not fallen(height, broken, rise=rise)[:, 7:16].any()
+
+
+def test_beside_what_fell_it_has_fallen_up_to_where_the_ground_rises():
+    """An edge along the view, which no column crosses; a slope aside is none."""
+    height = np.zeros((ROWS, COLUMNS))
+    height[:30, :16] = -0.06
+    broken = np.zeros((ROWS, COLUMNS), np.bool_)
+    broken[29, :12] = True
+    expected = np.zeros_like(broken)
+    expected[:30, :16] = True
+    np.testing.assert_array_equal(fallen(height, broken), expected)
+    np.testing.assert_array_equal(fallen(height[:, ::-1], broken[:, ::-1]), expected[:, ::-1])
+    height[:30, 12:] = -0.06 + 0.01 * np.arange(COLUMNS - 12)
+    expected[:, 12:] = False
+    np.testing.assert_array_equal(fallen(height, broken), expected)
 
 
 def test_a_hole_ends_where_the_ground_comes_back():

@@ -48,6 +48,8 @@ def below_edges(
     fallen, before = _fallen(signed, cells.place, steps, steep, broken, turned, rise)
     most = _most(fallen)
     _close_gaps(most, signed, before, steps.least, turned)
+    if not rise:
+        _spread(most, signed, before, steps)
     return most
 
 
@@ -106,6 +108,39 @@ def _close_gaps(
                 if closed or _depth(height, before, i, last, c) > least:
                     fallen[i, last + 1 : c] = True
             last = c
+
+
+@njit(cache=True, nogil=True)
+def _spread(
+    fallen: NDArray[np.bool_],
+    height: NDArray[np.float32],
+    before: NDArray[np.float32],
+    steps: Steps,
+) -> None:
+    """Let what lies as low between `fallen` cells and a rise beside them have fallen as well.
+
+    Columns cross an edge along the view late, or never. All are (rows, columns), `height` above
+    the ground under the robot and that of the ground `before` in metres.
+    """
+    rows, columns = fallen.shape
+    for i in range(rows):
+        if not fallen[i].any():
+            continue
+        for side in (1, -1):
+            first = columns if side < 0 else -1  # the last cell that has fallen
+            level = np.nan
+            for m in range(columns):
+                c = m if side > 0 else columns - 1 - m
+                if fallen[i, c]:
+                    if before[i, c] == before[i, c]:
+                        level = min(before[i, c], 0.0)
+                    first = c
+                elif not (level - height[i, c] > steps.least and abs(c - first) <= _BESIDE[0]):
+                    rise = height[i, c] - height[i, c - side]
+                    if level == level and rise > steps.beside:
+                        for k in range(first + side, c, side):
+                            fallen[i, k] = True
+                    level = np.nan
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
