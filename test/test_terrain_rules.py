@@ -11,10 +11,11 @@ from rangeseg_ros.core.meaning.classes import DROP, GROUND, HIDDEN, OBSTACLE, UN
 from rangeseg_ros.core.meaning.edges import below_edges
 from rangeseg_ros.core.meaning.ground import CellTerrain
 from rangeseg_ros.core.meaning.ground_field import GroundField
-from rangeseg_ros.core.meaning.pixels import Said, pixels_of
+from rangeseg_ros.core.meaning.pixels import Said, decide, pixels_of
 from rangeseg_ros.core.meaning.stairs import _find_level
 from rangeseg_ros.core.meaning.steps import BASELINES, Steps
 from rangeseg_ros.core.segmentation import STATED
+from rangeseg_ros.evaluation.terrain import _near_borders
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -145,8 +146,9 @@ def test_nothing_is_claimed_that_the_noise_of_a_place_would_make():
     def classes(kind, unsure, height):
         # The ground is a plane across the optical axis, so much farther than what is measured.
         field = GroundField.of(np.array([[[0.0, 0.0, 1 / (1 + height)]]]), size, up)
-        said = Said(np.full(shape, kind, np.int8), *np.full((2, *shape), unsure, np.float32))
-        found, measured = pixels_of(image, field, size, said, (0.025, 0.025))
+        low, high, noise = (np.full(shape, x, np.float32) for x in (-0.025, 0.025, unsure))
+        found, measured = pixels_of(image, field, size, Said(np.full(shape, kind, np.int8), low,
+                                                             high, noise))  # fmt: skip
         assert measured == pytest.approx(height, abs=1e-5)
         (value,) = np.unique(found)
         return value
@@ -157,6 +159,27 @@ def test_nothing_is_claimed_that_the_noise_of_a_place_would_make():
     assert [classes(HIDDEN, 0.05, h) for h in (0, 0.04, 0.06, -0.06)] == [
         UNKNOWN, UNKNOWN, OBSTACLE, DROP,
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ('unsure', 'low', 'beside'),
+    [(0.01, -0.025, -0.025), (0.035, -0.035, -0.015), (1, -0.04, 0.95)],
+)
+def test_beside_a_drop_ground_is_what_could_not_be_the_drop(unsure, low, beside):
+    """Elsewhere noise excuses what is low; beside what only may be a drop, it does not."""
+    rows, columns = 20, 9
+    surface = np.zeros((rows, columns), np.int32)
+    surface[:5], surface[14, 2] = 1, 2
+    verdict = np.array([UNKNOWN, DROP, HIDDEN], np.int8)
+    none = np.zeros(surface.shape, np.bool_)
+    height = np.where(surface > 0, np.float32(-0.05), np.float32(0))
+    noise = np.full(surface.shape, unsure, np.float32)
+    said = decide(verdict, surface, surface == 0, none, none, height, noise, (0.05, 0.05), 0.04)
+    expected = np.full(surface.shape, low, np.float32)
+    expected[12:17, 1:4] = -0.025
+    expected[:7] = beside
+    ground = surface == 0
+    np.testing.assert_allclose(said.low[ground], expected[ground], atol=1e-6)
 
 
 def test_bits_of_a_tread_are_level_though_most_of_it_is_not_measured():
@@ -240,16 +263,16 @@ def test_little_is_called_ground_that_the_noise_nearly_hides(kind, seed, class_)
     assert inside.sum() > 2000 and (terrain[inside] == GROUND).mean() < 0.008
 
 
-@pytest.mark.parametrize(('seed', 'most'), [(1710099, 0.014), (1710061, 0.0), (1920182, 0.03)])
-def test_a_level_beyond_an_edge_is_told_as_a_whole(seed, most):
+@pytest.mark.parametrize('seed', [1710099, 1710061, 1920182, 2020141])
+def test_a_level_beyond_an_edge_is_told_as_a_whole(seed):
     """5 cm down at more than 2 m: no pixel of a stereo camera tells, all of them together do."""
     scene, sensor = terrain_scene('drop', seed), SENSORS['realsense'](seed)
     frame = simulate_terrain(scene, sensor, seed=seed)
     up, height = stated(scene, seed)
     config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=height)
     terrain = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera)).terrain
-    inner = cv2.erode((frame.terrain == DROP).view(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    drop = terrain[inner & (frame.crossing <= 2.5)]
+    there = (frame.terrain == DROP) & (frame.crossing <= 2.5)
+    drop = terrain[there & ~_near_borders(frame.terrain)]
     assert np.mean(drop == DROP) >= 0.95
-    # Nor are little pieces beside the edge noise of the ground.
-    assert np.mean(drop == GROUND) <= most
+    # What docs/navigation.md counts as a failure.
+    assert np.mean(drop == GROUND) <= 0.01

@@ -214,9 +214,9 @@ def _terrain(
     # What rises less than is never excused is no foot, however precise the sensor.
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
     foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
-    said = decide(verdict, surface, ground, fallen, foot, height, unsure, _EXCUSED * least)
-    bounds = limits.obstacle / 2, limits.drop / 2
-    classes, heights = pixels_of(image, field, size, said, bounds)
+    lowest = limits.obstacle, limits.drop
+    said = decide(verdict, surface, ground, fallen, foot, height, unsure, lowest, _EXCUSED * least)
+    classes, heights = pixels_of(image, field, size, said)
     if known[0] == 0:
         stands, falls = ends_of(said.kind, height, steps.least, turned)
         # The rule of succession: nothing but the edge of a surface tells a table from a floor.

@@ -24,15 +24,16 @@ class Said(NamedTuple):
     ----------
     kind : (...) int8
         Obstacle or drop as a whole, ground, or unknown.
-    doubt : (...) float32
-        Heights beyond it contradict that a pixel is ground, metres.
+    low, high : (...) float32
+        Heights that a pixel of the ground is between, metres.
     unsure : (...) float32
         The noise of a pixel's height: where it is not higher, nothing is claimed to be an
         obstacle, where it is not deeper, nothing to be a drop. Metres.
     """
 
     kind: NDArray[np.int8]
-    doubt: NDArray[np.float32]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
     unsure: NDArray[np.float32]
 
 
@@ -45,11 +46,12 @@ def decide(
     foot: NDArray[np.bool_],
     height: NDArray[np.float32],
     unsure: NDArray[np.float32],
+    least: tuple[float, float],
     most: float,
 ) -> Said:
     """What is said of cells, by their surfaces and by themselves.
 
-    Eight parameters: a kernel that takes arrays.
+    Nine parameters: a kernel that takes arrays.
 
     Parameters
     ----------
@@ -62,13 +64,16 @@ def decide(
         obstacles, which are obstacles.
     height, unsure : (rows, columns) float32
         Above the ground, and its noise, metres.
+    least : (float, float)
+        The least obstacle, and the least drop, metres: what is not half so high, or so deep, is
+        more probably ground.
     most : float
         No noise excuses more, metres.
     """
     rows, columns = surface.shape
     kind = np.empty((rows, columns), np.int8)
-    doubt = np.empty(kind.shape, np.float32)
-    bound = np.float32(most)
+    low, top = np.empty((2, rows, columns), np.float32)
+    tall, deep = np.float32(least[0] / 2), np.float32(-least[1] / 2)
     high, wide = BLUR[0] // 2, BLUR[1] // 2
     for i in range(rows):
         for c in range(columns):
@@ -76,23 +81,31 @@ def decide(
             if fallen[i, c] and own == UNKNOWN:
                 own = np.int8(HIDDEN)
             kind[i, c] = np.int8(OBSTACLE) if foot[i, c] else own
-            doubt[i, c] = min(unsure[i, c], bound)
+            excused = min(unsure[i, c], np.float32(most)) if own == GROUND else np.float32(0)
+            low[i, c], top[i, c] = min(deep, -excused), max(tall, excused)
     # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
-    low = np.zeros((rows + 2 * high, columns + 2 * wide), np.bool_)
+    # Noise moves the edge, too: beside a drop, ground is what could not as well be the least drop.
+    # Bits: 2 for a drop, 1 for what may be one.
+    drops = np.zeros((rows + 2 * high, columns + 2 * wide), np.uint8)
     for i in range(rows):
         for c in range(columns):
+            found = (kind[i, c] == DROP) | ((kind[i, c] == HIDDEN) & fallen[i, c])
             hidden = (kind[i, c] == HIDDEN) & (height[i, c] < 0)
-            low[i + high, c + wide] = (kind[i, c] == DROP) | hidden
-    beside = np.empty(low.shape[1], np.bool_)
+            drops[i + high, c + wide] = np.uint8(hidden) | np.uint8(found) << 1
+    column, beside = np.empty(drops.shape[1], np.uint8), np.empty(columns, np.uint8)
     for i in range(rows):
-        beside[:] = False
+        column[:], beside[:] = 0, 0
         for k in range(BLUR[0]):
-            for c in range(len(beside)):
-                beside[c] |= low[i + k, c]
+            for c in range(len(column)):
+                column[c] |= drops[i + k, c]
         for k in range(BLUR[1]):
             for c in range(columns):
-                doubt[i, c] = np.float32(0) if beside[c + k] else doubt[i, c]
-    return Said(kind, doubt, unsure)
+                beside[c] |= column[c + k]
+        for c in range(columns):
+            told = unsure[i, c] - np.float32(least[1]) if beside[c] > 1 else deep
+            low[i, c] = max(deep, told) if beside[c] else low[i, c]
+            top[i, c] = tall if beside[c] else top[i, c]
+    return Said(kind, low, top, unsure)
 
 
 def pixels_of(
@@ -100,7 +113,6 @@ def pixels_of(
     field: GroundField,
     size: CellSize,
     said: Said,
-    bounds: tuple[float, float],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Classes and heights of pixels.
 
@@ -111,9 +123,6 @@ def pixels_of(
     field : GroundField
     size : CellSize
     said : Said
-    bounds : (float, float)
-        Half of the least obstacle, and of the least drop, metres: what is not so high, or so
-        deep, is more probably ground.
 
     Returns
     -------
@@ -125,7 +134,7 @@ def pixels_of(
     classes = np.empty(image.shape, np.uint8)
     heights = np.empty(image.shape, np.float32)
     run_rows(_classify, len(said.kind), image.inverse, image.rays, image.pinhole, field, size,
-             said, bounds, classes, heights)  # fmt: skip
+             said, classes, heights)  # fmt: skip
     return classes, heights
 
 
@@ -139,13 +148,12 @@ def _classify(
     field: GroundField,
     size: CellSize,
     said: Said,
-    bounds: tuple[float, float],
     classes: NDArray[np.uint8],
     heights: NDArray[np.float32],
 ) -> None:
     """Of rows first...after of cells.
 
-    Eleven parameters, as a kernel cannot return what several threads write. The inner loops do the
+    Ten parameters, as a kernel cannot return what several threads write. The inner loops do the
     same for every pixel, so that the compiler makes them vector instructions.
     """
     width = inverse.shape[1]
@@ -158,7 +166,7 @@ def _classify(
     ray = first_rays(rays, first * size.rows)
     for i in range(first, after):
         planes_of_row(spread, ((i + 0.5) * size.rows) / field.rows - 0.5, planes)
-        _bound(said, i, bounds, of_cells)
+        _bound(said, i, of_cells)
         _widen(of_cells, groups, limits)
         for v in range(i * size.rows, min((i + 1) * size.rows, len(inverse))):
             next_rays(rays, pinhole, v, ray)
@@ -179,13 +187,12 @@ def _classify(
 
 
 @njit(cache=True, inline='always')
-def _bound(said: Said, i: int, bounds: tuple[float, float], limits: NDArray[np.float32]) -> None:
+def _bound(said: Said, i: int, limits: NDArray[np.float32]) -> None:
     """Limits of row i of cells, without a branch, as vector instructions."""
-    deep, tall, endless = np.float32(-bounds[1]), np.float32(bounds[0]), np.float32(np.inf)
+    endless = np.float32(np.inf)
     for c in range(limits.shape[1]):
-        kind, doubt, unsure = said.kind[i, c], said.doubt[i, c], said.unsure[i, c]
-        low = min(deep, -doubt) if kind == GROUND else deep
-        high = max(tall, doubt) if kind == GROUND else tall
+        kind, unsure = said.kind[i, c], said.unsure[i, c]
+        low, high = said.low[i, c], said.high[i, c]
         drop, obstacle = min(low, -unsure), max(high, unsure)
         never = (kind == HIDDEN) | (kind > GROUND)
         whole = -endless if kind == OBSTACLE else endless
