@@ -199,10 +199,6 @@ def _grow(
     for a in range(count):
         if nodes[a] and parent[a] == a:
             _wait(a, residual[a] / moments[a, COUNT], first, last, after)
-    # Turns in which a patch has grown, and in which it was told what the two of a pair leave
-    # together: most are asked for from either side.
-    grown, told = np.zeros(count, np.int32), np.zeros(len(pairs), np.int32)
-    left = np.empty(len(pairs))
     seen = np.full(count, -1, np.int32)
     turn, level = 0, 0
     while level < _LEVELS:
@@ -235,17 +231,14 @@ def _grow(
                 seen[b] = turn
                 before = e
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
-                    pair = e // 2
-                    if told[pair] <= max(grown[a], grown[b]):
-                        left[pair] = common_residual(moments, a, b)
-                        told[pair] = turn
-                    extra = left[pair] - residual[a] - residual[b]
+                    common = common_residual(moments, a, b)
+                    extra = common - residual[a] - residual[b]
                     apart = misfit(extra, moments, a, b, WITHIN_PATCH, agreement)
                     if apart < best:
-                        best, partner, together = apart, b, left[pair]
+                        best, partner, together = apart, b, common
             e = following
         if partner >= 0:
-            residual[a], grown[a] = together, turn
+            residual[a] = together
             for entry in range(SIZE):
                 moments[a, entry] += moments[partner, entry]
             parent[partner] = a
