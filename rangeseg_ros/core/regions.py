@@ -224,8 +224,13 @@ def _rename(
 ) -> None:
     """What `Components.renamed` returns, of some rows."""
     for i in range(first, after):
+        name, renamed = 0, table[0]
         for j in range(found.shape[1]):
-            result[i, j] = table[number[found[i, j]]]
+            # Most pixels are called as the one before.
+            if found[i, j] != name:
+                name = found[i, j]
+                renamed = table[number[name]]
+            result[i, j] = renamed
 
 
 def _thin(
@@ -263,21 +268,26 @@ def _counts(
     eight = rim.view(np.uint64)
     for i in range(first, after):
         for k in range(i + 1 if i > first else max(i - 1, 0), min(i + 2, height)):
+            name = own = 0
             for j in range(width):
-                rows[k % 3, j] = number[found[k, j]]
-        own = rows[i % 3]
+                # Most pixels are called as the one before.
+                if found[k, j] != name:
+                    name = found[k, j]
+                    own = number[name]
+                rows[k % 3, j] = own
+        here = rows[i % 3]
         if i in (0, height - 1):
             rim[:width] = 1
         else:
-            _find_rim(own, rows[(i - 1) % 3], rows[(i + 1) % 3], rim)
+            _find_rim(here, rows[(i - 1) % 3], rows[(i + 1) % 3], rim)
         for k in range(len(eight)):
             start, stop = 8 * k, min(8 * k + 8, width)
             if eight[k] == 0:
-                area[own[start]] += stop - start
+                area[here[start]] += stop - start
                 continue
             for j in range(start, stop):
-                area[own[j]] += 1
-                perimeter[own[j]] += rim[j]
+                area[here[j]] += 1
+                perimeter[here[j]] += rim[j]
     return area, perimeter
 
 
