@@ -46,6 +46,19 @@ def test_strips_are_worked_on_at_the_same_time(threads):
     run_rows(lambda first, after: barrier.wait(), 1000)
 
 
+def test_strips_are_as_many_for_each_thread_as_asked_for(threads):
+    visits = np.zeros(1000, int)
+    begun = []
+
+    def kernel(first, after):
+        begun.append(first)
+        visits[first:after] += 1
+
+    run_rows(kernel, 1000, strips=1)
+    assert len(begun) == min(threads, 4)
+    assert (visits == 1).all()
+
+
 @pytest.mark.parametrize('threads', [2], indirect=True)
 def test_a_thread_that_is_done_takes_more_strips(threads):
     """The caller's first one takes as long as all others together."""

@@ -127,14 +127,16 @@ def _cores() -> int:
     return cv2.getNumThreads() // max(_sharing, 1)
 
 
-def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
+def run_rows(
+    kernel: Callable[..., None], rows: int, *arguments: Any, strips: int = _STRIPS
+) -> None:
     """Run kernel(first, after, *arguments) on strips of the rows at the same time.
 
     What one strip writes no other may touch: then the result is the same for any number of
-    threads.
+    threads, and of strips for each.
     """
     threads = min(_cores(), _MAX_THREADS)
-    count = max(min(_STRIPS * threads, rows // _ROWS), 1) if threads > 1 else 1
+    count = max(min(strips * threads, rows // _ROWS), 1) if threads > 1 else 1
     bounds = [rows * part // count for part in range(count + 1)]
     others = [
         _handed_over(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])

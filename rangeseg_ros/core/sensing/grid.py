@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
@@ -54,7 +53,8 @@ def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 
     if jumps is None:
         jumps = np.zeros((height, width - 1), np.bool_), np.zeros((height - 1, width), np.bool_)
     horizontal, vertical = (np.empty(edges.shape, np.float32) for edges in jumps)
-    run_rows(_connect, height, image.inverse, *jumps, horizontal, vertical)
+    # On this thread alone: to hand rows over takes longer than to do them.
+    _connect(image.inverse, *jumps, horizontal, vertical)
     if weighting == 'distance':
         points = image.points
         across = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
@@ -69,17 +69,15 @@ def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 
 
 @njit(cache=True, nogil=True)
 def _connect(
-    first: int,
-    after: int,
     inverse: NDArray[np.float32],
     across: NDArray[np.bool_],
     down: NDArray[np.bool_],
     right: NDArray[np.float32],
     below: NDArray[np.float32],
 ) -> None:
-    """Give 1 to edges of some rows between measured pixels that do not jump, 0 to others."""
+    """Give 1 to edges between measured pixels that do not jump, 0 to others."""
     height, width = inverse.shape
-    for i in range(first, after):
+    for i in range(height):
         for j in range(width - 1):
             both = (inverse[i, j] > 0) & (inverse[i, j + 1] > 0)
             right[i, j] = both & ~across[i, j]

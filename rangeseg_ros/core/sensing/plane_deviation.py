@@ -50,7 +50,9 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
     horizontal = np.empty((height, width - 1), np.bool_)
     vertical = np.empty((height - 1, width), np.bool_)
-    run_rows(_find_jumps, height, image.inverse, limits, clear, horizontal, vertical)
+    # Every strip looks once more at the rows around it: as few of them as there are threads.
+    arrays = image.inverse, limits, clear, horizontal, vertical
+    run_rows(_find_jumps, height, *arrays, strips=1)
     return horizontal, vertical
 
 
