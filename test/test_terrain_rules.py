@@ -57,10 +57,10 @@ def test_cells_are_the_means_of_their_pixels(lens):
 
 
 def fallen(height, broken, steep=None, turned=False, rise=False):
-    """`below_edges` of cells on straight columns at heights (ROWS, COLUMNS)."""
-    place = np.zeros((3, ROWS, COLUMNS), np.float32)
-    place[0], place[1], place[2] = height, AHEAD, 0.02 * np.arange(COLUMNS)
-    flat = np.ones((ROWS, COLUMNS), np.float32)
+    """`below_edges` of cells on straight columns at heights (ROWS, ...)."""
+    place = np.zeros((3, *height.shape), np.float32)
+    place[0], place[1], place[2] = height, AHEAD, 0.02 * np.arange(height.shape[1])
+    flat = np.ones(height.shape, np.float32)
     cells = Cells(place, flat, place, flat, place[:2])
     steep = np.zeros_like(broken) if steep is None else steep
     return below_edges(height.astype(np.float32), cells, STEPS, steep, broken, turned, rise)
@@ -92,6 +92,31 @@ def test_what_hides_an_edge_hides_no_drop_and_a_plank_across_it_stays(rise):
     np.testing.assert_array_equal(fallen(height, broken, rise=rise), expected)
     height[:30, 4:19] = 0
     assert not fallen(height, broken, rise=rise)[:, 7:16].any()
+
+
+def test_at_the_border_of_the_image_a_hidden_edge_hides_no_drop():
+    """There are columns on one side only; few of them tell nothing, nor do rises."""
+    height = np.zeros((ROWS, 2 * COLUMNS))
+    height[:30] = -0.06
+    broken = np.zeros(height.shape, np.bool_)
+    broken[29, 15:] = True
+    for side in (1, -1):
+        found = fallen(height[:, ::side], broken[:, ::side])
+        np.testing.assert_array_equal(found, height[:, ::side] < 0)
+    assert not fallen(-height, broken, rise=True)[:, :12].any()
+    broken[29, 30:] = False
+    assert not fallen(height, broken)[:, :12].any()
+    broken[29, 30:], height[:30, :15] = True, 0
+    assert not fallen(height, broken)[:, :12].any()
+
+
+def test_aslant_a_trench_ends_at_the_border_of_the_image_first():
+    far = 25 - np.arange(2 * COLUMNS) // 2
+    row = np.arange(ROWS)[:, None]
+    trench = (row >= far) & (row < 30)
+    broken = np.isin(row, 29) | (row == far - 1)
+    found = fallen(np.where(trench, -0.06, 0.0), broken)
+    assert (found != trench).mean() < 0.01
 
 
 def test_beside_what_fell_it_has_fallen_up_to_where_the_ground_rises():

@@ -47,7 +47,7 @@ def below_edges(
     signed = -height if rise else height
     fallen, before = _fallen(signed, cells.place, steps, steep, broken, turned, rise)
     most = _most(fallen)
-    _close_gaps(most, signed, before, steps.least, turned)
+    _close_gaps(most, signed, before, steps.least, turned, rise)
     if not rise:
         _spread(most, signed, before, steps)
     return most
@@ -87,25 +87,32 @@ def _close_gaps(
     before: NDArray[np.float32],
     least: float,
     turned: bool,
+    rise: bool,
 ) -> None:
     """Let what lies between `fallen` columns have fallen as well, from where it lies as low.
 
-    Something may hide an edge in more columns than there are on either side to outvote them. What
-    is as high as the ground before the edge on both sides, such as a plank, is left. All are
-    (rows, columns), `height` and that of the ground `before` in metres.
+    Something may hide an edge in more columns than there are on either side to outvote them, and
+    at the border of the image there is but one side, of which so many must have fallen that no few
+    patches of noise tell it; a rise there hides nothing to fall into. What is as high as the
+    ground before the edge beside it, such as a plank, is left. All are (rows, columns), `height`
+    and that of the ground `before` in metres.
     """
     rows, columns = fallen.shape
+    wide = _BESIDE[1]
     for m in range(rows):  # outwards
         i = m if turned else rows - 1 - m
         nearer = max(m - 1, 0) if turned else min(i + 1, rows - 1)
-        last = -1
-        for c in range(columns):
-            if not fallen[i, c]:
+        last = columns if rise else -1
+        for c in range(columns + (not rise)):
+            if c < columns and not fallen[i, c]:
                 continue
             gap = c - last - 1
-            if last >= 0 and 0 < gap <= _BESIDE[1]:
-                closed = 2 * fallen[nearer, last + 1 : c].sum() > gap
-                if closed or _depth(height, before, i, last, c) > least:
+            if 0 < gap <= wide:
+                # At the border, the far edge of a trench aslant makes a gap as well.
+                within = last >= 0 and c < columns
+                closed = within and 2 * fallen[nearer, last + 1 : c].sum() > gap
+                told = within or fallen[i, max(last + 1 - wide, 0) : c + wide].sum() == wide
+                if closed or (told and _depth(height, before, i, last, c) > least):
                     fallen[i, last + 1 : c] = True
             last = c
 
