@@ -1,5 +1,7 @@
 """What rays say of places where something is known to be."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from rangeseg_ros.core.mapping.sightings import find_sightings, may_be_in_sight
@@ -28,3 +30,24 @@ def test_whatever_rays_tell_of_lies_in_spheres_that_may_be_in_sight():
     assert not may_be_in_sight(
         np.array([[0, 0, -2.0], [9, 0, 2], [0, -9, 2]]), np.ones(3), image
     ).any()
+
+
+def test_sightings_are_the_same_in_any_frame_of_the_camera():
+    random = np.random.default_rng(2)
+    body = replace(CAMERA, turn=(-0.5, 0.5, -0.5, 0.5))  # x forward, y to the left, z up
+    np.testing.assert_allclose(body.axes @ [0, 0, 1], [1, 0, 0], atol=1e-12)
+    depth = random.uniform(1, 3, CAMERA.shape)
+    points = random.normal((0, 0, 2), 1, (2000, 3))
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    found = [
+        find_sightings(
+            points @ turn.T,
+            normals @ turn.T,
+            np.full(2000, 1e-4),
+            RangeImage.from_depth(depth, camera),
+            SENSOR,
+        )
+        for turn, camera in ((np.eye(3), CAMERA), (body.axes, body))
+    ]
+    assert len(np.unique(found[0])) == 3
+    np.testing.assert_array_equal(*found)
