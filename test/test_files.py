@@ -1,6 +1,7 @@
 """Depth images, cameras, parameter files and plane tables: what is read back, what is refused."""
 
 import csv
+import resource
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
+from rangeseg_ros.cli.errors import in_words
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.files import natural_order, replacing
@@ -84,6 +86,19 @@ def test_a_failed_write_leaves_what_was_there(tmp_path):
         raise RuntimeError
     assert path.read_text() == 'old'
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_where_there_is_no_room_the_file_is_named(tmp_path):
+    path, (soft, hard) = tmp_path / 'picture.png', resource.getrlimit(resource.RLIMIT_FSIZE)
+    noise = np.random.default_rng(0).integers(0, 255, (200, 200), np.uint8)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        with pytest.raises(OSError, match='too large') as caught:
+            write_image(path, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert in_words(caught.value) == f'{path}: File too large'
+    assert not list(tmp_path.iterdir())
 
 
 @given(st.text(min_size=1), st.text(min_size=1))

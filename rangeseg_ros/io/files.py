@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import errno
 import fcntl
 import os
 import re
@@ -16,6 +17,8 @@ from tempfile import gettempdir
 # Temporary folders of this process. A signal may come while one is made or removed, where no
 # `finally` helps; what is still there when the process exits goes then.
 _unfinished: set[Path] = set()
+# A full disk, quota or largest file: Python does not say of which file.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 class NotReplacedError(OSError):
@@ -36,18 +39,25 @@ def replacing(path: Path) -> Iterator[Path]:
     ------
     NotReplacedError
         `path` is a device, a pipe or the like.
+    OSError
+        It cannot be written; of a full disk, too, the error names the file.
     """
     path = path.resolve() if path.is_symlink() else path
     check_regular(path)
     folder = path.with_name(f'.{os.getpid()}.{path.name}')
     with temporary_folder(folder):
-        yield folder / path.name
-        if path.is_file():
-            shutil.copymode(path, folder / path.name)
-            if path.stat().st_nlink > 1:
-                path.write_bytes((folder / path.name).read_bytes())
-                return
-        os.replace(folder / path.name, path)
+        try:
+            yield folder / path.name
+            if path.is_file():
+                shutil.copymode(path, folder / path.name)
+                if path.stat().st_nlink > 1:
+                    path.write_bytes((folder / path.name).read_bytes())
+                    return
+            os.replace(folder / path.name, path)
+        except OSError as error:
+            if error.errno in _NO_ROOM:
+                error.filename = str(path)
+            raise
 
 
 def check_regular(path: Path) -> None:
