@@ -283,5 +283,7 @@ def test_what_is_said_of_the_errors():
     assert str(stereo) == 'noise 0.0034 1/m, correlated over 9 px, distortion 0.005 1/m'
     told = str(stereo._replace(shown_length=10.0, quantum=0.001))
     assert told == f'{stereo}, smooth over 35 px, steps of 0.001 1/m'
+    assert stereo.alike == pytest.approx(9)
+    assert stereo._replace(shown_length=10.0).alike == pytest.approx(35.4, abs=0.1)
     laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)
-    assert str(laser) == 'range noise 0.012 m, steps of 0.001 m'
+    assert str(laser) == 'range noise 0.012 m, steps of 0.001 m' and laser.alike == 1

@@ -187,22 +187,27 @@ def test_nothing_is_claimed_that_the_noise_of_a_place_would_make():
 
 
 @pytest.mark.parametrize(
-    ('unsure', 'low', 'beside'),
-    [(0.01, -0.025, -0.025), (0.035, -0.035, -0.015), (1, -0.04, 0.95)],
+    ('unsure', 'low', 'beside', 'deeper'),
+    [(0.01, -0.025, -0.025, -0.025), (0.035, -0.035, -0.015, np.inf), (1, -0.04, np.inf, np.inf)],
 )
-def test_beside_a_drop_ground_is_what_could_not_be_the_drop(unsure, low, beside):
-    """Elsewhere noise excuses what is low; beside what only may be a drop, it does not."""
+def test_beside_a_drop_ground_is_what_could_not_be_the_drop(unsure, low, beside, deeper):
+    """As far as cells err alike; beside what only may be a drop, no noise excuses what is low."""
     rows, columns = 20, 9
     surface = np.zeros((rows, columns), np.int32)
-    surface[:5], surface[14, 2] = 1, 2
+    surface[:5, :4], surface[14, 2] = 1, 2
     verdict = np.array([UNKNOWN, DROP, HIDDEN], np.int8)
     none = np.zeros(surface.shape, np.bool_)
     height = np.where(surface > 0, np.float32(-0.05), np.float32(0))
+    height[8, 5] = -0.016
     noise = np.full(surface.shape, unsure, np.float32)
-    said = decide(verdict, surface, surface == 0, none, none, height, noise, (0.05, 0.05), 0.04)
+    said = decide(
+        verdict, surface, surface == 0, none, none, height, noise, (0.05, 0.05), 0.04, (6, 3)
+    )
     expected = np.full(surface.shape, low, np.float32)
-    expected[12:17, 1:4] = -0.025
-    expected[:7] = beside
+    expected[:7, :5] = expected[12:17, 1:4] = -0.025
+    if unsure > 0.025:
+        expected[:11, :7] = beside
+        expected[8, 5] = deeper
     ground = surface == 0
     np.testing.assert_allclose(said.low[ground], expected[ground], atol=1e-6)
 
@@ -301,3 +306,15 @@ def test_a_level_beyond_an_edge_is_told_as_a_whole(seed):
     assert np.mean(drop == DROP) >= 0.95
     # What docs/navigation.md counts as a failure.
     assert np.mean(drop == GROUND) <= 0.01
+
+
+def test_what_noise_lifts_of_a_drop_is_no_ground():
+    """A corner of a hole 6 cm deep, 2.4 m ahead: a patch of smooth errors lifts it by 5 cm."""
+    scene, sensor = terrain_scene('hole', 2120196), SENSORS['realsense'](2120196)
+    frame = simulate_terrain(scene, sensor, seed=2120196)
+    up, height = stated(scene, 2120196)
+    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=height)
+    terrain = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera)).terrain
+    there = (frame.terrain == DROP) & (frame.crossing <= 2.5) & ~_near_borders(frame.terrain)
+    assert there.sum() > 600
+    assert np.mean(terrain[there] == GROUND) <= 0.01

@@ -215,7 +215,9 @@ def _terrain(
     rise = float(_CERTAIN * noise[0]), float((1 - _EXCUSED) * least)
     foot = feet_of(height, steep, cells.error, rise, steps.least, turned)
     lowest = limits.obstacle, limits.drop
-    said = decide(verdict, surface, ground, fallen, foot, height, unsure, lowest, _EXCUSED * least)
+    excused = _EXCUSED * least
+    alike = (math.ceil(sensor.alike / size.rows), math.ceil(sensor.alike / size.columns))
+    said = decide(verdict, surface, ground, fallen, foot, height, unsure, lowest, excused, alike)
     classes, heights = pixels_of(image, field, size, said)
     if known[0] == 0:
         stands, falls = ends_of(said.kind, height, steps.least, turned)

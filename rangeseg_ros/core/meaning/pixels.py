@@ -48,10 +48,11 @@ def decide(
     unsure: NDArray[np.float32],
     least: tuple[float, float],
     most: float,
+    alike: tuple[int, int],
 ) -> Said:
     """What is said of cells, by their surfaces and by themselves.
 
-    Nine parameters: a kernel that takes arrays.
+    Ten parameters: a kernel that takes arrays.
 
     Parameters
     ----------
@@ -69,12 +70,13 @@ def decide(
         more probably ground.
     most : float
         No noise excuses more, metres.
+    alike : (int, int)
+        Rows and columns that err alike.
     """
     rows, columns = surface.shape
     kind = np.empty((rows, columns), np.int8)
     low, top = np.empty((2, rows, columns), np.float32)
     tall, deep = np.float32(least[0] / 2), np.float32(-least[1] / 2)
-    high, wide = BLUR[0] // 2, BLUR[1] // 2
     for i in range(rows):
         for c in range(columns):
             own = np.int8(GROUND) if ground[i, c] else verdict[surface[i, c]]
@@ -83,29 +85,55 @@ def decide(
             kind[i, c] = np.int8(OBSTACLE) if foot[i, c] else own
             excused = min(unsure[i, c], np.float32(most)) if own == GROUND else np.float32(0)
             low[i, c], top[i, c] = min(deep, -excused), max(tall, excused)
+    found, blurred = np.empty((2, rows, columns), np.uint8)
+    for i in range(rows):
+        for c in range(columns):
+            found[i, c] = (kind[i, c] == DROP) | ((kind[i, c] == HIDDEN) & fallen[i, c])
+            blurred[i, c] = found[i, c] | ((kind[i, c] == HIDDEN) & (height[i, c] < 0))
+    high, wide = BLUR[0] // 2, BLUR[1] // 2
     # Beside a drop, or what may be one, the sensor blurs its edge: no noise excuses what is low.
-    # Noise moves the edge, too: beside a drop, ground is what could not as well be the least drop.
-    # Bits: 2 for a drop, 1 for what may be one.
-    drops = np.zeros((rows + 2 * high, columns + 2 * wide), np.uint8)
+    beside = _around(blurred, high, wide)
     for i in range(rows):
         for c in range(columns):
-            found = (kind[i, c] == DROP) | ((kind[i, c] == HIDDEN) & fallen[i, c])
-            hidden = (kind[i, c] == HIDDEN) & (height[i, c] < 0)
-            drops[i + high, c + wide] = np.uint8(hidden) | np.uint8(found) << 1
-    column, beside = np.empty(drops.shape[1], np.uint8), np.empty(columns, np.uint8)
+            low[i, c] = deep if beside[i, c] > 0 else low[i, c]
+            top[i, c] = tall if beside[i, c] > 0 else top[i, c]
+    # Noise that lifts a part of a drop is as wide as what errs alike: so far from what is found of
+    # it, ground is what could not as well be the least drop, as a whole cell.
+    doubtful = _around(found, max(high, alike[0]), max(wide, alike[1]))
     for i in range(rows):
-        column[:], beside[:] = 0, 0
-        for k in range(BLUR[0]):
-            for c in range(len(column)):
-                column[c] |= drops[i + k, c]
-        for k in range(BLUR[1]):
-            for c in range(columns):
-                beside[c] |= column[c + k]
         for c in range(columns):
-            told = unsure[i, c] - np.float32(least[1]) if beside[c] > 1 else deep
-            low[i, c] = max(deep, told) if beside[c] else low[i, c]
-            top[i, c] = tall if beside[c] else top[i, c]
+            told = unsure[i, c] - np.float32(least[1])
+            bound = told if height[i, c] > told else np.float32(np.inf)
+            low[i, c] = bound if (doubtful[i, c] > 0) & (told > deep) else low[i, c]
     return Said(kind, low, top, unsure)
+
+
+@njit(cache=True, nogil=True)
+def _around(where: NDArray[np.uint8], high: int, wide: int) -> NDArray[np.uint8]:
+    """Cells within so many rows and columns of one that is set.
+
+    Short loops without a branch, which the compiler makes vector instructions.
+    """
+    rows, columns = where.shape
+    result = np.zeros((rows, columns), np.uint8)
+    column = np.zeros(columns + 2 * wide, np.uint8)
+    last = -1  # the last row near to which there is one
+    for i in range(rows + high):
+        if i < rows:
+            some = np.uint8(0)
+            for c in range(columns):
+                some |= where[i, c]
+            last = i + 2 * high if some else last
+        if i < high or i > last:
+            continue
+        column[:] = 0
+        for k in range(max(i - 2 * high, 0), min(i + 1, rows)):
+            for c in range(columns):
+                column[c + wide] |= where[k, c]
+        for k in range(2 * wide + 1):
+            for c in range(columns):
+                result[i - high, c] |= column[c + k]
+    return result
 
 
 def pixels_of(

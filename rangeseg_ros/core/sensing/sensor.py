@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA, Config
 
+# Widths of the kernel that an error is smoothed with, which its correlations along a line sum to.
+_LINE = 2 * float(np.sqrt(np.pi))
+
 
 class SensorModel(NamedTuple):
     """Error of the inverse range of a pixel, 1/m.
@@ -43,7 +46,7 @@ class SensorModel(NamedTuple):
         Step that the range is rounded to, metres.
     shown_length : float
         Width of the kernel that the distortion of an image looks smoothed with, pixels; 0 where
-        that was not measured. Nothing is decided by it.
+        that was not measured.
     """
 
     noise: float
@@ -79,14 +82,13 @@ class SensorModel(NamedTuple):
 
         Correlated and smooth over as many pixels as the correlation along a line sums to.
         """
-        line = 2 * np.sqrt(np.pi)
         said = _listed(('noise', self.noise, '1/m'), ('range noise', self.range_noise, 'm'))
-        if self.white < 0.5 and line * self.correlation > 1:
-            said.insert(1, f'correlated over {line * self.correlation:.0f} px')
+        if self.white < 0.5 and _LINE * self.correlation > 1:
+            said.insert(1, f'correlated over {_LINE * self.correlation:.0f} px')
         smooth = ('distortion', self.distortion, '1/m')
         said += _listed(smooth, ('range distortion', self.range_distortion, 'm'))
         if self.shown_length > 0:
-            said.append(f'smooth over {line * self.shown_length:.0f} px')
+            said.append(f'smooth over {_LINE * self.shown_length:.0f} px')
         steps = ('steps of', self.quantum, '1/m'), ('steps of', self.range_quantum, 'm')
         return ', '.join(said + _listed(*steps))
 
@@ -105,6 +107,11 @@ class SensorModel(NamedTuple):
     def correlated(self) -> float:
         """Pixels of a large region that count as one measurement: the sum of the correlations."""
         return self.white + (1 - self.white) * max(4 * np.pi * self.correlation**2, 1.0)
+
+    @property
+    def alike(self) -> float:
+        """Pixels of a line that err alike, as far as the image shows: at least one."""
+        return max(_LINE * max(self.correlation, self.shown_length), 1.0)
 
     @property
     def distortion_pixels(self) -> float:
