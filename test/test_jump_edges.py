@@ -47,6 +47,26 @@ def test_creases_have_no_jump(sign):
     assert not horizontal.any() and not vertical.any()
 
 
+@pytest.mark.parametrize('width', [12, 20])
+@pytest.mark.parametrize('slope', [10 * STEP, -10 * STEP])
+@pytest.mark.parametrize('axis', [0, 1])
+def test_a_narrow_steep_face_has_no_jump(axis, slope, width):
+    """However steep from pixel to pixel, and too narrow for its slope to be told."""
+    crease = CAMERA.shape[axis] - 1 - width
+    inverse = 1.0 + slope * np.maximum(np.indices(CAMERA.shape)[axis] - crease, 0)
+    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
+    assert not horizontal.any() and not vertical.any()
+
+
+def test_a_line_between_two_jumps_is_parted_from_both():
+    """A pixel wide, a jump on either side: none continues the other, alike as they are."""
+    inverse = np.full(CAMERA.shape, 0.5)
+    inverse[:, 70] = 0.6
+    inverse[:, 71:] = 0.7 + 3 * STEP
+    horizontal, _ = plane_deviation(image_of(inverse), STEP)
+    assert horizontal[:, 69:71].all() and horizontal.sum() == 2 * CAMERA.height
+
+
 @pytest.mark.parametrize('height', [2 * STEP, 0.1, -0.1])
 @pytest.mark.parametrize('slope', [(0, 0), (0.001, 0.001)])
 def test_a_jump_lies_exactly_between_its_pixels(height, slope):

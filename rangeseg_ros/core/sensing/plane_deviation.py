@@ -45,8 +45,7 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     height, width = image.shape
     blocks = -(-height // BLOCK), -(-width // BLOCK)
     limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
-    # Steps between two pixels that need no look at their surroundings: steeper than all but planes
-    # seen edge-on from centimetres away.
+    # Steps between two pixels that are no noise, and twice as steep as the flat surface around.
     clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
     horizontal = np.empty((height, width - 1), np.bool_)
     vertical = np.empty((height - 1, width), np.bool_)
@@ -216,17 +215,18 @@ def _cross_right(
 ) -> None:
     """Jumps between the pixels of a row."""
     width = inverse.shape[1]
-    row, now, block = inverse[i], i % 2, i // BLOCK % 2
-    _step_clearly(row, row[1:], bound[block], result)
+    now, block = i % 2, i // BLOCK % 2
+    row = np.zeros(width + 2, np.float32)
+    row[1:-1] = inverse[i]
+    a, b, c, d = row, row[1:], row[2:], row[3:]
+    _step_clearly(a, b, c, d, bound[block], limit[block], result)
     for k in range(count[now]):
         for j in range(max(places[now, k] - 1, 0), min(places[now, k] + 1, width - 1)):
-            if row[j] == 0 or row[j + 1] == 0:
+            if b[j] == 0 or c[j] == 0:
                 continue
-            before = row[j - 1] if j > 0 else np.float32(0)
-            after = row[j + 2] if j + 2 < width else np.float32(0)
             both = strong[now, j] & strong[now, j + 1]
             result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
-                before, row[j], row[j + 1], after, limit[block, j]
+                a[j], b[j], c[j], d[j], limit[block, j]
             )
 
 
@@ -243,33 +243,45 @@ def _cross_down(
     result: NDArray[np.bool_],
 ) -> None:
     """Jumps between the pixels of a row and those below."""
-    height = len(inverse)
-    row, below, block = inverse[i], inverse[i + 1], i // BLOCK % 2
-    _step_clearly(row, below, bound[block], result)
+    height, width = inverse.shape
+    block = i // BLOCK % 2
+    nothing = np.zeros(width, np.float32)
+    a = inverse[i - 1] if i > 0 else nothing
+    b, c = inverse[i], inverse[i + 1]
+    d = inverse[i + 2] if i + 2 < height else nothing
+    _step_clearly(a, b, c, d, bound[block], limit[block], result)
     for now in range(2):
         for k in range(count[now]):
             j = places[now, k]
-            if row[j] == 0 or below[j] == 0:
+            if b[j] == 0 or c[j] == 0:
                 continue
-            before = inverse[i - 1, j] if i > 0 else np.float32(0)
-            after = inverse[i + 2, j] if i + 2 < height else np.float32(0)
             both = strong[0, j] & strong[1, j]
             result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
-                before, row[j], below[j], after, limit[block, j]
+                a[j], b[j], c[j], d[j], limit[block, j]
             )
 
 
 @njit(cache=True, nogil=True)
 def _step_clearly(
-    here: NDArray[np.float32],
-    there: NDArray[np.float32],
+    a: NDArray[np.float32],
+    b: NDArray[np.float32],
+    c: NDArray[np.float32],
+    d: NDArray[np.float32],
     clear: NDArray[np.float32],
+    step: NDArray[np.float32],
     result: NDArray[np.bool_],
 ) -> None:
-    """Whether the steps between measured pixels are clear by themselves."""
+    """Whether the steps from b to c are clear, and no part of a slope.
+
+    That is what the one from a to b, or that from c to d, continues to within `step`: of a face
+    so narrow that no block tells its slope. What was not measured (0) continues nothing.
+    """
+    # Without branches, so that the compiler takes many at a time.
     for j in range(len(result)):
-        step = abs(here[j] - there[j])
-        result[j] = (here[j] > 0) & (there[j] > 0) & (step > clear[j])
+        here = c[j] - b[j]
+        before, after = abs(here - (b[j] - a[j])), abs(here - (d[j] - c[j]))
+        continued = ((a[j] > 0) & (before <= step[j])) | ((d[j] > 0) & (after <= step[j]))
+        result[j] = (b[j] > 0) & (c[j] > 0) & (abs(here) > clear[j]) & ~continued
 
 
 @njit(cache=True, nogil=True)
