@@ -318,3 +318,21 @@ def test_what_noise_lifts_of_a_drop_is_no_ground():
     there = (frame.terrain == DROP) & (frame.crossing <= 2.5) & ~_near_borders(frame.terrain)
     assert there.sum() > 600
     assert np.mean(terrain[there] == GROUND) <= 0.01
+
+
+def test_ground_beyond_a_trench_is_no_part_of_it():
+    """Of a stereo camera, noise hides the far edge of a trench 5 cm deep in some columns."""
+    floor = Piece(slab(-3, 1.5, 0, 0, ALL), GROUND)
+    trench = Piece(slab(1.5, 1.8, -0.05, -0.05, ALL), DROP, 0.05)
+    beyond = Piece(slab(1.8, 12, 0, 0, ALL), GROUND)
+    pose = Pose.looking((0, 0, 0.95), 0, 25, 0)
+    scene = Terrain('', (floor, trench, beyond), (slab(-3, 12, 0, 0, ALL),), pose)
+    sensor = SENSORS['realsense'](3)
+    frame = simulate_terrain(scene, sensor, seed=3)
+    x, y, z = map(float, scene.up)
+    config = Config(up_x=x, up_y=y, up_z=z, sensor_height=0.95)
+    terrain = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera)).terrain
+    inside = ~_near_borders(frame.terrain)
+    far = inside & (frame.terrain == GROUND) & (frame.depth > 1900) & (frame.depth < 3000)
+    assert far.sum() > 20000 and np.mean(terrain[far] == GROUND) > 0.9
+    assert np.mean(terrain[inside & (frame.terrain == DROP)] == GROUND) <= 0.01

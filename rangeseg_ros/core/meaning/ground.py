@@ -186,7 +186,8 @@ def _terrain(
     height = cell_heights(cells, flat, size)
     start = nearest_part(height, cells.place, surface, under.surface, steps.least)
     own = surface == under.surface
-    fallen = below_edges(height, cells, steps, steep, broken, turned) & own
+    lower = below_edges(height, cells, steps, steep, broken, turned)
+    fallen = lower & own
     # The top of a step may hang together with the ground beside it just as well as the bottom.
     risen = below_edges(height, cells, steps, steep, broken, turned, True) & own & ~fallen
     own &= ~(fallen | risen)
@@ -194,7 +195,8 @@ def _terrain(
     # What remains is judged surface by surface, by its height beside the ground.
     plane = under.theta
     field, height = _continued(cells, ground, measured, plane, size, up)
-    part = parts_of(fallen, risen, steep, ground)
+    # A trench would hang together with the ground beyond it where noise hides its far edge.
+    part = parts_of(lower, risen, steep, ground)
     # The noise of a pixel: by the sensor model, and what the image shows if that is more.
     unsure = np.float32(_CERTAIN * max(noise[BROAD], 1.0)) * cells.error
     near = around(ground)
