@@ -17,7 +17,8 @@ from rangeseg_ros.core.meaning.beside import around, sides_of
 from rangeseg_ros.core.meaning.cells import Cells, CellSize, cells_of
 from rangeseg_ros.core.meaning.classes import OBSTACLE, UNKNOWN
 from rangeseg_ros.core.meaning.continuity import join_cells, surfaces_of
-from rangeseg_ros.core.meaning.edges import below_edges, ends_of, feet_of
+from rangeseg_ros.core.meaning.edges import below_edges
+from rangeseg_ros.core.meaning.ends import ends_of, feet_of
 from rangeseg_ros.core.meaning.ground_field import (
     GroundField,
     cell_heights,
