@@ -177,7 +177,8 @@ def band(
     labels, links, position = labelling.labels, labelling.links, labelling.position
     offsets = np.array([1, labelling.width, -1, -labelling.width])
     first, after = rows[0] * labelling.width, rows[1] * labelling.width
-    sites = np.empty(max(64, 2 * reach * len(front)), np.int32)
+    # Room for all within so many edges: an array that a loop makes anew is counted at every turn.
+    sites = np.empty((2 * reach * (reach - 1) + 1) * len(front), np.int32)
     count = done = 0
     for p in front:
         if labels[p] != alpha and position[p] < 0:
@@ -193,8 +194,6 @@ def band(
                 q = p + offsets[k]
                 linked = first <= q < after and links[k % 2, min(p, q)] > 0
                 if linked and labels[q] != alpha and position[q] < 0:
-                    if count == len(sites):
-                        sites = np.concatenate((sites, np.empty_like(sites)))
                     position[q] = count
                     sites[count] = q
                     count += 1
