@@ -17,7 +17,7 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.regions import least_pixels, plane_regions
+from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
 from rangeseg_ros.core.runtime.boxing import box_safely
 from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
@@ -116,7 +116,7 @@ class Segmenter:
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
             kept = np.zeros(len(fits.theta), np.uint16)
             kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
-            labels = kept[labels]
+            labels = relabel(labels, kept)
         watch.lap('planes')
         reason = _reason(image, planes)
         survey = Survey.of(image, sensor, config)
