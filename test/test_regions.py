@@ -5,12 +5,8 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import (
-    connected_components,
-    drop_regions,
-    merge,
-    plane_regions,
-)
+from rangeseg_ros.core.components import connected_components
+from rangeseg_ros.core.regions import drop_regions, merge, plane_regions
 from rangeseg_ros.core.sensing.grid import Grid
 
 
