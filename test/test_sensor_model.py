@@ -1,5 +1,7 @@
 """The sensor model measured in simulated images whose errors are known."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -18,8 +20,10 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
+from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.simulation.kinect import smooth_field
 
+SCAN = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'synpeb_noisy'
 CAMERA = Camera(640, 480, 580.0, 580.0, 319.5, 239.5)
 STATED = SensorModel.from_config(Config())
 
@@ -167,6 +171,33 @@ def test_errors_that_are_smooth_alone_are_measured(width):
         measured.append(sensor.distortion)
         assert sensor.shown_length == pytest.approx(width, rel=0.5)
     assert np.mean(measured) == pytest.approx(0.0012, rel=0.3)
+
+
+@pytest.mark.parametrize('seed', range(3))
+def test_what_noise_hides_is_not_made_more_of(seed):
+    """Creases that blocks show by less than the noise: no field is told that would show more."""
+    columns = 0.004 * np.abs(np.arange(640) / 60 % 2 - 1)
+    rows = 0.004 * np.abs(np.arange(480) / 60 % 2 - 1)
+    creases = columns + rows[:, None]
+    depth = 2 + np.arange(480)[:, None] / 960 + creases
+    noise = np.random.default_rng(seed).normal(0, 0.02, CAMERA.shape)
+    sensor = sensor_of(1 / (depth + noise))
+    assert sensor.range_noise == pytest.approx(0.02, rel=0.05)
+    assert sensor.distortion < 1.5 * (creases / depth**2).std()
+
+
+@pytest.mark.skipif(not SCAN.exists(), reason='the scan is not here')
+@pytest.mark.parametrize('turns', range(4))
+@pytest.mark.parametrize('mirrored', [False, True])
+def test_a_scan_shows_the_same_errors_turned_and_mirrored(turns, mirrored):
+    (case,) = find_cases(SCAN)
+    points = np.rot90(case.load().image.points, turns)
+    image = RangeImage.from_points(points[:, ::-1] if mirrored else points)
+    sensor = measured_sensor(
+        image, Blocks.of(image), SensorModel.from_config(Config(), image.shape)
+    )
+    assert sensor.range_noise == pytest.approx(0.02, rel=0.1)
+    assert max(sensor.distortion, sensor.range_distortion) < 0.02
 
 
 def test_holes_hide_no_distortion():

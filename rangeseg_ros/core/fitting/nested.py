@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import median
+from rangeseg_ros.core.fitting.alike import median, quantiles
 from rangeseg_ros.core.fitting.errors import Errors, explaining, variances
 from rangeseg_ros.core.fitting.scale import (
     ENOUGH,
@@ -21,7 +21,7 @@ from rangeseg_ros.core.fitting.scale import (
 )
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, merged_alone, slope_of
 from rangeseg_ros.core.sensing.sensor import correlated_residuals
-from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
+from rangeseg_ros.core.significance import CLEARLY, SAMPLES, chi2_quantile
 
 # Chi-squared of 9 degrees of freedom, of what one plane through four blocks leaves, over its mean:
 # what is rougher is no part of a plane, and the median.
@@ -142,7 +142,7 @@ def over_scales(
         Of the distortion at most, pixels.
     """
     none = Errors(0.0, 0.0, 0.0)
-    distortion, side = none, 2 * BLOCK
+    distortion, side, clear = none, 2 * BLOCK, False
     within, freedom = [0.0], [0.0]
     within.clear()
     freedom.clear()
@@ -176,13 +176,15 @@ def over_scales(
             wide = width * side / 8
         if typical > most:
             most, distortion = typical, smooth
+        clear = _clearly_more(excess, shown, scale)
         flat = _not_bent(compared, blocks, way, shown, bending)
         side *= 2
         larger = merged_alone(blocks, rays, side)
         compared = compare(flat, blocks.residual, compared.level, larger, way)
         blocks = larger
-    # Where the largest blocks show the most, larger ones would show more.
-    if before == most > 0 and width > 0:
+    # Where the largest blocks show the most, larger ones would show more; but what noise hides of
+    # creases shows in them first, too.
+    if before == most > 0 and width > 0 and clear:
         hidden = max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
         distortion = Errors(hidden * distortion.constant, hidden * distortion.quartic, 0.0)
     return Nested(np.array(within), np.array(freedom), between, filled, distortion, wide)
@@ -192,6 +194,14 @@ def over_scales(
 def _typical(errors: Errors, scale: Scale) -> float:
     """Median of the variance of errors."""
     return median(variances(errors, scale.squared, scale.slope))
+
+
+@njit(cache=True, nogil=True)
+def _clearly_more(excess: NDArray[np.float64], noise: Errors, scale: Scale) -> bool:
+    """Whether all sets of blocks of an `excess` (N,) show clearly more than the noise."""
+    expected = variances(noise, scale.squared, scale.slope)
+    seen = quantiles(excess, scale.sets, 0.5)
+    return bool((seen > CLEARLY * quantiles(expected, scale.sets, 0.5)).all())
 
 
 @njit(cache=True, nogil=True)
