@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.references import UNCOUNTED
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import CHUNK, Grid
 from rangeseg_ros.core.sensing.marks import no_marks
@@ -65,7 +64,7 @@ def connected_components(
     return Components(*_unite_halves(labels, grid, found, parent, *counts))
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def _find_components(
     first: int,
     after: int,

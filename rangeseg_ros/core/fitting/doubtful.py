@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.cells import RECORD, Cells, add_block, add_pixels, cell_of
 from rangeseg_ros.core.fitting.interior import RIM, rows_of_blocks
-from rangeseg_ros.core.runtime.references import UNCOUNTED
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, squares_left
@@ -93,35 +92,10 @@ def _sort(
     The numbers of all pixels, of outliers and of the rest of the rim, (3, M + 1), and the sums
     over the sure ones, over the outliers and over that rest, (3, N, 25).
     """
+    width = labels.shape[1]
     count = np.zeros((3, len(theta)), np.intp)
     sums = np.zeros((3, len(cells.sums), RECORD))
     explained = np.zeros(inner.shape, np.bool_)
-    pixels = labels, inverse, rays, pinhole
-    regions = cells, sensor, theta, central
-    _sort_blocks(top, bottom, *pixels, blocks, inner, *regions, explained, count, sums)
-    _sort_pixels(top, bottom, *pixels, inner, *regions, explained, count, sums)
-    return count, sums
-
-
-@njit(cache=True, nogil=True, **UNCOUNTED)
-def _sort_blocks(
-    top: int,
-    bottom: int,
-    labels: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    pinhole: bool,
-    blocks: Blocks,
-    inner: NDArray[np.uint16],
-    cells: Cells,
-    sensor: SensorModel,
-    theta: NDArray[np.float64],
-    central: bool,
-    explained: NDArray[np.bool_],
-    count: NDArray[np.intp],
-    sums: NDArray[np.float64],
-) -> None:
-    """Add the blocks that their planes explain as a whole, which are then `explained`."""
     first_block, after_block = rows_of_blocks(top, bottom)
     for bi in range(max(first_block - 1, 0), after_block):
         for bj in range(inner.shape[1]):
@@ -139,27 +113,6 @@ def _sort_blocks(
                 count[0, label] += int(blocks.moments[bi, bj, COUNT])
                 record = sums[_SURE, cell_of(cells, label, bi * BLOCK, bj * BLOCK)]
                 add_block(record, blocks.moments[bi, bj], squared, sensor)
-
-
-@njit(cache=True, nogil=True, **UNCOUNTED)
-def _sort_pixels(
-    top: int,
-    bottom: int,
-    labels: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    pinhole: bool,
-    inner: NDArray[np.uint16],
-    cells: Cells,
-    sensor: SensorModel,
-    theta: NDArray[np.float64],
-    central: bool,
-    explained: NDArray[np.bool_],
-    count: NDArray[np.intp],
-    sums: NDArray[np.float64],
-) -> None:
-    """Add the pixels that are in no `explained` block."""
-    width = labels.shape[1]
     for i in range(top, bottom):
         within, inside = explained[i // BLOCK], inner[i // BLOCK]
         j = 0
@@ -186,6 +139,7 @@ def _sort_pixels(
                 count[kind, label] += pixels
             record = sums[kind, cell_of(cells, label, i, first)]
             add_pixels(record, i, first, j, inverse, rays, pinhole, sensor, central)
+    return count, sums
 
 
 @njit(cache=True, nogil=True)
@@ -225,7 +179,7 @@ def _leave_out(
             explained[k] += total[_OUTLYING]
 
 
-@njit(cache=True, **UNCOUNTED)
+@njit(cache=True)
 def _has_outliers(
     top: int,
     left: int,

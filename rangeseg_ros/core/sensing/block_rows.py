@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.references import UNCOUNTED
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SLOPE, plane_of, plus_pixel
 
 LANES = 32
@@ -29,25 +28,25 @@ def new_lanes() -> NDArray[np.float64]:
     return np.zeros((_RESIDUAL + 1) * LANES)
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def clear_sums(lanes: NDArray[np.float64]) -> None:
     """Begin with blocks of no pixels."""
     lanes[_SUMS * LANES : _THETA * LANES] = 0
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def set_rays(lanes: NDArray[np.float64], axis: int, row: NDArray[np.float32], size: int) -> None:
     """Take one coordinate (N,) of the rays of a row of pixels, of blocks `size` pixels wide."""
     _deal(lanes, _RAYS + WIDEST * axis, row, size)
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def set_height(lanes: NDArray[np.float64], y: float) -> None:
     """Take one second coordinate for all rays of a row, which a pinhole camera's have."""
     lanes[(_RAYS + WIDEST) * LANES : (_RAYS + 2 * WIDEST) * LANES] = y
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def add_row(lanes: NDArray[np.float64], row: NDArray[np.float32], size: int) -> None:
     """Add pixels of these inverse ranges (N,), and of the rays set, to the sums of the blocks."""
     _deal(lanes, _INVERSE, row, size)
@@ -67,7 +66,7 @@ def add_row(lanes: NDArray[np.float64], row: NDArray[np.float32], size: int) -> 
         lanes[(_SUMS + COUNT) * LANES + b] = count
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def _deal(lanes: NDArray[np.float64], entry: int, row: NDArray[np.float32], size: int) -> None:
     """Deal the pixels of a row out to the blocks, and 0 where it ends."""
     entries = lanes[entry * LANES : (entry + WIDEST) * LANES]
@@ -91,7 +90,7 @@ def _deal(lanes: NDArray[np.float64], entry: int, row: NDArray[np.float32], size
             entries[k * LANES + b] = row[j] if j < len(row) else 0.0
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def add_moments(lanes: NDArray[np.float64], blocks: NDArray[np.float64]) -> None:
     """Add a row of blocks (N, 13) to the sums of blocks twice as wide."""
     for j in range(min(len(blocks), 2 * LANES)):
@@ -99,7 +98,7 @@ def add_moments(lanes: NDArray[np.float64], blocks: NDArray[np.float64]) -> None
             lanes[(_SUMS + entry) * LANES + j // 2] += blocks[j, entry]
 
 
-@njit(cache=True, nogil=True, error_model='numpy', **UNCOUNTED)
+@njit(cache=True, nogil=True, error_model='numpy')
 def fit_sums(lanes: NDArray[np.float64]) -> None:
     """Fit a plane to every block."""
     for b in range(LANES):
@@ -108,7 +107,7 @@ def fit_sums(lanes: NDArray[np.float64]) -> None:
         lanes[(_THETA + 2) * LANES + b], lanes[_RESIDUAL * LANES + b] = z, left
 
 
-@njit(cache=True, nogil=True, error_model='numpy', **UNCOUNTED)
+@njit(cache=True, nogil=True, error_model='numpy')
 def store_sums(
     lanes: NDArray[np.float64],
     moments: NDArray[np.float64],

@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.references import UNCOUNTED
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.block_rows import (
     LANES,
@@ -140,7 +139,7 @@ def merged_alone(blocks: Blocks, rays: NDArray[np.float32], size: int) -> Blocks
     return result
 
 
-@njit(cache=True, nogil=True, error_model='numpy', **UNCOUNTED)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _store(
     bi: int,
     begin: int,
@@ -186,7 +185,7 @@ def _known(rays: NDArray[np.float32], i: int, j: int) -> Any:
     return (rays[i, j, 0] != 0) | (rays[i, j, 1] != 0) | (rays[i, j, 2] != 0)
 
 
-@njit(cache=True, nogil=True, **UNCOUNTED)
+@njit(cache=True, nogil=True)
 def _change(
     theta: Any, rays: NDArray[np.float32], corner: tuple[int, int], size: int, down: bool
 ) -> float:
