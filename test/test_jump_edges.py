@@ -58,18 +58,6 @@ def test_a_narrow_steep_face_has_no_jump(axis, slope, width):
     assert not horizontal.any() and not vertical.any()
 
 
-@pytest.mark.parametrize('level', [-0.06, -0.1, -0.18])
-@pytest.mark.parametrize('turned', [False, True])
-def test_no_edge_runs_into_a_slope_beside_a_corner(turned, level):
-    """An object pulls the local mean along: a sloping face crosses it below the corner."""
-    row, column = np.indices(CAMERA.shape)
-    row, column = (column, row) if turned else (row, column)
-    inverse = np.where((row < 50) & (column < 60), 2 + level, 2 + 3 * STEP * (column - 60))
-    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
-    horizontal, vertical = (vertical.T, horizontal.T) if turned else (horizontal, vertical)
-    assert not horizontal[50:].any() and not vertical[50:].any() and not vertical[:, 60:].any()
-
-
 def test_a_line_between_two_jumps_is_parted_from_both():
     """A pixel wide, a jump on either side: none continues the other, alike as they are."""
     inverse = np.full(CAMERA.shape, 0.5)

@@ -11,7 +11,7 @@ from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.significance import CLEARLY, OUTLIER
+from rangeseg_ros.core.significance import OUTLIER
 
 _WINDOW = 3
 # The farthest window that a boundary looks at, and rows of means that those of one row need.
@@ -196,10 +196,9 @@ def _find_sides(
 
 
 # Boundaries are crossed between strong pixels on unlike sides of the local mean, and at every
-# clear step, because where three surfaces meet, two may lie on the same side of the mean. Where a
-# third pulls the mean along, a sloping face may cross it: steps there are all alike. At corners,
-# where the windows hold little of one surface, contours would have gaps: beside strong pixels, the
-# pixels by themselves are looked at as the windows are.
+# clear step, because where three surfaces meet, two may lie on the same side of the mean. At
+# corners, where the windows hold little of one surface, contours would have gaps: beside strong
+# pixels, the pixels by themselves are looked at as the windows are.
 
 
 @njit(cache=True, nogil=True)
@@ -226,8 +225,9 @@ def _cross_right(
             if b[j] == 0 or c[j] == 0:
                 continue
             both = strong[now, j] & strong[now, j + 1]
-            crossed = both and side[now, j] != side[now, j + 1]
-            result[j] |= _parts(crossed, a[j], b[j], c[j], d[j], limit[block, j])
+            result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
+                a[j], b[j], c[j], d[j], limit[block, j]
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -256,8 +256,9 @@ def _cross_down(
             if b[j] == 0 or c[j] == 0:
                 continue
             both = strong[0, j] & strong[1, j]
-            crossed = both and side[0, j] != side[1, j]
-            result[j] |= _parts(crossed, a[j], b[j], c[j], d[j], limit[block, j])
+            result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
+                a[j], b[j], c[j], d[j], limit[block, j]
+            )
 
 
 @njit(cache=True, nogil=True)
@@ -284,19 +285,14 @@ def _step_clearly(
 
 
 @njit(cache=True, nogil=True)
-def _parts(
-    crossed: bool, a: np.float32, b: np.float32, c: np.float32, d: np.float32, step: float
-) -> bool:
+def _stands_out(a: np.float32, b: np.float32, c: np.float32, d: np.float32, step: float) -> bool:
     """Whether the step from b to c leaves those from a to b and c to d by more than `step`.
 
-    On the same side of both; one that was not measured (0) is left out. Where it crosses the local
-    mean (`crossed`), that they are not all the same slope, clearly more than `step`, is enough.
+    On the same side of both; one that was not measured (0) is left out.
     """
     here = c - b
     if a == 0 and d == 0:
-        return crossed
+        return False
     before = here - (b - a) if a > 0 else here - (d - c)
     after = here - (d - c) if d > 0 else before
-    least, most = min(before, after), max(before, after)
-    slope = least >= -step and most <= step and abs(here) > CLEARLY * step
-    return bool(least > step or most < -step or (crossed and not slope))
+    return bool(min(before, after) > step or max(before, after) < -step)
