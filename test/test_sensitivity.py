@@ -32,7 +32,7 @@ def value_in(folder, constant):
 @pytest.mark.parametrize('name', ['tracking/tracker._GATE', 'tracking/tracker._UNSEEN_OVERLAP'])
 def test_one_constant_of_a_copy_is_changed(name, tmp_path):
     constant = CONSTANTS[name]
-    sensitivity.write_changed(constant, 0.5, tmp_path)
+    sensitivity.write_changed([constant], 0.5, tmp_path)
     assert value_in(tmp_path, constant) == constant.value / 2
     sources = [path.relative_to(sensitivity.PACKAGE) for path in sensitivity.PACKAGE.rglob('*.py')]
     changed = [
@@ -44,13 +44,19 @@ def test_one_constant_of_a_copy_is_changed(name, tmp_path):
     assert [path.as_posix() for path in changed] == ['core/tracking/tracker.py']
 
 
-def test_one_expression_of_several_is_changed(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ('names', 'changed'),
+    [('Y', 'X, Y = 3, 4.5\nZ = 2\n'), ('XYZ', 'X, Y = 6, 4.5\nZ = 4\n')],
+)
+def test_only_the_expressions_asked_for_are_changed(names, changed, tmp_path, monkeypatch):
     package = tmp_path / 'package'
     (package / 'core').mkdir(parents=True)
-    (package / 'core' / 'a.py').write_text('X, Y = 3, 1.5**2\n')
+    (package / 'core' / 'a.py').write_text('X, Y = 3, 1.5**2\nZ = 2\n')
     monkeypatch.setattr(sensitivity, 'PACKAGE', package)
-    sensitivity.write_changed(Constant('a', 'Y', 2.25, '1.5**2'), 2, tmp_path / 'copy')
-    assert (tmp_path / 'copy/package/core/a.py').read_text() == 'X, Y = 3, 4.5\n'
+    values = {'X': 3, 'Y': 2.25, 'Z': 2}
+    constants = [Constant('a', name, values[name], '') for name in names]
+    sensitivity.write_changed(constants, 2, tmp_path / 'copy')
+    assert (tmp_path / 'copy/package/core/a.py').read_text() == changed
 
 
 def test_ranges_end_at_the_first_factor_that_costs_too_much(tmp_path):
@@ -60,7 +66,7 @@ def test_ranges_end_at_the_first_factor_that_costs_too_much(tmp_path):
         b: {1: 0.9, 0.5: None, 2: 0.9, 0.25: 0.9, 4: 0.9},
     }
     trials = [
-        Trial(constant, factor, (tmp_path,), (), tmp_path)
+        Trial((constant,), factor, (tmp_path,), (), tmp_path)
         for constant, by_factor in ious.items()
         for factor in by_factor
     ]
@@ -82,7 +88,7 @@ def test_command_resumes(tmp_path, monkeypatch):
     measured = []
 
     def measure(trial):
-        measured.append((str(trial.constant), trial.factor))
+        measured.append((trial.constants, trial.factor))
         if len(measured) == 4:
             raise OSError('the disk is full')
         return {'set': 0.9 if trial.factor < 2 else 0.8}
@@ -106,6 +112,11 @@ def test_command_resumes(tmp_path, monkeypatch):
     assert len(rows) == 3 and rows[0].startswith('constant,value,low,high,loss')
     # Unchanged once for both, every factor once for each, and the one that failed again.
     assert len(measured) == 1 + 4 + 1 and measured[3] == measured[4]
+    done = CliRunner().invoke(command, [*map(str, arguments), '--together'])
+    assert (
+        'calibration/sightings._RIM, tracking/tracker._GATE: 0.5 to 1 times 2, 20.0' in done.output
+    )
+    assert len(measured) == 6 + 2 and all(len(constants) == 2 for constants, _ in measured[6:])
     unknown = CliRunner().invoke(command, [*map(str, arguments[:4]), '--constant', 'a._B'])
     assert unknown.exit_code == 1 and 'no constant a._B' in unknown.output
 
@@ -126,7 +137,7 @@ def test_command_resumes(tmp_path, monkeypatch):
 def test_script_measures_the_changed_package(program, found, tmp_path):
     script = tmp_path / 'figures.py'
     script.write_text(program)
-    trial = Trial(CONSTANTS['tracking/tracker._GATE'], 0.5, (), (), tmp_path / 'cache', script)
+    trial = Trial((CONSTANTS['tracking/tracker._GATE'],), 0.5, (), (), tmp_path / 'cache', script)
     assert trial.run() == found
     # Another program is another trial.
     script.write_text('print("{}")')

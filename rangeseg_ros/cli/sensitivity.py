@@ -45,6 +45,11 @@ from rangeseg_ros.tasks import run_all
     help='What the constants are multiplied with.',
 )
 @click.option(
+    '--together',
+    is_flag=True,
+    help='Move all of them at once: where that costs nothing, hardly one by itself does.',
+)
+@click.option(
     '--output',
     type=click.Path(file_okay=False, path_type=Path),
     required=True,
@@ -59,6 +64,7 @@ def command(
     table: Path | None,
     script: Path | None,
     factors: tuple[float, ...],
+    together: bool,
     output: Path,
     jobs: int | None,
 ) -> None:
@@ -75,10 +81,11 @@ def command(
     arguments = ['--method', method] if method else []
     if params_file:
         arguments += ['--params', str(params_file.resolve())]
+    groups = [tuple(chosen)] if together else [(constant,) for constant in chosen]
     trials = [
-        Trial(constant, factor, folders, tuple(arguments), output / 'cache', script)
+        Trial(group, factor, folders, tuple(arguments), output / 'cache', script)
         for factor in (1.0, *factors)
-        for constant in chosen
+        for group in groups
     ]
     results = list(options.progress(run_all(trials, jobs), len(trials), 'trial'))
     if any(r is None for t, r in zip(trials, results, strict=True) if t.factor == 1):

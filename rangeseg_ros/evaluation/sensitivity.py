@@ -2,7 +2,7 @@
 
 A constant is compiled into the kernels that read it, and into those that call them. So each trial
 runs `rangeseg evaluate` on all sets, and a program of one's own, in a copy of the package in which
-that one expression is changed, with all compiled code: the copy sees which of it is outdated.
+those expressions are changed, with all compiled code: the copy sees which of it is outdated.
 """
 
 from __future__ import annotations
@@ -90,18 +90,19 @@ def _dotted(path: Path) -> str:
     return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
 
 
-def write_changed(constant: Constant, factor: float, folder: Path) -> None:
-    """Copy the package into `folder`, one constant in it `factor` times as large."""
+def write_changed(constants: Sequence[Constant], factor: float, folder: Path) -> None:
+    """Copy the package into `folder`, these constants in it `factor` times as large."""
     shutil.copytree(PACKAGE, folder / PACKAGE.name)
-    path = PACKAGE / 'core' / f'{constant.module}.py'
-    copy = folder / path.relative_to(PACKAGE.parent)
-    text = path.read_text(encoding='utf-8')
-    lines = text.splitlines(keepends=True)
-    node = dict(_assigned(ast.parse(text)))[constant.name]
-    assert node.end_lineno is not None and node.end_col_offset is not None
-    start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
-    end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
-    copy.write_text(text[:start] + repr(_scaled(constant.value, factor)) + text[end:], 'utf-8')
+    for constant in constants:
+        path = folder / PACKAGE.name / 'core' / f'{constant.module}.py'
+        text = path.read_text(encoding='utf-8')
+        lines = text.splitlines(keepends=True)
+        node = dict(_assigned(ast.parse(text)))[constant.name]
+        assert node.end_lineno is not None and node.end_col_offset is not None
+        start = sum(map(len, lines[: node.lineno - 1])) + node.col_offset
+        end = sum(map(len, lines[: node.end_lineno - 1])) + node.end_col_offset
+        changed = repr(_scaled(constant.value, factor))
+        path.write_text(text[:start] + changed + text[end:], encoding='utf-8')
 
 
 def _scaled(value: Any, factor: float) -> Any:
@@ -112,11 +113,12 @@ def _scaled(value: Any, factor: float) -> Any:
 
 @dataclass(frozen=True)
 class Trial:
-    """A constant times a factor, on some sets; `factor` 1 is the package as it is.
+    """Constants times a factor, on some sets; `factor` 1 is the package as it is.
 
     Attributes
     ----------
-    constant : Constant
+    constants : tuple of Constant
+        One, or several that are moved together.
     factor : float
     folders : tuple of Path
         Sets that `rangeseg evaluate` knows.
@@ -129,7 +131,7 @@ class Trial:
         names of figures, 1 at best.
     """
 
-    constant: Constant
+    constants: tuple[Constant, ...]
     factor: float
     folders: tuple[Path, ...]
     arguments: tuple[str, ...]
@@ -154,7 +156,7 @@ class Trial:
     def _measure(self) -> dict[str, float] | None:
         with tempfile.TemporaryDirectory() as temporary:
             copy, result = Path(temporary), Path(temporary, 'figures.json')
-            write_changed(self.constant, self.factor, copy)
+            write_changed(self.constants, self.factor, copy)
             environment = {**os.environ, 'PYTHONPATH': str(copy)}
             environment.pop('NUMBA_CACHE_DIR', None)
 
@@ -180,10 +182,10 @@ class Trial:
 
     def _key(self) -> str:
         # Without a change, all constants are alike.
-        constant = '' if self.factor == 1 else str(self.constant)
+        names = '' if self.factor == 1 else ' '.join(map(str, self.constants))
         sets = [str(folder.resolve()) for folder in self.folders]
         script = self.script.read_text() if self.script else ''
-        words = constant, self.factor, sets, self.arguments, script
+        words = names, self.factor, sets, self.arguments, script
         return hashlib.sha256(code_digest() + repr(words).encode()).hexdigest()[:16]
 
 
@@ -197,21 +199,21 @@ def _quality(figures: dict[str, Any]) -> float:
 def ranges(
     trials: Sequence[Trial], results: Sequence[dict[str, float] | None]
 ) -> list[dict[str, Any]]:
-    """Of each constant, the factors around 1 that cost no set more than `TOLERATED_LOSS`.
+    """Of what was moved, the factors around 1 that cost no set more than `TOLERATED_LOSS`.
 
     Returns
     -------
     list of dict
-        `constant`, `value`, `low`, `high` (factors), `loss`: the largest of any factor tried (1
-        where the segmenter failed), `set`: where; the constants that matter most first.
+        `constant` (names), `value` (of each), `low`, `high` (factors), `loss`: the largest of any
+        factor tried (1 where the segmenter failed), `set`: where; what matters most first.
     """
     plain = next(r for t, r in zip(trials, results, strict=True) if t.factor == 1 and r)
-    losses: dict[Constant, dict[float, tuple[float, str]]] = {}
+    losses: dict[tuple[Constant, ...], dict[float, tuple[float, str]]] = {}
     for trial, result in zip(trials, results, strict=True):
         worst = max((plain[name] - result[name], name) for name in plain) if result else (1.0, '')
-        losses.setdefault(trial.constant, {})[trial.factor] = worst
+        losses.setdefault(trial.constants, {})[trial.factor] = worst
     rows = []
-    for constant, by_factor in losses.items():
+    for constants, by_factor in losses.items():
         low = high = 1.0
         for factor in sorted(by_factor):
             if factor > 1 and all(
@@ -226,8 +228,8 @@ def ranges(
         loss, where = max(by_factor.values())
         rows.append(
             {
-                'constant': str(constant),
-                'value': constant.value,
+                'constant': ', '.join(map(str, constants)),
+                'value': ', '.join(str(constant.value) for constant in constants),
                 'low': low,
                 'high': high,
                 'loss': loss,
