@@ -78,6 +78,23 @@ def test_clouds_in_millimetres_are_doubted():
         RangeImage.from_points(far)
 
 
+def test_depth_in_millimetres_that_is_said_to_be_metres_is_doubted():
+    depth = np.full(CAMERA.shape, 1500.0, np.float32)
+    half = np.where(np.arange(4) < 2, depth, 1.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        RangeImage.from_depth(half, CAMERA)
+        RangeImage.from_depth(depth, CAMERA, 0.001)
+        RangeImage.from_depth(np.full(CAMERA.shape, 65534, np.uint16), CAMERA)
+        RangeImage.from_depth(np.full(CAMERA.shape, np.nan), CAMERA)
+    half[0, 3] = np.nan
+    half[0, 2] = 1500
+    half[1, 0] = 0
+    for far, scale in ((depth, None), (half, None), (depth.astype(np.uint16), 1.0)):
+        with pytest.warns(UnitWarning, match='metres'):
+            RangeImage.from_depth(far, CAMERA, scale)
+
+
 def test_clouds_keep_their_points():
     points = np.random.default_rng(1).normal(size=(5, 6, 3)) * 3
     points[2, 3] = np.nan

@@ -78,6 +78,11 @@ class RangeImage:
         RangeImageError
             Not a 2-D uint16 or float image, a size other than the camera's, a scale that is
             not positive.
+
+        Warns
+        -----
+        UnitWarning
+            More than half of the pixels are farther than 16 bits of millimetres reach.
         """
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
@@ -99,7 +104,11 @@ class RangeImage:
             inverse[hidden] = 0
         if camera.distortion_model:
             inverse[~camera.rays.any(axis=2)] = 0
-        return cls(camera.rays, inverse, camera)
+        image = cls(camera.rays, inverse, camera)
+        # Millimetres of 16 bits are never as far.
+        if not integers or scale > 0.001:
+            image._doubt_unit('pixels')
+        return image
 
     @classmethod
     def from_points(cls, points: ArrayLike) -> RangeImage:
@@ -146,13 +155,7 @@ class RangeImage:
             # Like those of cameras, or every kernel that reads them is compiled twice.
             rays.flags.writeable = False
             image = cls(rays, inverse)
-        far = image.valid & (image.inverse < 1 / _FAR)
-        if 2 * np.count_nonzero(far) > np.count_nonzero(image.valid):
-            warnings.warn(
-                f'more than half of the points are beyond {_FAR:.0f} m: are they in metres?',
-                UnitWarning,
-                stacklevel=2,
-            )
+            image._doubt_unit('points')
         return image
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
@@ -199,6 +202,16 @@ class RangeImage:
                 f'the image {self.shape[1]}x{self.shape[0]}'
             )
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
+
+    def _doubt_unit(self, measured: str) -> None:
+        """Warn where more than half of what was measured is beyond any depth camera's reach."""
+        far = self.valid & (self.inverse < 1 / _FAR)
+        if 2 * np.count_nonzero(far) > np.count_nonzero(self.valid):
+            warnings.warn(
+                f'more than half of the {measured} are beyond {_FAR:.0f} m: are they in metres?',
+                UnitWarning,
+                stacklevel=3,
+            )
 
     @property
     def shape(self) -> tuple[int, int]:
