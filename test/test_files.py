@@ -216,7 +216,7 @@ def test_the_parameter_files_of_the_package_are_valid():
     [
         ('- 1', 'not a mapping'),
         ('a: [', 'not a YAML file'),
-        ('smoothnes: 3', "unknown parameter 'smoothnes'"),
+        ('smoothnes: 3', "unknown parameter 'smoothnes'; is 'smoothness' meant"),
         ('smoothness: -3', r'smoothness must be in \[0, 10000\]'),
         ('smoothness: soft', 'smoothness must be of type float'),
         ('3: 4', 'unknown parameter 3'),

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from rangeseg_ros.core.options import ConfigError, checked, option
+from rangeseg_ros.core.options import ConfigError, checked, option, unknown_parameter
 
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
 PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
@@ -397,7 +397,7 @@ class Config:
         known = {option_field.name for option_field in fields(cls)}
         for name in mapping:
             if name not in known:
-                raise ConfigError(f'unknown parameter {name!r}; known: {", ".join(sorted(known))}')
+                raise ConfigError(unknown_parameter(name, known))
         return cls(**mapping)
 
 

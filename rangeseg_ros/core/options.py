@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import numbers
 import reprlib
+from collections.abc import Iterable
 from dataclasses import field
 from typing import Any
 
@@ -43,3 +45,9 @@ def checked(option_field: Any, value: Any) -> Any:
     if low is not None and not low <= value <= high:
         raise ConfigError(f'parameter {name} must be in [{low:g}, {high:g}], not {shown}')
     return kind(value)
+
+
+def unknown_parameter(name: object, known: Iterable[str]) -> str:
+    """Say that there is no parameter of that name, and which of those known looks like it."""
+    similar = difflib.get_close_matches(str(name), sorted(known), n=1)
+    return f'unknown parameter {name!r}' + (f'; is {similar[0]!r} meant?' if similar else '')

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -15,7 +14,7 @@ import yaml
 from rclpy.node import Node
 from rclpy.utilities import remove_ros_args
 
-from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.core.runtime.cache import writable
 from rangeseg_ros.ros.parameters import NodeConfig
 
@@ -70,10 +69,7 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
     unknown = sorted(set(given) - known)
     shared = _shared(arguments)
     for name in unknown:
-        similar = difflib.get_close_matches(name, known, n=1)
-        problem = f'unknown parameter {name!r}'
-        if similar:
-            problem += f'; is {similar[0]!r} meant?'
+        problem = unknown_parameter(name, known)
         if name not in shared:
             raise ConfigError(problem)
         node.get_logger().warning(f'{problem} (of /**, ignored)')
