@@ -214,9 +214,11 @@ def imu_on(bench):
         bench.until(lambda: bench.node.count_subscribers('/imu'))
         bench.until(publisher.get_subscription_count)
 
-        def measure(x, y, z, frame=FRAME, covariance=0.0):
+        def measure(x, y, z, frame=FRAME, covariance=0.0, seconds=None):
             message = Imu(header=bench.header())
             message.header.frame_id = frame
+            if seconds is not None:
+                message.header.stamp.sec = seconds
             a = message.linear_acceleration
             a.x, a.y, a.z = float(x), float(y), float(z)
             message.linear_acceleration_covariance[0] = covariance
@@ -236,6 +238,13 @@ def roles_while(bench, measure, *acceleration, **fields):
     planes_of(bench, room(bench.camera))
     planes, _ = planes_of(bench, room(bench.camera))
     return planes['floor']['distance'] if 'floor' in planes else None
+
+
+def test_stamps_of_the_accelerometer_before_all_time_end_nothing(bench):
+    with imu_on(bench) as measure:
+        for seconds in (-1, 1, -2):
+            floor = roles_while(bench, measure, 0, -GRAVITY, 0, seconds=seconds)
+            assert floor == pytest.approx(HEIGHT, abs=3e-3)
 
 
 def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from rclpy.node import Node
-from rclpy.time import Time
 from sensor_msgs.msg import Imu
 
 from rangeseg_ros.ros.qos import MatchedSubscription
@@ -82,5 +81,6 @@ class Gravity:
         if message.linear_acceleration_covariance[0] == -1 or not at_rest:
             return
         header = message.header
-        new = Reading(header.frame_id, Time.from_msg(header.stamp).nanoseconds, acceleration)
+        stamp = header.stamp.sec * 10**9 + header.stamp.nanosec
+        new = Reading(header.frame_id, stamp, acceleration)
         self._reading = self._reading.followed_by(new) if self._reading else new
