@@ -48,6 +48,14 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         assert aliases.get(name, name) in keys | set(wheel_only.lower().split())
 
 
+def test_package_xml_names_the_messages_that_are_used():
+    package = ElementTree.parse(ROOT / 'package.xml').getroot()
+    declared = {element.text for element in package.iter('exec_depend')}
+    text = '\n'.join(path.read_text() for path in (ROOT / 'rangeseg_ros').rglob('*.py'))
+    used = set(re.findall(r'\b(\w+_(?:msgs|interfaces))(?:/msg/|\.msg )', text))
+    assert {'sensor_msgs', 'rcl_interfaces'} <= used <= declared
+
+
 def test_no_test_module_imports_another():
     """What several need is in a module of its own, and comes without the tests of another."""
     for path in (ROOT / 'test').glob('*.py'):
