@@ -41,6 +41,11 @@ ARGUMENTS = {
 }
 
 
+# A word that is none of these must not pass for false.
+SWITCHES = ('use_imu', 'use_sim_time', 'rviz')
+CHOICES = ['true', 'false', 'True', 'False']
+
+
 def _nodes(context):
     """The node, and RViz if it is wanted, by the values of the arguments."""
     value = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
@@ -93,7 +98,12 @@ def generate_launch_description():
     return LaunchDescription(
         [
             *(
-                DeclareLaunchArgument(name, default_value=default, description=description)
+                DeclareLaunchArgument(
+                    name,
+                    default_value=default,
+                    description=description,
+                    choices=[*CHOICES, *([] if default else [''])] if name in SWITCHES else None,
+                )
                 for name, (default, description) in ARGUMENTS.items()
             ),
             OpaqueFunction(function=_nodes),

@@ -76,6 +76,9 @@ def launched(monkeypatch):
         values = {d.arguments[0]: d.settings['default_value'] for d in declared}
         assert set(given) <= set(values)
         assert all(d.settings['description'] for d in declared)
+        for declaration in declared:
+            name, choices = declaration.arguments[0], declaration.settings['choices']
+            assert choices is None or (values | given)[name] in choices
         values['params_file'] = os.fspath(ROOT / 'params/segment_planes.yaml')
         values['fastdds_profile'] = os.fspath(ROOT / 'params/fastdds_large_images.xml')
         nodes = function.settings['function'](values | given)
@@ -93,6 +96,14 @@ def test_rviz_is_remapped_to_the_node_wherever_it_is(launched):
     assert dict(rviz['remappings']) == {
         topic: topic.replace('/segment_planes', '/robot/planes') for topic in shown
     }
+
+
+def test_a_switch_is_true_or_false(launched):
+    (node,) = launched(use_imu='True', use_sim_time='false')
+    assert node['parameters'][-1] == {'use_imu': True, 'use_sim_time': False}
+    for switch in ('use_imu', 'use_sim_time', 'rviz'):
+        with pytest.raises(AssertionError, match='ture'):
+            launched(**{switch: 'ture'})
 
 
 @pytest.mark.ros
