@@ -201,6 +201,8 @@ def test_errors_name_encoding_size_and_focal_length(tmp_path):
     colour.write(tmp_path / 'colour')
     with pytest.raises(BagError, match="'8UC1'"):
         DepthBag(tmp_path / 'colour', '/camera/depth/image_rect')
+    with pytest.raises(BagError, match=r'no depth image \(/camera/depth/image_rect: 8UC1\)'):
+        DepthBag(tmp_path / 'colour')
     sizes = Recording()
     sizes.add_camera(1, width=32)
     sizes.add_image(1, depth_images(1)[0])
@@ -226,7 +228,7 @@ def test_what_is_no_bag(tmp_path):
         with pytest.raises(BagError, match=f'{name}: not a readable bag'):
             DepthBag(tmp_path / name)
     (tmp_path / 'empty').mkdir()
-    with pytest.raises(BagError, match='not a readable bag'):
+    with pytest.raises(BagError, match=r'not a readable bag: the folder has no metadata\.yaml'):
         DepthBag(tmp_path / 'empty')
 
 

@@ -13,6 +13,7 @@ from rosbags.rosbag2 import Reader
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli import options
+from rangeseg_ros.io.recordings import why_unreadable
 
 CLOCK = '/clock'
 CLOCK_PERIOD = 0.025
@@ -60,7 +61,8 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock:
         reader.open()
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:
-        raise click.ClickException(f'{bag}: not a readable rosbag2: {error}') from None
+        reason = why_unreadable(bag, error)
+        raise click.ClickException(f'{bag}: not a readable rosbag2: {reason}') from None
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node('rangeseg_play')
     try:

@@ -185,7 +185,9 @@ class DepthBag:
         found = [name for name in images if 'depth' in name.lower() and self._may_be_depth(name)]
         found = found or [name for name in images if self._may_be_depth(name)]
         if not found:
-            raise BagError(f'{self.path}: no depth image; {self._topics_there_are()}')
+            kinds = ', '.join(f'{name}: {self._encoding(name) or "no message"}' for name in images)
+            none = f'no depth image ({kinds})' if images else 'no depth image'
+            raise BagError(f'{self.path}: {none}; {self._topics_there_are()}')
         return min(
             found,
             key=lambda name: (
@@ -199,12 +201,16 @@ class DepthBag:
     def _may_be_depth(self, topic: str) -> bool:
         if self._recording.counts[topic] == 0:
             return False
-        message = self._first_message(topic)
-        if message is None:
+        encoding = self._encoding(topic)
+        if not encoding:
             return 'depth' in topic.lower()
-        if hasattr(message, 'format'):
-            return 'compressedDepth' in message.format
-        return message.encoding in PIXEL_TYPES
+        return 'compressedDepth' in encoding or encoding in PIXEL_TYPES
+
+    def _encoding(self, topic: str) -> str:
+        """Encoding of the images on a topic, or format of compressed ones; empty when unknown."""
+        message = self._first_message(topic)
+        encoding: str = getattr(message, 'format', '') or getattr(message, 'encoding', '')
+        return encoding
 
     def _find_camera_topic(self) -> str:
         there = [name for name, kind in self._recording.types.items() if kind == CAMERA_INFO]

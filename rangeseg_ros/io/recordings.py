@@ -112,9 +112,16 @@ def open_recording(path: Path) -> Recording | DamagedRecording:
     except Exception as error:
         damaged = DamagedRecording(path)
         if not damaged.types:
-            reason = damaged.damage or str(error)
+            reason = damaged.damage or why_unreadable(path, error)
             raise RecordingError(f'not a readable bag: {reason}') from None
         return damaged
+
+
+def why_unreadable(path: Path, error: Exception) -> str:
+    """What the reader of `rosbags` stumbled over; it calls the metadata by the bag's name."""
+    if path.is_dir() and not (path / 'metadata.yaml').exists():
+        return 'the folder has no metadata.yaml'
+    return str(error)
 
 
 def _unpacked(record: Record | Lost) -> Record | Lost:
