@@ -5,6 +5,7 @@ What they import takes a second or more, in which Python would answer with a tra
 
 import os
 import signal
+import sys
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda number, stack: os._exit(130))
@@ -22,6 +23,12 @@ def segment_planes() -> None:
     from rangeseg_ros.core.runtime.memory import share_memory
 
     share_memory()  # before rclpy starts its threads
-    from rangeseg_ros.ros.node import main
-
+    try:
+        from rangeseg_ros.ros.node import main
+    except ModuleNotFoundError as error:
+        if error.name != 'rclpy':
+            raise
+        needed = 'source a ROS 2 installation, or install the extra jazzy'
+        print(f'segment_planes: no rclpy: {needed}', file=sys.stderr)
+        sys.exit(2)
     main()

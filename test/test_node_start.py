@@ -22,6 +22,17 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 pytestmark = pytest.mark.ros
 
 
+def test_where_there_is_no_rclpy_it_says_so():
+    code = (
+        'import sys\n'
+        "sys.modules['rclpy'] = None\n"
+        'from rangeseg_ros.start import segment_planes; segment_planes()'
+    )
+    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stderr.startswith('segment_planes: no rclpy') and run.stderr.count('\n') == 1
+
+
 def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
     arguments = '-p', 'stall_timeout:=0.5'
