@@ -10,11 +10,14 @@ from clouds import cloud_of
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.runtime.work import Work
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.subsampling import labels_of_all
+from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
-BUDGETS = (1.0, 0.95, 0.9, 0.7, 0.48, 0.0)
+BUDGETS = (1.0, 0.95, 0.9, 0.7, 0.48, 0.46, 0.0)
 
 
 @pytest.fixture(scope='module')
@@ -35,16 +38,17 @@ def results(image):
 
 def test_less_is_never_more():
     steps = [Work.within(budget) for budget in np.linspace(1, 0, 1001)]
-    assert steps[0] == (True, 1.0) and steps[-1] == (False, 0.0)
+    assert steps[0] == (1, 1.0) and steps[-1] == (4, 0.0)
+    assert {work.step for work in steps} == {1, 2, 4}
     for before, after in pairwise(steps):
-        assert before.every_pixel >= after.every_pixel
-        assert before.cuts >= after.cuts or before.every_pixel > after.every_pixel
+        assert before.step <= after.step
+        assert before.cuts >= after.cuts or before.step < after.step
 
 
 def test_fewer_cuts_leave_more_energy(results):
     energies = [results[budget].energy for budget in (1.0, 0.95, 0.9)]
     assert energies[0] < energies[1] < energies[2]
-    energies = [results[budget].energy for budget in (0.7, 0.48, 0.0)]
+    energies = [results[budget].energy for budget in (0.7, 0.48, 0.46)]
     assert energies[0] < energies[1] < energies[2]
 
 
@@ -84,6 +88,60 @@ def test_the_sensor_is_said_in_pixels_of_the_image(results):
     assert coarse.distortion_length == pytest.approx(full.distortion_length, rel=0.01)
 
 
+def labels_by_hand(labels, step, inverse, rays, theta, sensor):
+    """Of each pixel, the label around it that costs least, the one on its left and above first."""
+    found, counts = np.zeros(inverse.shape, np.uint16), np.zeros(len(theta), int)
+    for row, column in np.argwhere(inverse > 0):
+        square = inverse[row, column] ** 2
+        variance = random_variance(sensor, square) + systematic_variance(sensor, square)
+        costs = {}
+        for y in (row // step, min(-(-row // step), len(labels) - 1)):
+            for x in (column // step, min(-(-column // step), labels.shape[1] - 1)):
+                label = labels[y, x]
+                residual = inverse[row, column] - theta[label] @ rays[row, column]
+                costs[label] = residual**2 / variance if label else chi2_quantile(1)
+        found[row, column] = min(costs, key=costs.get)
+        counts[found[row, column]] += 1
+    return found, counts
+
+
+@pytest.mark.parametrize('step', [2, 4])
+@pytest.mark.parametrize('shape', [(1, 1), (8, 9), (13, 22)])
+def test_pixels_between_take_the_label_that_they_fit(shape, step):
+    draw = np.random.default_rng(7)
+    camera = Camera(shape[1], shape[0], 20.0, 20.0, shape[1] / 2, shape[0] / 2)
+    theta = np.vstack([np.zeros(3), draw.normal((0, 0, 0.5), 0.01, (3, 3))])
+    coarse = draw.integers(0, 4, (-(-shape[0] // step), -(-shape[1] // step))).astype(np.uint16)
+    truth = draw.integers(1, 4, shape)
+    inverse = (theta[truth] * camera.rays).sum(axis=2).astype(np.float32)
+    inverse[draw.random(shape) < 0.2] = 0
+    sensor = SensorModel.from_config(Config(noise=0.003, distortion=0.002))
+    pixels = inverse, camera.rays, theta, sensor
+    labels, counts = labels_of_all(coarse, step, *pixels)
+    expected, expected_counts = labels_by_hand(coarse, step, *pixels)
+    assert (labels == expected).all() and (counts == expected_counts).all()
+    seen = inverse[::step, ::step] > 0
+    assert (labels[::step, ::step][seen] == coarse[seen]).all()
+
+
+def overlap(labels, truth, valid):
+    """Mean IoU of the regions of at least 1000 pixels."""
+    found = []
+    for face in np.unique(truth[truth > 0]):
+        region = (truth == face) & valid
+        if np.count_nonzero(region) >= 1000:
+            best = labels == np.bincount(labels[region], minlength=2)[1:].argmax() + 1
+            found.append(np.count_nonzero(best & region) / np.count_nonzero(best & valid | region))
+    return np.mean(found)
+
+
+@pytest.mark.parametrize(('budget', 'loss'), [(0.7, 0.005), (0.0, 0.03)])
+def test_borders_are_found_among_the_pixels_left_out(room, image, results, budget, loss):
+    """A border that keeps to the rows and columns looked at costs three times as much."""
+    full, less = (overlap(results[b].labels, room[0].labels, image.valid) for b in (1.0, budget))
+    assert less > full - loss
+
+
 def test_no_jump_beside_what_was_not_measured(image, results):
     across, down = results[0.7].jumps
     valid = image.valid
@@ -92,10 +150,11 @@ def test_no_jump_beside_what_was_not_measured(image, results):
     assert not (down & ~(valid[1:] & valid[:-1])).any()
 
 
-def test_half_a_camera_sees_every_second_pixel():
+@pytest.mark.parametrize(('step', 'shape'), [(2, (3, 4)), (4, (2, 2))])
+def test_a_coarser_camera_sees_every_second_or_fourth_pixel(step, shape):
     camera = Camera(7, 5, 6.0, 6.5, 3.2, 1.9, skew=0.3)
-    assert camera.halved.shape == (3, 4)
-    assert camera.halved.rays == pytest.approx(camera.rays[::2, ::2], abs=1e-6)
+    assert camera.every(step).shape == shape
+    assert camera.every(step).rays == pytest.approx(camera.rays[::step, ::step], abs=1e-6)
 
 
 def test_clouds_and_bodies_are_halved(image):

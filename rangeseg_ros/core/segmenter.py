@@ -29,10 +29,10 @@ from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
-from rangeseg_ros.core.sensing.halving import doubled_edges, doubled_labels
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.subsampling import edges_of_all, labels_of_all
 
 
 class Segmenter:
@@ -45,7 +45,6 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self._coarse = _for_half_the_size(self.config)
         self.reset()
         keep_freed_memory()
         box_safely()
@@ -73,11 +72,12 @@ class Segmenter:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        if Work.within(config.work_budget).every_pixel:
-            return self._segment(image, config, Stopwatch())
+        step = Work.within(config.work_budget).step
         watch = Stopwatch()
-        coarse = self._segment(image.halved(), self._coarse, watch)
-        result = _told_for_all(coarse, image)
+        if step == 1:
+            return self._segment(image, config, watch)
+        coarse = self._segment(image.every(step), _for_every(step, config), watch)
+        result = _told_for_all(coarse, step, image)
         watch.lap('pixels')
         return result
 
@@ -168,28 +168,30 @@ class Segmenter:
         return labels if camera == image.camera and labels.shape == image.shape else None
 
 
-def _for_half_the_size(config: Config) -> Config:
-    """Parameters for images of half the rows and columns: lengths and areas are in pixels."""
+def _for_every(step: int, config: Config) -> Config:
+    """Parameters for images of every `step`-th row and column: lengths, areas are in pixels."""
     return replace(
         config,
-        min_pixels=-(-config.min_pixels // 4),
-        noise_correlation=config.noise_correlation / 2,
-        distortion_length=config.distortion_length / 2,
-        pixel_noise=config.pixel_noise / 2,
+        min_pixels=-(-config.min_pixels // step**2),
+        noise_correlation=config.noise_correlation / step,
+        distortion_length=config.distortion_length / step,
+        pixel_noise=config.pixel_noise / step,
     )
 
 
-def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
-    """What was found in `image.halved()`, for all pixels that it stands for."""
-    labels = doubled_labels(coarse.labels, image.valid)
-    count = np.bincount(labels.ravel(), minlength=int(coarse.labels.max(initial=0)) + 1)
+def _told_for_all(coarse: Segmentation, step: int, image: RangeImage) -> Segmentation:
+    """What was found in `image.every(step)`, for all pixels that it stands for."""
+    theta = np.zeros((1 + max((plane.label for plane in coarse.planes), default=0), 3))
+    for plane in coarse.planes:
+        theta[plane.label] = -plane.normal / plane.distance
     sensor = coarse.sensor
+    labels, counts = labels_of_all(coarse.labels, step, image.inverse, image.rays, theta, sensor)
     sensor = sensor._replace(
-        correlation=2 * sensor.correlation,
-        distortion_length=2 * sensor.distortion_length,
-        shown_length=2 * sensor.shown_length,
-        column_noise=2 * sensor.column_noise,
-        row_noise=2 * sensor.row_noise,
+        correlation=step * sensor.correlation,
+        distortion_length=step * sensor.distortion_length,
+        shown_length=step * sensor.shown_length,
+        column_noise=step * sensor.column_noise,
+        row_noise=step * sensor.row_noise,
     )
     survey = coarse.survey
     if isinstance(survey, Survey):
@@ -197,9 +199,9 @@ def _told_for_all(coarse: Segmentation, image: RangeImage) -> Segmentation:
     return replace(
         coarse,
         labels=labels,
-        planes=[replace(plane, count=int(count[plane.label])) for plane in coarse.planes],
+        planes=[replace(plane, count=int(counts[plane.label])) for plane in coarse.planes],
         sensor=sensor,
-        jumps=coarse.jumps and doubled_edges(coarse.jumps, image.valid),
+        jumps=coarse.jumps and edges_of_all(coarse.jumps, step, image.valid),
         survey=survey,
     )
 

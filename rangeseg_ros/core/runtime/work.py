@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 # Share of the full work, on Kinect frames of 640 x 480, that remains without cuts: of all pixels,
-# and of every second row and column; and that of these with cuts.
-_UNCUT, _COARSE, _COARSE_UNCUT = 0.9, 0.5, 0.46
+# and of every second row and column; that of these with cuts; and of every fourth, without.
+_UNCUT, _COARSE, _COARSE_UNCUT, _COARSEST = 0.9, 0.5, 0.46, 0.32
 
-STEPS = (1.0, (1.0 + _UNCUT) / 2, _UNCUT, _COARSE, _COARSE_UNCUT)
+STEPS = (1.0, (1.0 + _UNCUT) / 2, _UNCUT, _COARSE, _COARSE_UNCUT, _COARSEST)
 """Budgets that make a difference, falling: those of which docs/benchmark.md tells the accuracy."""
 
 
@@ -17,13 +17,13 @@ class Work(NamedTuple):
 
     Attributes
     ----------
-    every_pixel : bool
-        Whether all pixels are looked at, or every second one of every second row.
+    step : int
+        1 where all pixels are looked at; 2, 4: every second, fourth of every such row.
     cuts : float
         Share of the pixels near boundaries whose labels cuts decide, 0...1.
     """
 
-    every_pixel: bool
+    step: int
     cuts: float
 
     @classmethod
@@ -31,8 +31,11 @@ class Work(NamedTuple):
         """What a share `budget` of the full work, 0...1, is enough for.
 
         Cuts move boundaries by a pixel here and there, and are the first that goes, a part at a
-        time. Then three quarters of the pixels go, and the cuts come back; last go these.
+        time. Then three quarters of the pixels go, and the cuts come back; then go these, and last
+        three quarters of what pixels there are.
         """
-        every_pixel = budget >= _UNCUT
-        least, full = (_UNCUT, 1.0) if every_pixel else (_COARSE_UNCUT, _COARSE)
-        return cls(every_pixel, min(max((budget - least) / (full - least), 0.0), 1.0))
+        if budget >= _UNCUT:
+            return cls(1, min((budget - _UNCUT) / (1.0 - _UNCUT), 1.0))
+        if budget >= _COARSE_UNCUT:
+            return cls(2, min((budget - _COARSE_UNCUT) / (_COARSE - _COARSE_UNCUT), 1.0))
+        return cls(4, 0.0)

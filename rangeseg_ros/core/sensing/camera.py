@@ -6,7 +6,7 @@ import operator
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import astuple, dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -225,19 +225,9 @@ class Camera:
         """Shape of an image of this camera: (height, width)."""
         return self.height, self.width
 
-    @cached_property
-    def halved(self) -> Camera:
-        """The camera that sees every second column of every second row, from the first on."""
-        return replace(
-            self,
-            width=(self.width + 1) // 2,
-            height=(self.height + 1) // 2,
-            fx=self.fx / 2,
-            fy=self.fy / 2,
-            cx=self.cx / 2,
-            cy=self.cy / 2,
-            skew=self.skew / 2,
-        )
+    def every(self, step: int) -> Camera:
+        """The camera that sees every `step`-th column of every such row, from the first on."""
+        return _every(step, self)
 
     @property
     def pinhole(self) -> bool:
@@ -351,3 +341,18 @@ def _data(calibration: Mapping[str, Any], key: str) -> Any:
     if not isinstance(entry, Mapping):
         raise CameraError(f'malformed camera calibration: {key} has no data')
     return _entry(entry, 'data')
+
+
+@lru_cache(maxsize=4)
+def _every(step: int, camera: Camera) -> Camera:
+    # Kept, as its rays are worked out only once.
+    return replace(
+        camera,
+        width=-(-camera.width // step),
+        height=-(-camera.height // step),
+        fx=camera.fx / step,
+        fy=camera.fy / step,
+        cx=camera.cx / step,
+        cy=camera.cy / step,
+        skew=camera.skew / step,
+    )
