@@ -21,6 +21,8 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
 
+QOS = f'qos_overrides.{DEPTH}.subscription'
+
 
 def test_where_there_is_no_rclpy_it_says_so():
     code = (
@@ -70,6 +72,10 @@ def test_interrupted_during_a_computation(presses):
         (['--ros-args', '-p', 'method:=magic'], 'method'),
         (['--ros-args', '-p', 'min_pixel:=3'], "is 'min_pixels' meant?"),
         (['--ros-args', '-p', 'min_pixels:=many'], 'INTEGER'),
+        (['--ros-args', '-p', f'{QOS}.reliability:=best'], 'reliable, best_effort'),
+        (['--ros-args', '-p', f'{QOS}.history:=7'], 'keep_last'),
+        (['--ros-args', '-p', f'{QOS}.depth:=many'], 'number of messages'),
+        (['--ros-args', '-p', f'{QOS}.depth:=-1'], 'number of messages'),
         (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
         (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
         (['--ros-args', '--magic'], '--magic'),

@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 from rclpy.node import Node
+from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 from rclpy.utilities import remove_ros_args
 
 from rangeseg_ros.core.options import ConfigError, unknown_parameter
@@ -33,6 +34,7 @@ Parameters:
 
 # Of rclpy and of every node.
 _FOREIGN = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
+_POLICIES = {'reliability': ReliabilityPolicy, 'history': HistoryPolicy}
 
 
 def check_arguments(arguments: list[str]) -> None:
@@ -62,8 +64,12 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
     Raises
     ------
     ConfigError
-        A name that is not a parameter, and the one that it looks like.
+        A name that is not a parameter, and the one that it looks like; a quality of service that
+        there is none of.
     """
+    for name, parameter in node._parameter_overrides.items():
+        if name.startswith('qos_overrides.'):
+            _check_policy(name, parameter.value)
     known = {field.name for field in fields(NodeConfig)}
     given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
     unknown = sorted(set(given) - known)
@@ -86,6 +92,19 @@ def logging_arguments() -> list[str]:
         file=sys.stderr,
     )
     return ['--ros-args', '--disable-external-lib-logs']
+
+
+def _check_policy(name: str, value: object) -> None:
+    """Refuse a policy that would end the node as soon as the topic is subscribed to."""
+    policy = name.rpartition('.')[2]
+    if policy in _POLICIES:
+        choices = [kind.lower() for kind in _POLICIES[policy].__members__ if kind != 'UNKNOWN']
+        if str(value).lower() not in choices:
+            raise ConfigError(
+                f'parameter {name} must be one of {", ".join(choices)}, not {value!r}'
+            )
+    elif policy == 'depth' and (type(value) is not int or value < 0):
+        raise ConfigError(f'parameter {name} must be a number of messages, not {value!r}')
 
 
 def _described() -> Iterable[str]:
