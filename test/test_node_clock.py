@@ -16,6 +16,7 @@ def test_a_clock_that_stands_still_silences_no_report():
         with bench.listening('labels'):
             dead = bench.status(lambda status: status.level == DiagnosticStatus.ERROR)
             assert f'no depth message on /paused{DEPTH}' in dead.message
+            bench.until(lambda: bench.log().count('no depth message') == 1)
             with bench.camera_on(f'/paused{DEPTH}', f'/paused{INFO}'):
                 assert bench.segment().any()
 

@@ -169,6 +169,11 @@ def test_publisher_goes_and_comes_back(node):
             assert_segments(node)
 
 
+def test_a_topic_of_another_type_is_told(node):
+    with node.listening('labels'), node.advertised(PointCloud2, DEPTH):
+        error_about(node, '(1 publishers of sensor_msgs/msg/PointCloud2)')
+
+
 def test_subscriber_joins_late(node):
     with (
         node.advertised(Image, DEPTH) as node.depth,

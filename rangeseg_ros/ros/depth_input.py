@@ -101,10 +101,11 @@ class DepthInput:
         """Topic of the depth messages."""
         return self._subscription.topic
 
-    @property
-    def publishers(self) -> int:
-        """Number of publishers of depth messages."""
-        return self._subscription.publishers
+    def publishers(self) -> str:
+        """How many publishers the topic has, and which of their types are not what is read."""
+        others = self._subscription.other_types
+        of = f' of {", ".join(others)}' if others else ''
+        return f'{self._subscription.publishers} publishers{of}'
 
     def loss_hint(self) -> str:
         """What may help against lost depth messages; empty when nothing is known to."""

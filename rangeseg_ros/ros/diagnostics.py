@@ -199,6 +199,13 @@ class FrameStatistics:
         parts = self.compiling, str(self.activity)
         return ', '.join(part for part in parts if part)
 
+    def silence(self, source: DepthInput, stall_timeout: float) -> str:
+        """For how long nothing has come from `source`; empty up to `stall_timeout` seconds."""
+        silence = time.monotonic() - source.last_arrival
+        if silence <= stall_timeout:
+            return ''
+        return f'no depth message on {source.topic} for {silence:.1f} s ({source.publishers()})'
+
     def lost(self, source: DepthInput) -> str:
         """What share of the messages of `source` is lost, and what may help; empty when none."""
         lost = self.losses.lost.recent()
@@ -213,12 +220,7 @@ class FrameStatistics:
             busy = f'; {self.compiling}' if self.compiling else ''
             return DiagnosticStatus.OK, f'idle: nobody listens{busy}'
         lost = self.lost(source)
-        silence = time.monotonic() - source.last_arrival
-        if silence > stall_timeout:
-            silent = (
-                f'no depth message on {source.topic} for {silence:.1f} s '
-                f'({source.publishers} publishers)'
-            )
+        if silent := self.silence(source, stall_timeout):
             return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
         if problem := source.problem or self.problem:
             return DiagnosticStatus.ERROR, problem

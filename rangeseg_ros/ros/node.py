@@ -62,6 +62,7 @@ class SegmentPlanes(Node):
         config = bind(self, lambda config: self._settings.want(config))
         self._config = config
         self._input: DepthInput | None = None
+        self._silent = False
         self._statistics = FrameStatistics()
         self._seldom = SeldomCallbackGroup(_EVENT_INTERVAL)
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
@@ -175,6 +176,10 @@ class SegmentPlanes(Node):
             self._input.follow_publishers()
             if lost := self._statistics.lost(self._input):
                 self.get_logger().warning(f'{lost} (said once; see /diagnostics)', once=True)
+            silence = self._statistics.silence(self._input, self._config.stall_timeout)
+            if silence and not self._silent:
+                self.get_logger().warning(silence)
+            self._silent = bool(silence)
         self._pipeline.locator.follow_publishers()
         if self._settings.pending:
             self._statistics.pending = 'in preparation, those before serve'

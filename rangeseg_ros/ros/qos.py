@@ -66,6 +66,14 @@ class MatchedSubscription:
         count: int = self._node.count_publishers(self.topic)
         return count
 
+    @property
+    def other_types(self) -> list[str]:
+        """Types that are published on the topic and are not that of the subscription."""
+        kind = self._arguments[0]
+        own = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
+        offers = self._node.get_publishers_info_by_topic(self.topic)
+        return sorted({info.topic_type for info in offers} - {own})
+
     def follow_publishers(self) -> None:
         """Subscribe anew where the publishers there are now offer something else.
 
