@@ -53,7 +53,9 @@ def random_case(seed, height, width, count=3):
     shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
     models = Models(theta, half_precision, Shifts(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
-    return Problem.of(image, SENSOR, edges, BLOCK, LAMBDA), models, labels.astype(np.int32)
+    problem = Problem.of(image, SENSOR, edges, BLOCK, LAMBDA)
+    # The rays are those of a pinhole camera, whether that is known or not.
+    return problem._replace(pinhole=seed % 2 == 1), models, labels.astype(np.int32)
 
 
 def unary(problem, models):

@@ -19,6 +19,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.graphcut.sites import room_for_unlike, unlike_sites
 from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 
 REACH = 2
 """Blocks from a surface in which its label may win pixels."""
@@ -58,6 +59,8 @@ def _take_nearest(
     count = np.empty(columns, np.intp)
     # The first of them, for each column of pixels.
     label, planes = np.empty(width, np.int32), np.empty((5, width))
+    rays = problem.rays.reshape(height, width, 3)
+    ray = first_rays(rays, 0)
     above, around = np.empty((3, columns + 2 * REACH), np.int32), np.empty((3, columns), np.int32)
     for bi in range(first, after):
         top, bottom = bi * block, min((bi + 1) * block, height)
@@ -83,7 +86,8 @@ def _take_nearest(
                     planes[entry, j] = plane[entry]
         for i in range(top, bottom):
             here = slice(i * width, (i + 1) * width)
-            row = problem.inverse[here], problem.rays[here].reshape(-1), problem.weight[here]
+            next_rays(rays, problem.pinhole, i, ray)
+            row = problem.inverse[here], ray, problem.weight[here]
             _take_first(label, planes, *row, labels[here], cost[here])
         for bj in range(columns):
             for k in range(1, count[bj]):
@@ -91,7 +95,7 @@ def _take_nearest(
                 for i in range(top, bottom):
                     for j in range(bj * block, min((bj + 1) * block, width)):
                         p = i * width + j
-                        value = np.float32(plane_cost(plane, p, problem))
+                        value = np.float32(plane_cost(plane, i * width, j, problem))
                         better = value < cost[p]
                         labels[p] = candidates[bj, k] if better else labels[p]
                         cost[p] = value if better else cost[p]
@@ -169,10 +173,10 @@ def _take_first(
 ) -> None:
     """Give each pixel of a row its first candidate, or none where that costs more."""
     a, b, c, scale, half_precision = planes[0], planes[1], planes[2], planes[3], planes[4]
-    # Without branches, and the rays' components in one row, so that the compiler takes many pixels
-    # at a time.
+    x, y, z = rays[0], rays[1], rays[2]
+    # Without branches, so that the compiler takes many pixels at a time.
     for j in range(len(labels)):
-        level = a[j] * rays[3 * j] + b[j] * rays[3 * j + 1] + c[j] * rays[3 * j + 2]
+        level = a[j] * x[j] + b[j] * y[j] + c[j] * z[j]
         residual = inverse[j] - scale[j] * level
         value = np.float32(min(half_precision[j] * weight[j] * residual * residual, CAP))
         measured, better = weight[j] > 0, value < np.float32(NO_PLANE)

@@ -41,6 +41,8 @@ class Problem(NamedTuple):
     ----------
     inverse, rays : (n,), (n, 3) float32
         Range image.
+    pinhole : bool
+        Of it: whether rays of a column differ in y alone, and those of a row not in y.
     weight : (n,) float32
         1 / random variance of the inverse range; 0 where nothing was measured.
     links : (2, n) float32
@@ -55,6 +57,7 @@ class Problem(NamedTuple):
 
     inverse: NDArray[np.float32]
     rays: NDArray[np.float32]
+    pinhole: bool
     weight: NDArray[np.float32]
     links: NDArray[np.float32]
     width: int
@@ -79,7 +82,7 @@ class Problem(NamedTuple):
         weight = _weights(inverse, sensor)
         prior = link_costs(grid, smoothness * sensor.patch)
         width, smooth = image.shape[1], sensor.distortion_pixels
-        return cls(inverse, rays, weight, prior, width, block, smooth)
+        return cls(inverse, rays, image.pinhole, weight, prior, width, block, smooth)
 
 
 # Divides by zero where numpy does, and without branches, so that many pixels are taken at a time.
@@ -139,9 +142,10 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
         return NO_PLANE
     # Unsigned and short, which divides in a fraction of the time.
     place, width, block = np.uint32(p), np.uint32(problem.width), np.uint32(problem.block)
-    row, column = np.intp(place // width // block), np.intp(place % width // block)
+    i, j = place // width, place % width
+    row, column, along = np.intp(i // block), np.intp(j // block), int(np.intp(j))
     plane = shifted_plane(label, shift_at(models.shifts, label, int(row), int(column)), models)
-    return plane_cost(plane, p, problem)
+    return plane_cost(plane, p - along, along, problem)
 
 
 @njit(cache=True)
@@ -160,11 +164,19 @@ def shifted_plane(
 
 
 @njit(cache=True)
-def plane_cost(plane: tuple[float, float, float, float, float], p: int, problem: Problem) -> float:
-    """What a plane costs a pixel; 0 where nothing was measured."""
+def plane_cost(
+    plane: tuple[float, float, float, float, float], begin: int, j: int, problem: Problem
+) -> float:
+    """What a plane costs the pixel in column j of a row; 0 where nothing was measured.
+
+    `begin` is the number of the first pixel of the row.
+    """
     a, b, c, scale, half_precision = plane
-    rays = problem.rays
-    residual = problem.inverse[p] - scale * (a * rays[p, 0] + b * rays[p, 1] + c * rays[p, 2])
+    rays, p = problem.rays, begin + j
+    # Numbers that stay in cache, where the rays of all pixels do not.
+    first, second = (j, begin) if problem.pinhole else (p, p)
+    level = a * rays[first, 0] + b * rays[second, 1] + c * rays[first, 2]
+    residual = problem.inverse[p] - scale * level
     return min(half_precision * problem.weight[p] * residual * residual, CAP)
 
 
