@@ -13,6 +13,8 @@ only blocks whose four parts are flat themselves are compared, scale by scale.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -33,7 +35,7 @@ from rangeseg_ros.core.fitting.scale import (
     share,
     variance_ratio,
 )
-from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.runtime.threads import Task, start, submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, slope_of
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -49,7 +51,9 @@ _EXACT = 1e-4
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
 
-def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
+def measured_sensor(
+    image: RangeImage, blocks: Blocks, prior: SensorModel, beside: Task[Any] | None = None
+) -> SensorModel:
     """The errors that an image shows.
 
     Parameters
@@ -59,6 +63,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         Of the image.
     prior : SensorModel
         Taken as far as the image says too little.
+    beside : Task, optional
+        Started, for later, where all that is left here is one thread's work.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
@@ -82,6 +88,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if not flat.any():
         return prior
     smallest = submit(_within, blocks, flat, way, level)
+    if beside is not None:
+        start(beside)
     compared = compare(flat, blocks.residual, level, coarse, way)
     if not compared.enough:
         return prior
