@@ -10,14 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.runtime.threads import (
-    Task,
-    map_halves,
-    run_rows,
-    sharing_cores,
-    start,
-    submit,
-)
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
 
 
 @pytest.fixture(params=[1, 2, 7])
@@ -118,17 +111,6 @@ def test_a_task_that_waits_for_a_helper_is_done_by_who_needs_it(threads):
     assert submit(threading.get_ident).result() == threading.get_ident()
     free.set()
     assert busy.result() == (None, True)
-
-
-@pytest.mark.parametrize('started', [False, True])
-def test_a_task_is_done_once_whether_it_was_started_or_not(threads, started):
-    done = threading.Event()
-    task = Task(lambda *values: (sum(values), done.set()), (2, 3))
-    assert not done.is_set()
-    if started:
-        start(task)
-        assert done.wait(20)
-    assert task.result() == task.result() == (5, None)
 
 
 @pytest.mark.parametrize('threads', [2], indirect=True)

@@ -22,7 +22,7 @@ from rangeseg_ros.core.runtime.boxing import box_safely
 from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
-from rangeseg_ros.core.runtime.threads import Task, submit
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -83,11 +83,11 @@ class Segmenter:
 
     def _segment(self, image: RangeImage, config: Config, watch: Stopwatch) -> Segmentation:
         blocks = Blocks.of(image)
-        # For another thread, once what tells the noise leaves it time.
-        holes = Task(find_holes, (image.inverse,))
+        # Much of what tells the noise runs on one thread: on another one meanwhile.
+        holes = submit(find_holes, image.inverse)
         stated = sensor = SensorModel.from_config(config, image.shape)
         if config.sensor_model == 'measured':
-            sensor = measured_sensor(image, blocks, sensor, holes)
+            sensor = measured_sensor(image, blocks, sensor)
         watch.lap('noise')
         # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
         # a surface seen at a grazing angle costs it less than one too few.

@@ -13,8 +13,6 @@ only blocks whose four parts are flat themselves are compared, scale by scale.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -35,7 +33,7 @@ from rangeseg_ros.core.fitting.scale import (
     share,
     variance_ratio,
 )
-from rangeseg_ros.core.runtime.threads import Task, start, submit
+from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, slope_of
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -51,9 +49,7 @@ _EXACT = 1e-4
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
 
-def measured_sensor(
-    image: RangeImage, blocks: Blocks, prior: SensorModel, beside: Task[Any] | None = None
-) -> SensorModel:
+def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
     """The errors that an image shows.
 
     Parameters
@@ -63,8 +59,6 @@ def measured_sensor(
         Of the image.
     prior : SensorModel
         Taken as far as the image says too little.
-    beside : Task, optional
-        Started, for later, where all that is left here is one thread's work.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
@@ -88,8 +82,6 @@ def measured_sensor(
     if not flat.any():
         return prior
     smallest = submit(_within, blocks, flat, way, level)
-    if beside is not None:
-        start(beside)
     compared = compare(flat, blocks.residual, level, coarse, way)
     if not compared.enough:
         return prior

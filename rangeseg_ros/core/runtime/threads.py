@@ -138,7 +138,9 @@ def run_rows(
     threads = min(_cores(), _MAX_THREADS)
     count = max(min(strips * threads, rows // _ROWS), 1) if threads > 1 else 1
     bounds = [rows * part // count for part in range(count + 1)]
-    others = [submit(kernel, *strip, *arguments) for strip in pairwise(bounds[1:])]
+    others = [
+        _handed_over(kernel, first, after, *arguments) for first, after in pairwise(bounds[1:])
+    ]
     kernel(0, bounds[1], *arguments)
     for other in others:
         other.run()
@@ -169,16 +171,16 @@ def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
     kernel((max(middle - _SEAM, 0), min(middle + _SEAM, height)), *arguments)
 
 
-def submit(function: Callable[..., T], *arguments: Any) -> Task[T]:
-    """Start a call beside what the caller does until `result()`, or make it with a single core."""
-    task = Task(function, arguments)
-    start(task)
-    return task
-
-
-def start(task: Task[Any]) -> None:
-    """Do what `submit` does with a task that is there already."""
+def submit(task: Callable[..., T], *arguments: Any) -> Task[T]:
+    """Start a task beside what the caller does until `result()`, or do it with a single core."""
     if _cores() > 1:
-        _helpers().add(task)
-    else:
-        task.run()
+        return _handed_over(task, *arguments)
+    done = Task(task, arguments)
+    done.run()
+    return done
+
+
+def _handed_over(task: Callable[..., T], *arguments: Any) -> Task[T]:
+    given = Task(task, arguments)
+    _helpers().add(given)
+    return given
