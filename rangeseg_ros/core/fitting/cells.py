@@ -173,15 +173,21 @@ def add_pixels(
 
 @njit(cache=True, inline='always')
 def add_block(
-    record: NDArray[np.float64], moments: NDArray[np.float64], squared: float, sensor: SensorModel
+    record: NDArray[np.float64],
+    moments: NDArray[np.float64],
+    squared: float,
+    sensor: SensorModel,
+    forward: NDArray[np.float64],
 ) -> None:
-    """Add a block, of moments with unit weights, to a cell: its rays have z = 1."""
+    """Add a block, of moments with unit weights, to a cell: rays are 1 long along `forward`."""
     w = 1 / random_variance(sensor, squared)
     for entry in range(CHI2):
         record[entry] += w * moments[entry]
     record[COUNT] += moments[COUNT]
-    for entry, place in enumerate((2, 4, 5)):
-        record[WEIGHTED_RAY + entry] += w * moments[place]
+    # The sum of r r^T f is that of r where r^T f is 1.
+    for entry, (a, b, c) in enumerate(((0, 1, 2), (1, 3, 4), (2, 4, 5))):
+        along = forward[0] * moments[a] + forward[1] * moments[b] + forward[2] * moments[c]
+        record[WEIGHTED_RAY + entry] += w * along
     record[WEIGHT] += w * moments[COUNT]
     # With 1 / y^2 for weights, sums of r y and r r^T are those of points and of their squares.
     w = 1 / squared

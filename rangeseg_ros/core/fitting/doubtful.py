@@ -64,7 +64,8 @@ def sums_without_doubtful(
     """
     central = image.camera is not None
     pixels = labels, image.inverse, image.rays, image.pinhole
-    regions = blocks, inner, cells, sensor, theta, central
+    forward = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
+    regions = blocks, inner, cells, sensor, theta, central, forward
     (count, upper), (lower_count, lower) = map_halves(_sort, len(labels), *pixels, *regions)
     count += lower_count
     explained = np.zeros((len(theta), RECORD))
@@ -86,6 +87,7 @@ def _sort(
     sensor: SensorModel,
     theta: NDArray[np.float64],
     central: bool,
+    forward: NDArray[np.float64],
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Numbers and sums of pixels of some rows by their kinds.
 
@@ -100,7 +102,7 @@ def _sort(
     for bi in range(max(first_block - 1, 0), after_block):
         for bj in range(inner.shape[1]):
             label, squared = inner[bi, bj], blocks.squared[bi, bj]
-            # Points of a cloud have rays without a z of 1, which blocks do not tell the sums of.
+            # Rays of a cloud are not of one length along any axis: blocks do not tell their sums.
             if label == 0 or not central or cells.size[label] % BLOCK > 0:
                 continue
             variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
@@ -112,7 +114,7 @@ def _sort(
             if explained[bi, bj] and bi >= first_block and squared > 0:
                 count[0, label] += int(blocks.moments[bi, bj, COUNT])
                 record = sums[_SURE, cell_of(cells, label, bi * BLOCK, bj * BLOCK)]
-                add_block(record, blocks.moments[bi, bj], squared, sensor)
+                add_block(record, blocks.moments[bi, bj], squared, sensor, forward)
     for i in range(top, bottom):
         within, inside = explained[i // BLOCK], inner[i // BLOCK]
         j = 0
