@@ -2,37 +2,53 @@
 
 import numpy as np
 import pytest
+from message_classes import header, make_rosbags
 from scanner_points import scanned
 
-from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.mapping.sightings import may_be_in_sight
+from rangeseg_ros.core.meaning.classes import GROUND
 from rangeseg_ros.core.meaning.crossings import drops, outlines
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 from rangeseg_ros.core.sensing.distortion import DistortionMap
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.solids import cast
 
 BODY = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """x forward, y left, z up, from the optical frame (REP 103)."""
+BASE = Transform(rotation_by((0, np.radians(20), 0)) @ BODY, np.array([0.3, 0, 0.8]))
+"""That of a robot that the camera looks down from."""
+ORIGIN = np.zeros(3)
 FRAMES = {
-    'body': BODY,
-    'body, turned': BODY @ rotation_by((0.1, -0.2, 0.05)),
-    'y forward': np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]) @ rotation_by((0, 0.1, 0)),
-    'any': rotation_by((1.3, -0.7, 2.1)),
+    'body': (BODY, ORIGIN),
+    'body, turned': (BODY @ rotation_by((0.1, -0.2, 0.05)), ORIGIN),
+    'y forward': (
+        np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]) @ rotation_by((0, 0.1, 0)),
+        ORIGIN,
+    ),
+    'any': (rotation_by((1.3, -0.7, 2.1)), ORIGIN),
+    'base': BASE,
+    'any, moved': (rotation_by((1.3, -0.7, 2.1)), np.array([-7.0, 3, 2])),
 }
 CAMERA = Camera(320, 240, 290.0, 291.0, 158.5, 121.0)
 
 
-def room(seed=5):
-    """Range image of a room with noise, and up in it."""
-    scene = kinect_room(seed)
-    pose = scene.poses[0]
-    depth, _ = cast(scene.solids, pose.position, CAMERA.rays.astype(float) @ pose.rotation.T)
+def room(seed=5, camera=CAMERA, frame=0):
+    """Range image of a room with noise, and its pose in the room."""
+    scene = kinect_room(seed, frame + 1)
+    pose = scene.poses[frame]
+    depth, _ = cast(scene.solids, pose.position, camera.rays.astype(float) @ pose.rotation.T)
     depth = np.where(np.isfinite(depth), depth, 0)
     error = np.random.default_rng(seed).normal(0, 0.001, depth.shape)
     with np.errstate(divide='ignore'):
         noisy = np.where(depth > 0, 1 / (1 / depth + error), 0)
-    return RangeImage.from_depth(noisy, CAMERA), pose.rotation[2]
+    return RangeImage.from_depth(noisy, camera), Transform(pose.rotation, pose.position)
+
+
+def cloud_in(frame, points):
+    """Range image of points (H, W, 3) as a message has them in a frame: turn and place."""
+    return RangeImage.from_points((points @ frame[0].T + frame[1]).astype(np.float32))
 
 
 def stated(up):
@@ -46,13 +62,15 @@ def overlap(labels, other, label):
     return found, (mask & (other == found)).sum() / (mask | (other == found)).sum()
 
 
-@pytest.mark.parametrize('turn', FRAMES.values(), ids=FRAMES)
+@pytest.mark.parametrize('frame', FRAMES.values(), ids=FRAMES)
 @pytest.mark.parametrize('method', ['planes', 'normals'])
-def test_a_room_is_segmented_as_its_depth_image(turn, method):
-    image, up = room()
-    cloud = RangeImage.from_points((image.points @ turn.T).astype(np.float32))
+def test_a_room_is_segmented_as_its_depth_image(frame, method):
+    image, pose = room()
+    up, (turn, place) = pose.rotation[2], frame
+    cloud = cloud_in(frame, image.points)
     np.testing.assert_allclose(cloud.axes, turn, atol=1e-5)
-    np.testing.assert_allclose(cloud.points, image.points @ turn.T, atol=1e-4)
+    np.testing.assert_allclose(cloud.place, place, atol=1e-5)
+    np.testing.assert_allclose(cloud.points, image.points @ turn.T + place, atol=1e-4)
     expected = Segmenter(Config(method=method, **stated(up))).segment(image)
     result = Segmenter(Config(method=method, **stated(turn @ up))).segment(cloud)
     # What rounding decides are single pixels of borders.
@@ -62,14 +80,20 @@ def test_a_room_is_segmented_as_its_depth_image(turn, method):
         assert label > 0 and same > 0.97
         other = next(other for other in result.planes if other.label == label)
         assert (turn @ plane.normal) @ other.normal > 1 - 1e-5
-        assert other.distance == pytest.approx(plane.distance, rel=2e-3)
+        distance = plane.distance - turn @ plane.normal @ place
+        assert other.distance == pytest.approx(distance, rel=2e-3, abs=2e-3)
         assert other.area == pytest.approx(plane.area, rel=0.05)
-        np.testing.assert_allclose(turn @ plane.centroid, other.centroid, atol=0.02)
-        np.testing.assert_allclose(turn @ plane.centre, other.centre, atol=0.05)
+        to_frame = np.eye(4)
+        to_frame[:3, :3], to_frame[3, :3] = turn, -place @ turn
+        covariance = to_frame @ plane.covariance @ to_frame.T
+        error = np.abs(other.covariance - covariance).max()
+        assert error < 0.1 * np.abs(covariance).max()
+        np.testing.assert_allclose(turn @ plane.centroid + place, other.centroid, atol=0.02)
+        np.testing.assert_allclose(turn @ plane.centre + place, other.centre, atol=0.05)
         np.testing.assert_allclose(plane.extents, other.extents, atol=0.05)
         assert np.abs(other.hull @ other.normal + other.distance).max() < 1e-5
-        for low, high in zip((plane.hull @ turn.T).min(0), other.hull.min(0), strict=True):
-            assert low == pytest.approx(high, abs=0.05)
+        lowest = (plane.hull @ turn.T + place).min(axis=0)
+        np.testing.assert_allclose(lowest, other.hull.min(axis=0), atol=0.05)
         axis = rotation_matrix(other.orientation)[:, 0]
         assert axis @ turn[:, 0] >= -1e-6  # to the right of the image
     assert expected.ground.stand.surface and str(result.ground) == str(expected.ground)
@@ -77,7 +101,10 @@ def test_a_room_is_segmented_as_its_depth_image(turn, method):
     for find in (drops, lambda *seen: np.concatenate(outlines(*seen))):
         here, there = find(image, expected.ground)[:, :3], find(cloud, result.ground)[:, :3]
         assert len(here) == pytest.approx(len(there), rel=0.02)
-        np.testing.assert_allclose((here @ turn.T).mean(0), there.mean(0), atol=0.02)
+        np.testing.assert_allclose((here @ turn.T + place).mean(0), there.mean(0), atol=0.02)
+    ground = OUTPUTS['ground'].message(make_rosbags, header(), cloud, result)
+    points = np.frombuffer(ground.data, '<f4').reshape(-1, 3)
+    np.testing.assert_allclose(points, cloud.points[result.terrain == GROUND], atol=1e-6)
     normals = expected.normals @ turn.T.astype(np.float32)
     both = np.isfinite(normals + result.normals).all(axis=2)
     assert (np.abs(normals - result.normals)[both].max(axis=1) < 0.01).mean() > 0.98
@@ -136,3 +163,101 @@ def test_the_distortion_is_along_the_axis_that_the_cloud_looks_along(form):
     first, second = (distortion.corrected(image) for image in images)
     np.testing.assert_allclose(first.inverse, second.inverse, rtol=1e-5)
     assert np.abs(first.inverse - images[0].inverse).max() > 0.01
+
+
+@pytest.mark.parametrize('size', [(32, 24), (160, 120), (1280, 720)])
+@pytest.mark.parametrize('scale', [1, 3])
+def test_where_the_camera_is(size, scale):
+    width, height = size
+    camera = Camera(width, height, 0.9 * width, 0.91 * width, width / 2 - 0.3, height / 2 + 0.4)
+    points = scale * room(7, camera)[0].points
+    points[np.random.default_rng(1).random(points.shape[:2]) < 0.3] = np.nan
+    found = cloud_in(BASE, points).camera
+    np.testing.assert_allclose(found.place, BASE.shift, atol=1e-5)
+    np.testing.assert_allclose(found.axes, BASE.rotation, atol=1e-5)
+    np.testing.assert_allclose(found.matrix, camera.matrix, atol=0.002)
+    # Frames share a camera, and so its rays.
+    assert cloud_in(BASE, 1.01 * points).camera is found
+
+
+def no_cameras():
+    """Clouds that no pinhole camera has taken, or that do not tell where it was."""
+    rays = CAMERA.rays.astype(float)
+    wall = -2 * rays / (rays @ (0.3, 0.5, -0.8))[..., None]
+    v, u = np.indices(CAMERA.shape)
+    bent = 1 + 0.05 * (rays[..., :2] ** 2).sum(axis=2, keepdims=True)
+    points = room()[0].points
+    return {
+        'wall': wall,
+        'parallel rays': np.stack([u * 0.01, v * 0.01, 2 + 0.3 * np.sin(u / 50)], axis=2),
+        'lens': points * np.concatenate([bent, bent, np.ones_like(bent)], axis=2),
+        'scanner': scanned(CAMERA) * np.linalg.norm(points, axis=2)[..., None],
+        'nothing': np.full_like(points, np.nan),
+        'one point': np.where((u == 9)[..., None], (1.0, 2, 3), np.nan),
+    }
+
+
+@pytest.mark.parametrize('points', no_cameras().values(), ids=no_cameras())
+def test_no_place_is_made_up(points):
+    image = cloud_in(BASE, points)
+    assert image.camera is None and not image.place.any()
+    known, moved = np.isfinite(points).all(axis=2), points @ BASE.rotation.T + BASE.shift
+    np.testing.assert_allclose(image.points[known], moved[known], rtol=1e-5)
+
+
+@pytest.mark.parametrize('budget', [0.9, 0.5])
+def test_less_work_does_as_well_wherever_the_camera_is(budget):
+    points = room()[0].points
+    clouds = (cloud_in((BASE.rotation, place), points) for place in (ORIGIN, BASE.shift))
+    config = Config(work_budget=budget, **stated((0, 0, 1)))
+    level, moved = (Segmenter(config).segment(cloud).labels for cloud in clouds)
+    assert level.any() and (level == moved).mean() > 0.999
+
+
+def test_walls_without_noise_tell_no_place():
+    # The fewer the pixels, the more cameras there are that are off by less than is let pass.
+    camera = Camera(32, 24, 29.0, 29.1, 15.8, 12.1)
+    random, rays = np.random.default_rng(3), camera.rays.astype(float)
+    for _ in range(100):
+        normal = random.normal(size=3) * (0.5, 0.5, 0.2) - (0, 0, 1)
+        depth = -2 / (rays @ normal)
+        points = np.where(depth > 0, depth, np.nan)[..., None] * rays
+        frame = rotation_by(random.normal(size=3)), random.normal(size=3)
+        assert not cloud_in(frame, points).place.any()
+
+
+def test_a_sequence_is_followed_as_that_of_the_depth_images():
+    config = Config(odometry=True, **stated((0, 0, 1)))
+    seen, moved = SequenceSegmenter(config), SequenceSegmenter(config)
+    told, mapped = (SequenceSegmenter(Config(fixed_frame='map')) for _ in range(2))
+    for k in range(3):
+        image, pose = room(frame=4 * k)
+        # The same axes, so that all but the place is the same.
+        level = Transform(BASE.rotation, ORIGIN)
+        clouds = cloud_in(level, image.points), cloud_in(BASE, image.points)
+        assert clouds[1].place.any()
+        stamp = 10**9 + 4 * k * 10**9 // 30
+        one, other = seen.segment(clouds[0], stamp), moved.segment(clouds[1], stamp)
+        names = [[(p.id, p.surface, p.role) for p in result.planes] for result in (one, other)]
+        assert names[0] == names[1] and any(name[2] == 'floor' for name in names[0])
+        # Poses of the frames of the clouds: their origin is where the camera is, or before it.
+        origin = moved.pose.rotation @ BASE.shift
+        np.testing.assert_allclose(moved.pose.shift + origin, seen.pose.shift, atol=1e-3)
+        np.testing.assert_allclose(moved.pose.rotation, seen.pose.rotation, atol=1e-3)
+        speed = np.cross(moved.motion.velocity[3:], BASE.shift) + moved.motion.velocity[:3]
+        np.testing.assert_allclose(speed, seen.motion.velocity[:3], atol=1e-3)
+        for name, lever in (('covariance', origin), ('velocity_covariance', BASE.shift)):
+            # The camera is where the origin is and goes, and what the lever adds to that.
+            change = np.eye(6)
+            change[:3, 3:] = np.cross(lever, np.eye(3))
+            error = change @ getattr(moved.motion, name) @ change.T - getattr(seen.motion, name)
+            assert np.abs(error).max() <= 1e-2 * np.abs(getattr(seen.motion, name)).max()
+        poses = [pose.after(frame.inverse()) for frame in (level, BASE)]
+        told.segment(clouds[0], stamp, poses[0].rotation[2], poses[0], poses[0].shift[2])
+        found = mapped.segment(clouds[1], stamp, poses[1].rotation[2], poses[1], poses[1].shift[2])
+        np.testing.assert_allclose(mapped.pose.shift, poses[1].shift, atol=1e-9)
+        assert found.survey.sensor_height == pytest.approx(pose.shift[2], abs=1e-5)
+    assert len(told.map) == len(mapped.map) > 3
+    for one, other in zip(told.map.planes, mapped.map.planes, strict=True):
+        np.testing.assert_allclose(one.normal, other.normal, atol=1e-3)
+        np.testing.assert_allclose(one.centroid, other.centroid, atol=0.02)

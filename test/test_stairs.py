@@ -74,6 +74,21 @@ def test_edge_count_rise_and_run(direction, tmp_path):
     assert float(row['edge_x1']) == pytest.approx(stairs.edge[0, 0], abs=1e-6)
 
 
+def test_the_edge_is_in_the_frame_of_a_cloud():
+    floor = Piece(FLOOR, GROUND)
+    terrain, image, result = seen(floor, *treads(1.9, 3, 0.17, 0.28, OBSTACLE, (-0.5, 0.6)))
+    turn, place = Rotation.from_rotvec((1.3, -0.7, 2.1)).as_matrix(), np.array([0.3, 0.2, 0.8])
+    cloud = RangeImage.from_points((image.points @ turn.T + place).astype(np.float32))
+    config = Config(**up_of(turn @ terrain.up), sensor_height=1.5)
+    (expected,), (stairs,) = result.stairs, Segmenter(config).segment(cloud).stairs
+    ends = expected.edge @ turn.T + place
+    # Which end is the first one depends on the axes.
+    assert min(np.abs(stairs.edge - order).max() for order in (ends, ends[::-1])) < 0.02
+    # What is remembered of a result is told alike.
+    again = pickle.loads(pickle.dumps(Segmenter(config).segment(cloud))).stairs[0]
+    np.testing.assert_array_equal(again.edge, stairs.edge)
+
+
 def test_boxes_side_by_side_a_table_and_one_step_are_no_stairs():
     boxes = [
         Piece(box((0.3, 0.3, h), np.eye(3), (1.6 + 0.1 * k, 0.4 * k - 0.4, h / 2)), OBSTACLE, h)

@@ -202,7 +202,7 @@ class ResidualsOfFrame:
             along = np.where(version.valid, version.along, 1)
             for plane in result.planes:
                 mask = result.labels == plane.label
-                theta = -plane.normal / plane.distance
+                theta = -plane.normal / (plane.distance + plane.normal @ version.place)
                 error = version.inverse[mask] - version.rays[mask] @ theta
                 residual[mask] = error / along[mask]
             pictures.append(residual)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -127,7 +127,8 @@ class Segmentation:
         """Staircases in sight, up and down, worked out when read."""
         if not isinstance(self.survey, Survey) or self.ground is None:
             return []
-        return stairs_of(self.ground)
+        place = self.survey.image.place
+        return [replace(seen, edge=seen.edge + place) for seen in stairs_of(self.ground)]
 
     @property
     def up(self) -> NDArray[np.float64] | None:

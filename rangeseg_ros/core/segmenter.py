@@ -183,7 +183,7 @@ def _told_for_all(coarse: Segmentation, step: int, image: RangeImage) -> Segment
     """What was found in `image.every(step)`, for all pixels that it stands for."""
     theta = np.zeros((1 + max((plane.label for plane in coarse.planes), default=0), 3))
     for plane in coarse.planes:
-        theta[plane.label] = -plane.normal / plane.distance
+        theta[plane.label] = -plane.normal / (plane.distance + plane.normal @ image.place)
     sensor = coarse.sensor
     labels, counts = labels_of_all(coarse.labels, step, image.inverse, image.rays, theta, sensor)
     sensor = sensor._replace(

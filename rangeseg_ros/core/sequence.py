@@ -12,6 +12,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
+from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.meaning.memory import GroundMemory
@@ -92,7 +93,8 @@ class SequenceSegmenter:
         pose : Transform, optional
             Fixed frame from the frame of the image: the planes then count for `map`.
         height : float, optional
-            Of the sensor above the ground, metres, where the parameter `sensor_height` is 0.
+            Of the origin of the frame of the image above the ground, metres, where the parameter
+            `sensor_height` is 0.
         """
         if stamp < self._stamp:
             self._segmenter.reset()
@@ -116,29 +118,40 @@ class SequenceSegmenter:
             self.map.clear('time has gone back')
             self._ground.forget()
             self._pose = None
+        # Errors and what is in sight follow from where the sensor is: all is seen from there.
+        sensor = Transform(np.eye(3), image.place)
+        planes = result.planes
+        if image.place.any():
+            planes = moved_planes(planes, sensor.inverse())
+        pose = pose.after(sensor) if pose else None
         motion = pose.inverse().after(self._pose) if pose and self._pose else None
         self._stamp, self._pose = stamp, pose
-        planes = self._tracker.track(result.labels, result.planes, stamp, motion)
+        planes = self._tracker.track(result.labels, planes, stamp, motion)
         up = result.up if up is None else unit(up)
         planes = with_roles(planes, self.config, up)
         if self._tracker.contradicted:
             # The fixed frame has jumped: the map would have everything twice.
             self.map.clear('the fixed frame has jumped')
         if self.config.odometry:
-            self._follow(result.labels, planes, stamp, up, image.axes)
+            self._follow(result.labels, planes, stamp, up, image)
             if not self.config.fixed_frame and self.motion:
-                pose = self.motion.pose
-        self.pose = pose
+                pose = self.motion.pose.after(sensor)
+        self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=up)
-        if height and height > 0 and isinstance(survey, Survey) and not survey.sensor_height:
-            survey = replace(survey, sensor_height=height)
         if isinstance(survey, Survey):
+            height = 0.0 if height is None else float(height + survey.up @ image.place)
+            if height > 0 and not survey.sensor_height:
+                survey = replace(survey, sensor_height=height)
             survey = replace(survey, memory=self._ground, stamp=stamp)
-        return replace(result, planes=planes, survey=survey)
+        known = [
+            replace(plane, id=seen.id, surface=seen.surface, role=seen.role)
+            for plane, seen in zip(result.planes, planes, strict=True)
+        ]
+        return replace(result, planes=known, survey=survey)
 
     def _follow(
         self,
@@ -146,13 +159,14 @@ class SequenceSegmenter:
         planes: list[Plane],
         stamp: int,
         up: NDArray[np.float64] | None,
-        axes: NDArray[np.float64],
+        image: RangeImage,
     ) -> None:
         """Find where the camera is now."""
         config = self.config
         towards = (config.up_x, config.up_y, config.up_z) if up is None else up
         seen = views(labels, planes, config.distortion_length)
-        self.motion = self._odometry.add(planes, seen, stamp, unit(towards), axes)
+        motion = self._odometry.add(planes, seen, stamp, unit(towards), image.axes)
+        self.motion = motion.of_origin(image.place)
         if not self.motion.held and len(self.map) and not config.fixed_frame:
             self.map.clear('no plane held the camera')
 

@@ -119,6 +119,7 @@ def _points(image: RangeImage, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
     # Of these pixels only, which is faster than RangeImage.points, and by number than by mask.
     points = np.take(image.rays.reshape(-1, 3), pixels, axis=0)
     points /= np.take(image.inverse, pixels)[:, None]
+    points += image.place
     return points
 
 

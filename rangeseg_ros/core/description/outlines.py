@@ -99,7 +99,7 @@ class Outline:
         rays = self._rays(corners)
         ahead = self._ahead(rays)
         points: NDArray[np.float64] = rays[ahead] / (rays[ahead] @ self.theta)[:, None]
-        return points
+        return points + self.rays.place if isinstance(self.rays, Camera) else points
 
     def _ahead(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Where rays (N, 3) meet the plane: grazing planes end in the distance."""

@@ -40,7 +40,7 @@ class Plane:
     normal : (3,) float64
         Unit normal towards the sensor.
     distance : float
-        Distance of the origin from the plane, metres, positive for a sensor at the origin.
+        normal . p + distance = 0, metres: positive where the origin is on the sensor's side.
     covariance : (4, 4) float64
         Covariance of (normal, distance), of rank 3, from the errors of the sensor model.
     centroid : (3,) float64
@@ -140,6 +140,12 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         return []
     surfaces = submit(common_surfaces, fits)
     normal, distance, covariance, centroid, rms, confidence = _described(fits)
+    if image.place.any():
+        # They are seen from the sensor, and told in the frame of the points.
+        told = np.eye(4)
+        told[3, :3] = -image.place
+        distance, covariance = distance - normal @ image.place, told @ covariance @ told.T
+        centroid = centroid + image.place
 
     shapes = Shapes(labels, image, theta, fits.inner)
     boxes = fits.boxes()

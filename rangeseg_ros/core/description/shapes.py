@@ -111,6 +111,7 @@ def _measure(
     limits[~finite], area[~finite] = 0, 0
     extents = limits[..., 1] - limits[..., 0]
     centre = np.einsum('ka,kai->ki', limits.mean(axis=2), axes) - distance[:, None] * normal
+    centre += image.place
     frames = np.stack([axes[:, 0], axes[:, 1], normal], axis=2)
     frames[slope == 0] = np.eye(3)
     return list(map(Shape, area.tolist(), extents, centre, quaternions(frames))), finite

@@ -38,7 +38,7 @@ from rangeseg_ros.core.mapping.observations import (
     observations,
     persistence,
 )
-from rangeseg_ros.core.mapping.plane_errors import shifted, tangents, to_errors
+from rangeseg_ros.core.mapping.plane_errors import cross_matrices, shifted, tangents, to_errors
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
@@ -80,6 +80,19 @@ class Motion(NamedTuple):
     velocity: NDArray[np.float64]
     velocity_covariance: NDArray[np.float64]
     held: int
+
+    def of_origin(self, place: NDArray[np.float64]) -> Motion:
+        """The motion of a camera at `place` (3,), as that of the origin of its frame."""
+        turn, shift = self.pose
+        # What turns the camera by w moves the origin by w x -place against it.
+        moved, own = np.eye(6), np.eye(6)
+        moved[:3, 3:], own[:3, 3:] = cross_matrices(np.stack([turn @ place, place]))
+        return self._replace(
+            pose=Transform(turn, shift - turn @ place),
+            covariance=moved @ self.covariance @ moved.T,
+            velocity=own @ self.velocity,
+            velocity_covariance=own @ self.velocity_covariance @ own.T,
+        )
 
 
 class PlaneOdometry:

@@ -32,7 +32,7 @@ class Placement:
     up : (3,) float64 or None
         In the frame of the image; None for the parameters.
     height : float or None
-        Of the camera above z = 0 of `gravity_frame`, metres.
+        Of the origin of the frame of the image above z = 0 of `gravity_frame`, metres.
     sources : dict of str
         What 'up', 'fixed frame' and 'target frame' come from, or why they are not known.
     missing : dict of str

@@ -43,7 +43,9 @@ def find_crossings(
         x, y, z in the frame of the image, metres, and the height of what was measured along the
         ray, NaN where nothing was.
     """
-    return _cross(image.rays, where, terrain.height, terrain.field, bounds)
+    found = _cross(image.rays, where, terrain.height, terrain.field, bounds)
+    found[:, :3] += image.place
+    return found
 
 
 def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
@@ -85,6 +87,7 @@ def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
         line = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0]
         if len(line) > 2:  # holes of single pixels have no outline
             lines.append(_cross_at(image.rays, line, terrain.field))
+            lines[-1] += image.place
     return lines
 
 

@@ -52,12 +52,14 @@ class Camera:
         Coefficients of the model, as in CameraInfo.
     turn : tuple of 4 float
         Frame of the rays from the optical one, a unit quaternion x, y, z, w.
+    place : tuple of 3 float
+        Of the camera in the frame of its points, whose axes are those of the rays, metres.
 
     Raises
     ------
     CameraError
         Empty image, non-finite intrinsics, a focal length that is not positive, pixels that look
-        across the optical axis, an unknown lens, or a turn of another length.
+        across the optical axis, an unknown lens, a turn of another length, or no place.
     """
 
     width: int
@@ -70,6 +72,7 @@ class Camera:
     distortion_model: str = ''
     d: tuple[float, ...] = ()
     turn: tuple[float, ...] = OPTICAL
+    place: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {
@@ -86,6 +89,9 @@ class Camera:
         checked['turn'] = tuple(_finite('turn', part) for part in self.turn)
         if len(self.turn) != 4 or abs(sum(q * q for q in checked['turn']) - 1) > _UNIT:
             raise CameraError(f'turn must be a unit quaternion x, y, z, w, not {self.turn!r}')
+        checked['place'] = tuple(_finite('place', part) for part in self.place)
+        if len(self.place) != 3:
+            raise CameraError(f'place must be x, y, z, not {self.place!r}')
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         for name in ('fx', 'fy'):

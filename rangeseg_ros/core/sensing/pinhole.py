@@ -1,4 +1,4 @@
-"""The camera of an organised cloud, where its points show one, and which way its frame looks."""
+"""The camera of an organised cloud, where its points show one, and where it is in their frame."""
 
 from __future__ import annotations
 
@@ -16,8 +16,14 @@ from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, CameraError
 _STEP = 2.0**-10
 # The same of quaternions: 0.001 pixels in the middle of an image of 1000.
 _TURN = 2.0**-20
+# The same of places, metres: 0.001 pixels of a focal length of 1000, a metre away.
+_PLACE = 2.0**-20
+_ORIGIN = (0.0, 0.0, 0.0)
 # Largest error of the camera, pixels: less than any sensor's.
 _CLOSE = 0.01
+# Largest standard deviation of a camera's place over its distance from what it sees: half a degree
+# of the rays. Rounding leaves 1e-5 of what has any depth, and 1 of a plane or of parallel rays.
+_PLACED = 0.01
 # Rows and columns that tell the camera, about.
 _TELLING = 64
 
@@ -31,7 +37,8 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
     Parameters
     ----------
     points : (H, W, 3) float
-        In a frame of any axes with the camera at its origin, metres.
+        In a frame of any axes, metres. The camera is at its origin where points tell no other
+        place, as those of a single plane.
     valid : (H, W) bool
         Which of them were measured.
 
@@ -47,27 +54,28 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
     v, u = np.nonzero(valid[::down, ::across])
     told = points[::down, ::across][v, u].astype(np.float64)
     u, v = u * across, v * down
-    for turn in _turns(told, u, v, valid.shape):
+    for turn, place in _frames(told, u, v, valid.shape):
         axes = rotation_matrix(turn)
-        x, y, z = (told @ axes).T
+        x, y, z = ((told - place) @ axes).T
         if not (z > 0).all():
             continue
         columns, rows = _line(u, x / z, width), _line(v, y / z, height)
         if columns is None or rows is None:
             continue
         lens = columns[0], rows[0], columns[1], rows[1]
-        camera = _camera(width, height, *lens, turn=turn)
+        camera = _camera(width, height, lens, turn, place)
         if camera is not None and _on_rays(points, valid, camera):
             return camera
     return None
 
 
 def depth_of(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floating]:
-    """(H, W) along the optical axis, of points (H, W, 3) in the frame of the camera's rays."""
-    if camera.turn == OPTICAL:
+    """(H, W) along the optical axis, of points (H, W, 3) in the frame that the camera is in."""
+    if camera.turn == OPTICAL and camera.place == _ORIGIN:
         return points[..., 2]
+    forward = camera.axes[:, 2]
     with np.errstate(invalid='ignore', over='ignore'):
-        depth: NDArray[np.floating] = points @ camera.axes[:, 2]
+        depth: NDArray[np.floating] = points @ forward - forward @ camera.place
     return depth
 
 
@@ -102,37 +110,80 @@ def _nearest_axis(
     return np.eye(3)[k] * (-1.0 if vector[k] < 0 else 1.0)
 
 
-def _turns(
+def _frames(
     points: NDArray[np.float64],
     u: NDArray[np.intp],
     v: NDArray[np.intp],
     shape: tuple[int, int],
-) -> Iterator[tuple[float, ...]]:
-    """The frames that points (N, 3) of pixels may be in: optical, or the one that they show.
+) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Turns and places of cameras that points (N, 3) of pixels may be from.
 
-    Rays are a homography of the pixels then, whose part that is a rotation is that of the frame
-    (direct linear transform: R. Hartley, A. Zisserman, Multiple View Geometry, 4.1).
+    First those at the origin: optical, then the one whose rays are a homography of the pixels.
+    Last, one that is elsewhere: its 3 x 4 matrix takes points to pixels (R. Hartley, A. Zisserman,
+    Multiple View Geometry, 4.1, 6.2 and 7.1). The part of either that is a rotation is the turn.
     """
-    yield OPTICAL
+    yield OPTICAL, _ORIGIN
     if not len(points):
         return
     middle, unit = (np.array(shape[::-1]) - 1) / 2, max(shape) / 2
-    place = np.stack([(u - middle[0]) / unit, (v - middle[1]) / unit, np.ones(len(u))], axis=1)
+    pixel = np.stack([(u - middle[0]) / unit, (v - middle[1]) / unit, np.ones(len(u))], axis=1)
+    size = np.abs(points).max()
     ray = points / np.abs(points).max(axis=1, keepdims=True)  # whose squares are finite
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    # What of a ray's homography lies across it is 0.
-    across = np.eye(3) - ray[:, :, None] * ray[:, None, :]
-    squares = place[:, :, None] * place[:, None, :]
-    equations = np.einsum('nab,nij->aibj', across, squares, optimize=True).reshape(9, 9)
-    found = np.linalg.eigh(equations)[1][:, 0].reshape(3, 3)
-    if np.einsum('na,ai,ni->', ray, found, place) < 0:
-        found = -found
-    axes, lens = np.linalg.qr(found)
+    _, found = _maps(pixel, ray)
+    turn = _turn(found[0])
+    if turn:
+        yield turn, _ORIGIN
+    # About their middle and of size 1, for the sake of rounding.
+    scaled = points / size
+    mean = scaled.mean(axis=0)
+    scaled -= mean
+    spread = np.abs(scaled).max()
+    if spread == 0:
+        return
+    scaled = np.append(scaled / spread, np.ones((len(points), 1)), axis=1)
+    pixel /= np.linalg.norm(pixel, axis=1, keepdims=True)
+    squares, found = _maps(scaled, pixel)
+    back = np.linalg.pinv(found[0, :, :3])
+    at = np.append(-back @ found[0, :, 3], 1)
+    # How much each of the other matrices moves the camera, by how little it is worse.
+    moves = np.linalg.norm(found[1:] @ at @ back.T, axis=1)
+    noise = np.maximum(squares, np.finfo(float).eps * squares[-1])
+    variance = noise[0] / (2 * len(points)) * (moves**2 / noise[1:]).sum()
+    turn = _turn(back)
+    if turn and variance <= _PLACED**2 * (at[:3] @ at[:3]):
+        place = (at[:3] * spread + mean) * size
+        yield turn, tuple((np.rint(place / _PLACE) * _PLACE).tolist())
+
+
+def _maps(
+    start: NDArray[np.float64], end: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Matrices (3 K, 3, K) that take vectors (N, K) along unit vectors (N, 3), best ones first.
+
+    With the sums (3 K,) of squares of what of the result is across these. The first leads to the
+    side that they point to.
+    """
+    across = np.eye(3) - end[:, :, None] * end[:, None, :]
+    squares = start[:, :, None] * start[:, None, :]
+    width = 3 * start.shape[1]
+    equations = np.einsum('nab,nij->aibj', across, squares, optimize=True).reshape(width, width)
+    values, vectors = np.linalg.eigh(equations)
+    found = vectors.T.reshape(width, 3, -1)
+    if np.einsum('na,ai,ni->', end, found[0], start) < 0:
+        found[0] = -found[0]
+    return values, found
+
+
+def _turn(rays: NDArray[np.floating]) -> tuple[float, ...] | None:
+    """The rotation in a matrix (3, 3) that takes pixels to rays; None for a mirror image."""
+    axes, lens = np.linalg.qr(rays)
     axes = axes * np.where(np.diag(lens) < 0, -1.0, 1.0)
-    if np.linalg.det(axes) > 0:
-        turn = np.rint(quaternions(axes) / _TURN)
-        turn *= np.sign(turn[turn != 0][-1]) / np.linalg.norm(turn)  # of half a turn, one of two
-        yield tuple(turn.tolist())
+    if np.linalg.det(axes) <= 0:
+        return None
+    turn = np.rint(quaternions(axes) / _TURN)
+    turn *= np.sign(turn[turn != 0][-1]) / np.linalg.norm(turn)  # of half a turn, one of two
+    return tuple(turn.tolist())
 
 
 def _line(
@@ -153,15 +204,13 @@ def _line(
 def _camera(
     width: int,
     height: int,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    lens: tuple[float, float, float, float],
     turn: tuple[float, ...],
+    place: tuple[float, ...],
 ) -> Camera | None:
     """One for all frames, as its rays are worked out once."""
     try:
-        return Camera(width, height, fx, fy, cx, cy, turn=turn)
+        return Camera(width, height, *lens, turn=turn, place=place)
     except CameraError:
         return None
 
@@ -172,7 +221,7 @@ def _on_rays(points: NDArray[np.floating], valid: NDArray[np.bool_], camera: Cam
     with np.errstate(invalid='ignore', over='ignore'):
         allowed = _CLOSE / max(camera.fx, camera.fy) * depth
         for axis in range(2 if camera.turn == OPTICAL else 3):
-            error = np.abs(points[..., axis] - depth * camera.rays[..., axis])
+            error = np.abs(points[..., axis] - camera.place[axis] - depth * camera.rays[..., axis])
             if (valid & ~(error <= allowed)).any():
                 return False
     return True

@@ -30,11 +30,11 @@ NOT_MEASURED = 65535
 
 @dataclass(frozen=True, eq=False)
 class RangeImage:
-    """Measurements along pixel rays: point = ray / inverse.
+    """Measurements along pixel rays: point = place + ray / inverse.
 
-    A plane n . p + d = 0 is linear in this form: (-n/d) . ray = inverse, which holds for the
-    pinhole camera (rays scaled to z = 1, inverse = 1/z) as for any cloud (unit rays,
-    inverse = 1/range).
+    Seen from that place, a plane n . p + d = 0 is linear in this form: (-n/d) . ray = inverse,
+    which holds for the pinhole camera (rays scaled to z = 1, inverse = 1/z) as for any cloud (unit
+    rays, inverse = 1/range).
 
     Attributes
     ----------
@@ -120,9 +120,9 @@ class RangeImage:
         Parameters
         ----------
         points : (H, W, 3) float
-            Points in metres, the sensor at the origin of a frame of any axes; any coordinate that
-            is not finite or hidden by the mask of a masked array, or a point at the origin, is
-            invalid.
+            Points in metres, in a frame of any axes, with the sensor at its origin unless it is a
+            pinhole camera; any coordinate that is not finite or hidden by the mask of a masked
+            array, or a point at the origin, is invalid.
 
         Raises
         ------
@@ -234,6 +234,11 @@ class RangeImage:
         return axes_of_frame(self.rays, self.valid)
 
     @property
+    def place(self) -> NDArray[np.float64]:
+        """(3,) where the sensor is in the frame of the points, metres."""
+        return np.array(self.camera.place if self.camera is not None else (0.0, 0.0, 0.0))
+
+    @property
     def level_up(self) -> NDArray[np.float64]:
         """(3,) up in the frame of the image where that is level.
 
@@ -260,6 +265,7 @@ class RangeImage:
         """(H, W, 3) points in metres, NaN where nothing was measured."""
         with np.errstate(divide='ignore', invalid='ignore'):
             points = self.rays / self.inverse[..., None]
+        points += self.place
         points[~self.valid] = np.nan
         return points
 
