@@ -4,16 +4,18 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.range_image import RangeImage, UnitWarning
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import overlap_figures
@@ -188,7 +190,9 @@ def test_absurd_depths_disturb_nothing(value, where):
     depth = frame.depth.copy()
     part = (slice(30, 60), slice(40, 90)) if where == 'part' else ...
     depth[part] = value
-    result = segmented(depth, frame.camera)
+    doubted = where == 'all' and value == 1e6
+    with pytest.warns(UnitWarning) if doubted else nullcontext():
+        result = segmented(depth, frame.camera)
     assert np.isfinite(result.energy)
     for plane in result.planes:
         assert np.isfinite([*plane.normal, plane.distance]).all()
@@ -236,3 +240,35 @@ def test_faces_of_twenty_pixels_are_planes_of_their_own():
 
 if __name__ == '__main__':
     print(json.dumps(small_fingerprint()))
+
+
+@pytest.mark.parametrize(
+    ('size', 'options', 'coarsely'),
+    [
+        ((640, 480), {'noise_correlation': 2.0, 'white_noise': 0.1}, True),
+        ((641, 483), {'noise_correlation': 2.0, 'white_noise': 0.1}, True),
+        ((1280, 720), {'noise_correlation': 2.0, 'white_noise': 0.1}, True),
+        ((640, 480), {'noise_correlation': 0.0}, False),
+        ((320, 240), {'noise_correlation': 2.0, 'white_noise': 0.1}, False),
+        ((640, 480), {'noise_correlation': 2.0, 'white_noise': 0.1, 'refits': 1}, False),
+    ],
+)
+def test_labels_of_every_second_pixel_do_where_neighbours_repeat_each_other(
+    size, options, coarsely, monkeypatch
+):
+    called = []
+
+    def refine_coarsely(*arguments):
+        called.append(arguments)
+        return real(*arguments)
+
+    real = by_planes.refine_coarsely
+    monkeypatch.setattr(by_planes, 'refine_coarsely', refine_coarsely)
+    camera = kinect_camera(*size)
+    depth = np.full(camera.shape, 1500, np.uint16)
+    depth[:, : size[0] // 3] = 1200
+    result = segmented(depth, camera, sensor_model='fixed', **options)
+    assert bool(called) == coarsely
+    assert len(result.planes) == 2
+    assert (result.labels == result.labels[:1]).all()
+    assert (np.diff(result.labels[0].astype(int)) != 0).nonzero()[0].tolist() == [size[0] // 3 - 1]

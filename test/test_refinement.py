@@ -9,7 +9,8 @@ import pytest
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.descent import descend, nearest
-from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.labelling import refine, refine_coarsely
+from rangeseg_ros.core.by_planes.method import every_second
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
@@ -238,6 +239,36 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
         changed = np.repeat(labels.reshape(1, -1), len(pixels), axis=0)
         changed[np.arange(len(pixels)), pixels] = label
         assert energies(changed.reshape(-1, *labels.shape), problem, models).min() > value - 1e-4
+
+
+@pytest.mark.parametrize('seed', range(4))
+def test_costs_that_are_not_known_are_asked_for(seed):
+    problem, models, labels = random_case(seed, 20, 24, 4)
+    labels = labels.ravel()
+    known, unknown = labels.copy(), labels.copy()
+    descend((0, 20), known, costs(labels, problem, models), problem, models)
+    descend((0, 20), unknown, np.full(labels.size, -1, np.float32), problem, models)
+    assert (known == unknown).all() and (known != labels).any()
+
+
+@pytest.mark.parametrize('seed', [900, 901, 903])
+def test_every_second_pixel_tells_nearly_as_much_as_all(seed):
+    frame = simulate_kinect(kinect_room(seed), kinect_camera(321, 241), seed=seed)
+    image = RangeImage.from_depth(frame.depth, frame.camera)
+    sensor = SensorModel.from_config(Config(), image.shape)
+    grid = weights(image)
+    nodes = Nodes.of(image.inverse, grid, Blocks.of(image), sensor, BLOCK)
+    found = join_surfaces(Patches.of(nodes, BLOCK, sensor), nodes, BLOCK, sensor, LAMBDA)
+    problem = Problem.of(image, sensor, grid, BLOCK, LAMBDA)
+    coarse = every_second(image, sensor, grid, BLOCK, LAMBDA)
+    found = found[0], nodes.moments, found[1], sensor
+    all_labels, models = refine(problem, *found)
+    labels, same = refine_coarsely(problem, coarse, *found, 1.0)
+    np.testing.assert_array_equal(models.theta, same.theta)
+    np.testing.assert_array_equal(models.half_precision, same.half_precision)
+    assert not labels[problem.weight == 0].any()
+    assert (labels == all_labels).mean() > 0.99
+    assert energy(labels, problem, models) < 1.01 * energy(all_labels, problem, models)
 
 
 def small_room(seed=900):

@@ -186,13 +186,7 @@ def _told_for_all(coarse: Segmentation, step: int, image: RangeImage) -> Segment
         theta[plane.label] = -plane.normal / (plane.distance + plane.normal @ image.place)
     sensor = coarse.sensor
     labels, counts = labels_of_all(coarse.labels, step, image.inverse, image.rays, theta, sensor)
-    sensor = sensor._replace(
-        correlation=step * sensor.correlation,
-        distortion_length=step * sensor.distortion_length,
-        shown_length=step * sensor.shown_length,
-        column_noise=step * sensor.column_noise,
-        row_noise=step * sensor.row_noise,
-    )
+    sensor = sensor.magnified(step)
     survey = coarse.survey
     if isinstance(survey, Survey):
         survey = replace(survey, image=image, sensor=sensor)
