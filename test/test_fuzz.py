@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.sensing.range_image import UnitWarning
 
 BAD = [0, -1, np.nan, np.inf, -np.inf, 1e30, 1e-30, 65.535]
 
@@ -51,6 +52,7 @@ def test_invariants(method, data):
     before = depth.tobytes()
     with warnings.catch_warnings():
         warnings.simplefilter('error')
+        warnings.simplefilter('ignore', UnitWarning)
         image = RangeImage.from_depth(depth, camera)
         result = Segmenter(config).segment(image)
         hulls = [plane.hull for plane in result.planes]
@@ -72,7 +74,8 @@ def test_invariants(method, data):
 
 def test_a_steep_ramp_without_an_end_is_no_plane():
     depth = np.tile((0.3 + np.arange(160)).astype(np.float32), (120, 1))
-    image = RangeImage.from_depth(depth, Camera(160, 120, 300, 300, 79.5, 59.5))
+    with pytest.warns(UnitWarning):
+        image = RangeImage.from_depth(depth, Camera(160, 120, 300, 300, 79.5, 59.5))
     result = Segmenter(Config(method='normals')).segment(image)
     assert all(np.isfinite(plane.extents).all() for plane in result.planes)
     assert set(np.unique(result.labels)) - {0} == {plane.label for plane in result.planes}

@@ -21,6 +21,8 @@ LOST = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
             except KeyboardInterrupt: pass"""
 WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
             except KeyboardInterrupt as error: raise SystemError('in a kernel') from error"""
+MISTAKEN = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
+            except KeyboardInterrupt: raise ValueError('not a bag')"""
 IN_A_CALLBACK = """ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()"""
 NONE = "raise SystemError('without a reason')"
 
@@ -33,7 +35,9 @@ def run(body):
 
 
 @pytest.mark.parametrize(
-    'body', [LOST, WRAPPED, IN_A_CALLBACK], ids=['lost', 'wrapped', 'in a callback']
+    'body',
+    [LOST, WRAPPED, MISTAKEN, IN_A_CALLBACK],
+    ids=['lost', 'wrapped', 'mistaken', 'in a callback'],
 )
 @pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143), ('SIGHUP', 129)])
 def test_a_signal_ends_the_command(body, name, code):

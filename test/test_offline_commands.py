@@ -306,7 +306,7 @@ def test_an_interrupted_replay_leaves_whole_files(folder):
         _, error = replay.communicate(timeout=60)
     finally:
         replay.kill()
-    assert replay.returncode == 130
+    assert replay.returncode == 130, error
     assert b'Traceback' not in error
     labels = sorted(folder.glob('out/[0-9]*_labels.png'))
     assert 3 <= len(labels) < 1000

@@ -6,7 +6,7 @@ import os
 import sys
 import warnings
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
@@ -58,6 +58,14 @@ def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
     print(f'rangeseg: warning: {text}', file=sys.stderr)
 
 
+def _fail(reason: str) -> NoReturn:
+    # What a signal raises libraries may take for an error of what they read.
+    if interrupts.exit_code():
+        interrupts.end()
+    print(f'rangeseg: {reason}', file=sys.stderr)
+    sys.exit(2)
+
+
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     interrupts.watch()
@@ -68,11 +76,9 @@ def main() -> None:
         # Without its standalone mode click returns the code that a command exits with.
         sys.exit(rangeseg.main(prog_name='rangeseg', standalone_mode=False))
     except click.ClickException as error:
-        print(f'rangeseg: {error.format_message()}', file=sys.stderr)
-        sys.exit(2)
+        _fail(error.format_message())
     except (ValueError, OSError, MemoryError, RecursionError) as error:
-        print(f'rangeseg: {in_words(error)}', file=sys.stderr)
-        sys.exit(2)
+        _fail(in_words(error))
     except SystemExit as end:
         if end.code and end.code == interrupts.exit_code():
             interrupts.end()
