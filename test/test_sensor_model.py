@@ -8,8 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.alike import ranked
+from rangeseg_ros.core.fitting.alike import alike, ranked
+from rangeseg_ros.core.fitting.errors import Errors, explaining
 from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -100,6 +102,18 @@ def test_directions_err_both_ways_or_one(errors):
     # Blocks that are compared slope alike to a third or so.
     assert sensor.column_noise == pytest.approx(errors[0], rel=0.3)
     assert sensor.row_noise == pytest.approx(errors[1], rel=0.3)
+
+
+@pytest.mark.parametrize(('count', 'told'), [(13, False), (200, False), (1000, True)])
+def test_a_few_blocks_tell_no_kind_of_error(count, told):
+    """Of one set of blocks either kind explains the median, so that rounding would decide."""
+    draw, none = np.random.default_rng(5), Errors(0.0, 0.0, 0.0)
+    for _ in range(200):
+        squared, slope = draw.uniform(0.04, 4, count), np.zeros(count)
+        scale = Scale(np.arange(count), squared, slope, alike(squared, slope))
+        variance = 1e-6 * squared**2 * draw.uniform(0.5, 2, count)
+        found = explaining(scale, variance, 0.5, True, none, none)
+        assert (found.quartic > 0) == told and (found.constant > 0) != told
 
 
 def test_slopes_explain_no_noise_that_is_of_two_kinds():

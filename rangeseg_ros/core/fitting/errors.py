@@ -90,7 +90,8 @@ def explaining(
     quartic = 0.0
     if in_range:
         factor, less = _likeliest(squared[facing] ** 2, ahead, before, blocks)
-        if less < unlikely:
+        # One set is explained by either, and rounding would decide.
+        if less < unlikely and len(facing) > 1:
             constant, quartic = 0.0, factor
     there += constant + quartic * squared**2
     straight, unlikely = _likeliest(tilt, shown, there, blocks)
