@@ -194,7 +194,7 @@ def measures(components: Components) -> tuple[NDArray[np.int64], NDArray[np.int6
 def _counts(
     first: int, after: int, most: int, found: NDArray[np.int32], number: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """What `_measures` returns, of some rows."""
+    """What `measures` returns, of some rows."""
     height, width = found.shape
     area, perimeter = np.zeros(most + 1, np.int64), np.zeros(most + 1, np.int64)
     # Components of three rows in turn: the one at hand, above and below it.

@@ -116,7 +116,21 @@ def every_second(
 ) -> Problem:
     """What every second pixel of every second row has to explain.
 
-    A quarter of the data, and borders of half as many pixels, of which each costs half.
+    A quarter of the data, and borders of half as many pixels, of which each costs half: the energy
+    of all pixels (thesis eq. 5.3), a quarter of it.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    sensor : SensorModel
+        Errors of the image.
+    grid : Grid
+        Of the image.
+    block : int
+        Rows and columns of its blocks, even.
+    smoothness : float
+        `plane_smoothness`.
     """
     coarser = sensor.magnified(1 / 2)
     smoothness *= sensor.patch / coarser.patch / 2

@@ -33,7 +33,10 @@ class Grid(NamedTuple):
     below: NDArray[np.float32]
 
     def every(self, step: int) -> Grid:
-        """Between every `step`-th column and row: what is least of the edges on the way."""
+        """Between every `step`-th column and row: what is least of the edges on the way.
+
+        Of ceil(H / step) rows and ceil(W / step) columns.
+        """
         rows, columns = len(self.right), self.below.shape[1]
         right = self.right[::step, : (columns - 1) // step * step]
         below = self.below[: (rows - 1) // step * step, ::step]
