@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.options import ConfigError
     from rangeseg_ros.core.segmentation import Segmentation
     from rangeseg_ros.core.segmenter import Segmenter
+    from rangeseg_ros.core.sensing.calibrations import (
+        camera_from_calibration,
+        camera_from_matrices,
+    )
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
     from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -33,6 +37,8 @@ __all__ = [
     'SequenceSegmenter',
     'Transform',
     '__version__',
+    'camera_from_calibration',
+    'camera_from_matrices',
     'corrected',
     'planes_from_message',
 ]
@@ -46,6 +52,7 @@ _HOMES = {
     'core.options': ('ConfigError',),
     'core.segmentation': ('Segmentation',),
     'core.segmenter': ('Segmenter',),
+    'core.sensing.calibrations': ('camera_from_calibration', 'camera_from_matrices'),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
     'core.sequence': ('SequenceSegmenter',),

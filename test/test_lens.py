@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, CameraError, Config, RangeImage, Segmenter
-from rangeseg_ros.core.sensing.camera import CameraWarning
+from rangeseg_ros.core.sensing.calibrations import CameraWarning, camera_from_matrices
 from rangeseg_ros.core.sensing.lens import undistort
 
 K = [[300, 0, 159.5], [0, 310, 119.5], [0, 0, 1]]
@@ -93,7 +93,7 @@ def test_opencv_sees_the_rays_at_their_pixels(model, d):
 def test_binning_and_skew_go_together():
     skewed = [[300, 30, 159.5], [0, 310, 119.5], [0, 0, 1]]
     full, binned = (
-        Camera.from_matrices(320, 240, skewed, binning=binning) for binning in ((1, 1), (2, 4))
+        camera_from_matrices(320, 240, skewed, binning=binning) for binning in ((1, 1), (2, 4))
     )
     block = full.rays[4:8, 6:8].reshape(-1, 3).mean(axis=0)
     np.testing.assert_allclose(binned.rays[1, 3], block, atol=1e-6)
@@ -138,7 +138,7 @@ def test_what_is_rectified_and_what_is_raw():
     raw = lens('plumb_bob', *d)
 
     def camera(p, raw=None, d=d):
-        return Camera.from_matrices(320, 240, K, p, distortion_model='plumb_bob', d=d, raw=raw)
+        return camera_from_matrices(320, 240, K, p, distortion_model='plumb_bob', d=d, raw=raw)
 
     for choice in (None, False):
         with pytest.warns(CameraWarning, match='D beside P'):

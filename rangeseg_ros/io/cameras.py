@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from rangeseg_ros.core.sensing.calibrations import camera_from_calibration
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.yaml_files import YamlError, read_yaml
@@ -34,7 +35,7 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
     if not isinstance(calibration, dict):
         raise CameraError(f'{path}: not a camera calibration')
     try:
-        return Camera.from_calibration(calibration, raw or None)
+        return camera_from_calibration(calibration, raw or None)
     except ValueError as error:
         raise CameraError(f'{path}: {error}') from None
 

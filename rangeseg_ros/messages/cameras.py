@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rangeseg_ros.core.sensing.calibrations import camera_from_matrices
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.messages.make import Make
 
@@ -31,7 +32,7 @@ def camera_from_message(info: Any, raw: bool | None = None) -> Camera:
     info : sensor_msgs/CameraInfo
         Of rclpy, rosbags or ROS 1.
     raw : bool, optional
-        Whether the images are raw, see `Camera.from_matrices`.
+        Whether the images are raw, see `camera_from_matrices`.
 
     Raises
     ------
@@ -59,7 +60,7 @@ def camera_from_message(info: Any, raw: bool | None = None) -> Camera:
 
 @lru_cache(maxsize=1)
 def _camera(*fields: Any) -> Camera:
-    return Camera.from_matrices(*fields)
+    return camera_from_matrices(*fields)
 
 
 def camera_info_message(make: Make, header: Any, camera: Camera) -> Any:
