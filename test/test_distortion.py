@@ -5,14 +5,12 @@ import json
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from clouds import cloud_of
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image, TiffImagePlugin
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
-from rangeseg_ros.cli.segment import command
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import KIND, load, read_distortion, write_distortion
@@ -153,7 +151,7 @@ def test_damaged_files_are_refused(tmp_path_factory, data):
 
 
 @pytest.mark.parametrize('kind', ['missing', 'png', 'nan', 'integers'])
-def test_wrong_files_end_the_command_in_one_line(tmp_path, kind):
+def test_wrong_files_end_the_command_in_one_line(tmp_path, kind, run):
     path = tmp_path / 'map.tiff'
     if kind == 'png':
         path.write_bytes(cv2.imencode('.png', np.zeros(CAMERA.shape, np.uint16))[1].tobytes())
@@ -166,7 +164,7 @@ def test_wrong_files_end_the_command_in_one_line(tmp_path, kind):
     (tmp_path / 'params.yaml').write_text(f'distortion_map: {path}\n')
     names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
     paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
-    result = CliRunner().invoke(command, paths)
-    assert result.exit_code != 0 and str(path) in result.output
-    assert len(result.output.strip().splitlines()) == 1
+    code, _, error = run('segment', *paths)
+    assert code == 2 and f'params.yaml: parameter distortion_map: {path}' in error
+    assert error.count('\n') == 1
     assert not (tmp_path / 'out').exists()

@@ -68,6 +68,8 @@ def test_wrong_files_end_the_command_in_one_line(tmp_path, kind):
     result = segment(tmp_path, path)
     said = result.output.strip() or str(result.exception)
     assert result.exit_code != 0 and str(path) in said
+    # Of the size nothing is known before there is an image.
+    assert (f'{tmp_path / "params.yaml"}: parameter mask: ' in said) == (kind != 'size')
     assert len(said.splitlines()) == 1
     assert not (tmp_path / 'out').exists()
 

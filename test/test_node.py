@@ -283,6 +283,8 @@ def test_bad_parameters_are_refused_with_the_reason(bench, expected):
     bench.in_use()
     (result,) = bench.set_parameters(method='magic')
     assert not result.successful and 'method' in result.reason and 'planes' in result.reason
+    (result,) = bench.set_parameters(distortion_map='/none.tiff')
+    assert not result.successful and 'distortion_map: /none.tiff' in result.reason
     (result,) = bench.set_parameters(smoothness=-1.0)
     assert not result.successful and 'smoothness' in result.reason
     result = bench.set_parameters(atomically=True, min_pixels=160 * 120, method='magic')

@@ -72,6 +72,7 @@ def test_interrupted_during_a_computation(presses):
         (['--ros-args', '-p', 'method:=magic'], 'method'),
         (['--ros-args', '-p', 'min_pixel:=3'], "is 'min_pixels' meant?"),
         (['--ros-args', '-p', 'min_pixels:=many'], 'INTEGER'),
+        (['--ros-args', '-p', 'mask:=/none.png'], 'parameter mask: /none.png'),
         (['--ros-args', '-p', f'{QOS}.reliability:=best'], 'reliable, best_effort'),
         (['--ros-args', '-p', f'{QOS}.history:=7'], 'keep_last'),
         (['--ros-args', '-p', f'{QOS}.depth:=many'], 'number of messages'),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +100,7 @@ def command(
     given: dict[str, Any] = read_params(segment_with) if segment_with else {}
     # What is learned is the whole distortion, not what another map leaves.
     given.pop('distortion_map', None)
-    config = replace(read_config(segment_with), distortion_map='')
+    config = read_config(segment_with, distortion_map='')
     kept = output.with_name(f'.{output.name}.parts')
     tasks = parts(sources, config, kept)
     seen = list(options.progress(run_all(tasks, jobs), len(tasks), 'part'))

@@ -11,6 +11,7 @@ import click
 from rangeseg_ros.cli import options
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.params import read_config
 
 
 @click.command()
@@ -22,7 +23,8 @@ def command(params_file: Path | None) -> None:
     NUMBA_CACHE_DIR set here and where it runs. Compiles for images and clouds, without --params
     for both methods with their default parameters.
     """
-    config = options.read_parameters(params_file, exact=False)
+    # Files of one sensor are read where it is, which need not be here.
+    config = read_config(params_file, mask='', distortion_map='')
     methods = Config.__dataclass_fields__['method'].metadata['choices']
     configs = [config] if params_file else [replace(config, method=name) for name in methods]
     for each in configs:

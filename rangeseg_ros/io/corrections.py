@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.io import distortion
 from rangeseg_ros.io.images import ImageFileError, read_mask
@@ -35,6 +37,25 @@ def corrected(image: RangeImage, config: Config) -> RangeImage:
     if config.distortion_map:
         image = distortion.load(Path(config.distortion_map)).corrected(image)
     return image
+
+
+def check_corrections(config: Config) -> None:
+    """Read the files that `corrected` needs, so that none is missed only once a frame is there.
+
+    Raises
+    ------
+    ConfigError
+        One that cannot be read, and the parameter that names it.
+    """
+    for parameter, file, read in (
+        ('mask', config.mask, _mask),
+        ('distortion_map', config.distortion_map, distortion.load),
+    ):
+        try:
+            if file:
+                read(Path(file))
+        except (ImageFileError, DistortionError) as error:
+            raise ConfigError(f'parameter {parameter}: {error}') from None
 
 
 def correction_files(config: Config) -> list[Path]:

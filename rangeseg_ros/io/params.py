@@ -9,6 +9,7 @@ from typing import Any
 
 from rangeseg_ros.core.config import Config, known_name
 from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.io.corrections import check_corrections
 from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
 NODE = 'segment_planes'
@@ -95,10 +96,13 @@ def read_config(path: Path | None, **overrides: Any) -> Config:
     Raises
     ------
     ConfigError
-        As `read_params`; an unknown parameter or a value out of range, named in the message.
+        As `read_params`; an unknown parameter, a value out of range or a file that cannot be
+        read, named in the message.
     """
     params = {} if path is None else read_params(path)
     try:
-        return Config.from_mapping({**params, **overrides})
+        config = Config.from_mapping({**params, **overrides})
+        check_corrections(config)
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}' if path else str(error)) from None
+    return config

@@ -17,6 +17,7 @@ from rclpy.parameter import Parameter
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.options import ConfigError, option
+from rangeseg_ros.io.corrections import check_corrections
 
 
 @dataclass(frozen=True)
@@ -83,13 +84,14 @@ def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
         node.declare_parameter(declared.name, declared.default, _descriptor(declared))
     names = [declared.name for declared in fields(NodeConfig)]
     config = NodeConfig(**{name: node.get_parameter(name).value for name in names})
+    check_corrections(config)
 
     def changed(parameters: list[Parameter]) -> NodeConfig:
         return replace(config, **{p.name: p.value for p in parameters if p.name in names})
 
     def check(parameters: list[Parameter]) -> SetParametersResult:
         try:
-            changed(parameters)
+            check_corrections(changed(parameters))
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
