@@ -77,6 +77,10 @@ def test_interrupted_during_a_computation(presses):
         (['--ros-args', '-p', f'{QOS}.history:=7'], 'keep_last'),
         (['--ros-args', '-p', f'{QOS}.depth:=many'], 'number of messages'),
         (['--ros-args', '-p', f'{QOS}.depth:=-1'], 'number of messages'),
+        (['--ros-args', '-p', f'{QOS}.relaibility:=reliable'], f"is '{QOS}.reliability' meant?"),
+        (['--ros-args', '-p', f'{QOS}.durability:=volatile'], 'unknown parameter'),
+        (['--ros-args', '-p', f'{QOS[:-1]}.depth:=1'], f"is '{QOS}.depth' meant?"),
+        (['--ros-args', '-p', f'qos_overrides.{DEPTH}x.subscription.depth:=1'], 'unknown'),
         (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
         (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
         (['--ros-args', '--magic'], '--magic'),
@@ -91,10 +95,14 @@ def test_bad_arguments_end_with_one_line(arguments, words):
 
 def test_parameters_of_other_nodes_in_a_shared_file_are_warned_of(tmp_path):
     shared = tmp_path / 'shared.yaml'
-    shared.write_text('/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n')
+    shared.write_text(
+        '/**:\n  ros__parameters:\n    of_another: 1\n    min_pixels: 7\n'
+        '    qos_overrides: {/scan: {subscription: {depth: -1}}}\n'
+    )
     with Bench('--params-file', os.fspath(shared), namespace='shared') as bench:
         bench.until(lambda: 'will subscribe' in bench.log())
-        assert "unknown parameter 'of_another'" in bench.log()
+        for name in ('of_another', 'qos_overrides./scan.subscription.depth'):
+            assert f"unknown parameter '{name}'" in bench.log()
 
 
 def test_without_a_place_for_log_files_it_starts_and_says_so():

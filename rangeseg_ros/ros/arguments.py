@@ -13,10 +13,14 @@ from typing import Any
 import yaml
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.utilities import remove_ros_args
 
 from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.core.runtime.cache import writable
+from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
+from rangeseg_ros.ros.depth_input import input_topics
+from rangeseg_ros.ros.gravity import IMU_TOPIC
 from rangeseg_ros.ros.parameters import NodeConfig
 
 USAGE = """\
@@ -33,7 +37,8 @@ Parameters:
 """
 
 # Of rclpy and of every node.
-_FOREIGN = ('qos_overrides', 'use_sim_time', 'start_type_description_service')
+_FOREIGN = ('use_sim_time', 'start_type_description_service')
+_OVERRIDING = QoSOverridingOptions.with_default_policies()
 _POLICIES = {'reliability': ReliabilityPolicy, 'history': HistoryPolicy}
 
 
@@ -58,6 +63,8 @@ def check_arguments(arguments: list[str]) -> None:
 def check_parameters(node: Node, arguments: list[str]) -> None:
     """Refuse parameters that the node does not have, so that none is misspelt in silence.
 
+    Nor is a topic or policy of `qos_overrides`, which rclpy looks up when it needs them.
+
     Those of the wildcard section of a parameter file may be meant for other nodes: they are
     warned of.
 
@@ -67,10 +74,10 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
         A name that is not a parameter, and the one that it looks like; a quality of service that
         there is none of.
     """
-    for name, parameter in node._parameter_overrides.items():
-        if name.startswith('qos_overrides.'):
-            _check_policy(name, parameter.value)
-    known = {field.name for field in fields(NodeConfig)}
+    quality = _quality_parameters(node)
+    for name in sorted(quality & set(node._parameter_overrides)):
+        _check_policy(name, node._parameter_overrides[name].value)
+    known = {field.name for field in fields(NodeConfig)} | quality
     given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
     unknown = sorted(set(given) - known)
     shared = _shared(arguments)
@@ -92,6 +99,19 @@ def logging_arguments() -> list[str]:
         file=sys.stderr,
     )
     return ['--ros-args', '--disable-external-lib-logs']
+
+
+def _quality_parameters(node: Node) -> set[str]:
+    """Names of the parameters that decide the quality of service of what the node may open."""
+    published = [f'~/{name}' for name in (*OUTPUTS, *MAP_OUTPUTS, 'odometry')]
+    sources = NodeConfig.__dataclass_fields__['input'].metadata['choices']
+    subscribed = {topic for source in sources for topic in input_topics(node, source)}
+    ends = [f'{node.resolve_topic_name(topic)}.publisher' for topic in published]
+    ends += [
+        f'{topic}.subscription' for topic in (*subscribed, node.resolve_topic_name(IMU_TOPIC))
+    ]
+    policies = [kind.name.lower() for kind in _OVERRIDING.policy_kinds]
+    return {f'qos_overrides.{end}.{policy}' for end in ends for policy in policies}
 
 
 def _check_policy(name: str, value: object) -> None:
