@@ -20,7 +20,8 @@ quick: $(VENV)/installed
 demo: $(VENV)/installed
 	rm -rf demo
 	$(BIN)/rangeseg simulate kinect --scenes 1 --frames 15 --seed 1 --output demo/simulated
-	$(BIN)/rangeseg replay demo/simulated/bag --output demo/planes
+	printf 'up_y: -0.94\nup_z: -0.34\n' > demo/up.yaml  # the camera looks down by 20 degrees
+	$(BIN)/rangeseg replay demo/simulated/bag --params demo/up.yaml --output demo/planes
 	@echo 'Labels, planes, a bag and report.html are in $(CURDIR)/demo/planes'
 
 # A simulated camera at 10 Hz, the node, and a node that prints its planes, for 20 s.
