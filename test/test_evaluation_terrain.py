@@ -126,6 +126,7 @@ def test_shares_are_those_counted_on_paper(drawn, evaluate):
 
 def test_the_table_tells_the_kinds_apart(drawn, evaluate):
     _, _, out, _ = evaluate(drawn)
+    assert 'nan' not in out
     rows = {words[0]: words[1:] for words in map(str.split, out.splitlines()) if words}
     for kind, expected in (('near', KINECT), ('far', REALSENSE), ('all', POOLED)):
         assert rows[kind] == [f'{value:.4f}' for value in expected.values()]

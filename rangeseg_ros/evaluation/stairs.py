@@ -87,9 +87,10 @@ def stairs_figures(checks: Sequence[StairsCheck]) -> dict[str, Any]:
 def stairs_line(figures: Mapping[str, Any]) -> str:
     """Text of `stairs_figures`."""
     f = figures
+    rise, run = 1000 * f['median_rise_error'], 1000 * f['median_run_error']
+    errors = f'; median error of rise {rise:.0f} mm, of run {run:.0f} mm' if f['found'] else ''
     return (
         f'stairs: {f["found"]} of {f["scenes_with_stairs"]} found, {f["treads_found"]} of their '
-        f'{f["treads_in_sight"]} treads in sight; median error of rise '
-        f'{1000 * f["median_rise_error"]:.0f} mm, of run {1000 * f["median_run_error"]:.0f} mm; '
-        f'{f["false_alarms"]} false alarms, {f["scenes_without_stairs"]} scenes without stairs'
+        f'{f["treads_in_sight"]} treads in sight{errors}; {f["false_alarms"]} false alarms, '
+        f'{f["scenes_without_stairs"]} scenes without stairs'
     )
