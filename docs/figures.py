@@ -37,6 +37,7 @@ from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.sensing.view import View
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
 from rangeseg_ros.io.images import write_image
@@ -192,12 +193,13 @@ def stages(image, config):
     surface, _ = join_surfaces(patches, nodes, size, sensor, config.plane_smoothness, least)
     pictures['surfaces'] = over(image, surface, size)
 
-    labelling = method.segment(bridges, fine, grid, sensor, config, lambda stage: None)
+    view = View(image, bridges, fine, grid, sensor, least, 1)
+    labelling, view = method.segment(view, config, lambda stage: None)
     labels = labelling.labels
-    pictures['labels'] = overlay(image.inverse, labels.astype(np.uint16))
-    regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-    regions, *_ = method.flat_regions(regions, bridges, fine, sensor, grid, config.flatness)
-    pictures['regions'] = overlay(image.inverse, regions)
+    pictures['labels'] = overlay(image.inverse, of_all(labels, view.step, image))
+    regions = plane_regions(labels, labels > 0, view.grid, config.noise_regions, view.least)
+    regions, *_ = method.flat_regions(regions, view, config.flatness)
+    pictures['regions'] = overlay(image.inverse, of_all(regions, view.step, image))
     result = Segmenter(config).segment(image)
     pictures['planes'] = overlay(image.inverse, result.labels, result.planes)
     pictures['uncertainty'] = uncertainty(image, result)
@@ -219,9 +221,15 @@ def with_edges(image, jumps):
     return picture
 
 
+def of_all(numbers, size, image):
+    """Numbers of the pixels of an image from those of squares so large."""
+    pixels = numbers.repeat(size, 0).repeat(size, 1)[: image.shape[0], : image.shape[1]]
+    return pixels.astype(np.uint16)
+
+
 def over(image, numbers, size):
     """Colour blocks by their numbers (rows, columns), 0 for none."""
-    pixels = numbers.repeat(size, 0).repeat(size, 1)[: image.shape[0], : image.shape[1]]
+    pixels = of_all(numbers, size, image)
     base = in_grey(image)
     picture = cv2.addWeighted(base, 0.45, colours(pixels), 0.55, 0)
     return np.where((pixels > 0)[..., None], picture, base)

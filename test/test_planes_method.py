@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
@@ -254,21 +253,23 @@ if __name__ == '__main__':
     ],
 )
 def test_labels_of_every_second_pixel_do_where_neighbours_repeat_each_other(
-    size, options, coarsely, monkeypatch
+    size, options, coarsely
 ):
-    called = []
-
-    def refine_coarsely(*arguments):
-        called.append(arguments)
-        return real(*arguments)
-
-    real = by_planes.refine_coarsely
-    monkeypatch.setattr(by_planes, 'refine_coarsely', refine_coarsely)
     camera = kinect_camera(*size)
     depth = np.full(camera.shape, 1500, np.uint16)
     depth[:, : size[0] // 3] = 1200
+    depth[100:103, size[0] // 2] = 0
     result = segmented(depth, camera, sensor_model='fixed', **options)
-    assert bool(called) == coarsely
+    seen = depth[::2, ::2] if coarsely else depth
+    assert result.labelling.labels.shape == seen.shape
+    assert result.sensor.correlation == options['noise_correlation']
     assert len(result.planes) == 2
-    assert (result.labels == result.labels[:1]).all()
-    assert (np.diff(result.labels[0].astype(int)) != 0).nonzero()[0].tolist() == [size[0] // 3 - 1]
+    expected = np.where(np.arange(size[0]) < size[0] // 3, 2, 1) * (depth > 0)
+    np.testing.assert_array_equal(result.labels, expected)
+    assert [plane.count for plane in result.planes] == np.bincount(result.labels.flat)[1:].tolist()
+    # Shapes and outlines are those of all pixels, holes bridged.
+    areas = [plane.area for plane in result.planes]
+    near, far = size[0] // 3 * size[1], (size[0] - size[0] // 3) * size[1]
+    assert areas == pytest.approx([far * (1.5 / camera.fx) ** 2, near * (1.2 / camera.fx) ** 2])
+    width = np.ptp(result.planes[1].hull, axis=0)[0]
+    assert width == pytest.approx((size[0] // 3 - 1) * 1.2 / camera.fx, rel=0.02)

@@ -8,10 +8,10 @@ import pytest
 from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
-from rangeseg_ros.core.sensing.subsampling import labels_of_all
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -88,40 +88,49 @@ def test_the_sensor_is_said_in_pixels_of_the_image(results):
     assert coarse.distortion_length == pytest.approx(full.distortion_length, rel=0.01)
 
 
-def labels_by_hand(labels, step, inverse, rays, theta, sensor):
-    """Of each pixel, the label around it that costs least, the one on its left and above first."""
-    found, counts = np.zeros(inverse.shape, np.uint16), np.zeros(len(theta), int)
-    for row, column in np.argwhere(inverse > 0):
-        square = inverse[row, column] ** 2
-        variance = random_variance(sensor, square) + systematic_variance(sensor, square)
+def labels_by_hand(few, step, image, whole, theta, sensor, smoothness):
+    """Of each pixel, the label around it of the least energy, the upper left one first."""
+    regions = np.zeros(whole.shape, np.uint16)
+    for row, column in np.argwhere(whole.inverse > 0):
+        y = whole.inverse[row, column]
+        variance = random_variance(sensor, y**2) + systematic_variance(sensor, y**2)
+        around = [
+            (i, j)
+            for j in (column // step, min(-(-column // step), few.shape[1] - 1))
+            for i in (row // step, min(-(-row // step), len(few) - 1))
+        ]
+        known = [few[i, j] for i, j in around if whole.inverse[i * step, j * step] > 0]
         costs = {}
-        for y in (row // step, min(-(-row // step), len(labels) - 1)):
-            for x in (column // step, min(-(-column // step), labels.shape[1] - 1)):
-                label = labels[y, x]
-                residual = inverse[row, column] - theta[label] @ rays[row, column]
-                costs[label] = residual**2 / variance if label else chi2_quantile(1)
-        found[row, column] = min(costs, key=costs.get)
-        counts[found[row, column]] += 1
-    return found, counts
+        for i, j in around:
+            label = few[i, j]
+            residual = y - theta[label] @ whole.rays[row, column]
+            data = min(residual**2 / variance / 2, 8) if label else chi2_quantile(1) / 2
+            unlike = np.mean([other != label for other in known]) if known else 0
+            costs[label] = data + 4 * smoothness * unlike
+        regions[row, column] = min(costs, key=costs.get)
+    labels = regions * (image.inverse > 0).astype(np.uint16)
+    return regions, labels, np.bincount(labels[image.inverse > 0], minlength=len(theta))
 
 
 @pytest.mark.parametrize('step', [2, 4])
-@pytest.mark.parametrize('shape', [(1, 1), (8, 9), (13, 22)])
-def test_pixels_between_take_the_label_that_they_fit(shape, step):
+@pytest.mark.parametrize('shape', [(1, 1), (8, 9), (13, 22), (20, 75)])
+@pytest.mark.parametrize('kinds', [1, 4])
+def test_pixels_between_take_the_label_of_the_least_energy(shape, step, kinds):
     draw = np.random.default_rng(7)
     camera = Camera(shape[1], shape[0], 20.0, 20.0, shape[1] / 2, shape[0] / 2)
     theta = np.vstack([np.zeros(3), draw.normal((0, 0, 0.5), 0.01, (3, 3))])
-    coarse = draw.integers(0, 4, (-(-shape[0] // step), -(-shape[1] // step))).astype(np.uint16)
+    few = draw.integers(4 - kinds, 4, (-(-shape[0] // step), -(-shape[1] // step)))
+    few = few.astype(np.uint16)
+    few[:, -12:] = 1
     truth = draw.integers(1, 4, shape)
     inverse = (theta[truth] * camera.rays).sum(axis=2).astype(np.float32)
-    inverse[draw.random(shape) < 0.2] = 0
+    inverse[draw.random(shape) < 0.1] = 0
+    whole = RangeImage(camera.rays, inverse, camera)
+    image = RangeImage(camera.rays, inverse * (draw.random(shape) > 0.1), camera)
     sensor = SensorModel.from_config(Config(noise=0.003, distortion=0.002))
-    pixels = inverse, camera.rays, theta, sensor
-    labels, counts = labels_of_all(coarse, step, *pixels)
-    expected, expected_counts = labels_by_hand(coarse, step, *pixels)
-    assert (labels == expected).all() and (counts == expected_counts).all()
-    seen = inverse[::step, ::step] > 0
-    assert (labels[::step, ::step][seen] == coarse[seen]).all()
+    told = few, step, image, whole, theta, sensor, 0.7
+    for found, expected in zip(labels_of_all(*told), labels_by_hand(*told), strict=True):
+        np.testing.assert_array_equal(found, expected)
 
 
 def overlap(labels, truth, valid):

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
+from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
-from rangeseg_ros.core.fitting.borders import Borders
-from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
@@ -28,11 +27,11 @@ from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid, weights
-from rangeseg_ros.core.sensing.jump_edges import jump_edges
+from rangeseg_ros.core.sensing.grid import GridEdges, weights
+from rangeseg_ros.core.sensing.jump_edges import edges_of_all, jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.subsampling import edges_of_all, labels_of_all
+from rangeseg_ros.core.sensing.view import View
 
 
 class Segmenter:
@@ -73,45 +72,26 @@ class Segmenter:
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
         step = Work.within(config.work_budget).step
+        if step > 1:
+            config = _for_every(step, config)
         watch = Stopwatch()
-        if step == 1:
-            return self._segment(image, config, watch)
-        coarse = self._segment(image.every(step), _for_every(step, config), watch)
-        result = _told_for_all(coarse, step, image)
-        watch.lap('pixels')
-        return result
-
-    def _segment(self, image: RangeImage, config: Config, watch: Stopwatch) -> Segmentation:
-        blocks = Blocks.of(image)
-        # Much of what tells the noise runs on one thread: on another one meanwhile.
-        holes = submit(find_holes, image.inverse)
-        stated = sensor = SensorModel.from_config(config, image.shape)
-        if config.sensor_model == 'measured':
-            sensor = measured_sensor(image, blocks, sensor)
-        watch.lap('noise')
-        # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
-        # a surface seen at a grazing angle costs it less than one too few.
-        grazing = sensor
-        if config.method == 'normals':
-            grazing = sensor._replace(column_noise=0.0, row_noise=0.0)
-        steps, slopes = jump_steps(blocks, grazing)
-        if config.edge_step > 0:
-            steps = np.full_like(steps, config.edge_step)
-        # What was measured tells the planes; where they end is told with small holes bridged.
-        whole = bridge_holes(image, steps, slopes, holes.result())
-        jumps = jump_edges(whole, config.jump_edges, steps, slopes)
-        grid = weights(whole, jumps, config.weighting)
-        watch.lap('edges')
+        view, jumps = _seen(image.every(step) if step > 1 else image, config, step, watch)
+        whole = view.whole if step == 1 else image
+        labelling: Labelling
         if config.method == 'planes':
-            flat, labelling = self._by_planes(whole, blocks, grid, sensor, config, watch)
-            regions, fits = by_planes.unite_regions(*flat, image, blocks, sensor)
+            labelling, view = by_planes.segment(view, config, watch.lap)
+            found = labelling.labels
+            regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
+            flat = by_planes.flat_regions(regions, view, config.flatness)
+            watch.lap('regions')
+            regions, fits = by_planes.unite_regions(*flat, view)
         else:
-            regions, labelling = self._by_normals(whole, grid, config, watch)
+            regions, labelling = self._by_normals(view, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
-            fits = Fits.of(regions, image, stated, blocks)
-        measured = submit(np.multiply, regions, image.valid)
+            stated = SensorModel.from_config(config, view.image.shape)
+            fits = Fits.of(regions, view.image, stated, view.blocks)
+        regions, labels, fits = _of_all(regions, fits, view, image, whole, config)
         planes = describe_regions(regions, whole, fits)
-        labels = measured.result()
         if len(planes) < len(fits.theta) - 1:
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
             kept = np.zeros(len(fits.theta), np.uint16)
@@ -119,44 +99,25 @@ class Segmenter:
             labels = relabel(labels, kept)
         watch.lap('planes')
         reason = _reason(image, planes)
+        sensor = view.sensor.magnified(view.step)
         survey = Survey.of(image, sensor, config)
-        laps = watch.laps
+        if jumps is not None and step > 1:
+            jumps = edges_of_all(jumps, step, image.valid)
         upright = config.role_tolerance, config.role_area, config.ground_slope
-        found = jumps, survey, upright, config.work_budget
-        return Segmentation(labels, planes, laps, reason, sensor, labelling, *found)
-
-    def _by_planes(
-        self,
-        image: RangeImage,
-        blocks: Blocks,
-        grid: Grid,
-        sensor: SensorModel,
-        config: Config,
-        watch: Stopwatch,
-    ) -> tuple[tuple[NDArray[np.uint16], FirstPlanes, Borders], Labelling]:
-        """Regions, their first planes and borders, and the labelling they are made from."""
-        least = least_pixels(config.min_pixels, image.shape)
-        labelling = by_planes.segment(image, blocks, grid, sensor, config, watch.lap)
-        labels = labelling.labels
-        regions = plane_regions(labels, labels > 0, grid, config.noise_regions, least)
-        found = by_planes.flat_regions(regions, image, blocks, sensor, grid, config.flatness)
-        watch.lap('regions')
-        return found, labelling
+        others = jumps, survey, upright, config.work_budget
+        return Segmentation(labels, planes, watch.laps, reason, sensor, labelling, *others)
 
     def _by_normals(
-        self,
-        image: RangeImage,
-        grid: Grid,
-        config: Config,
-        watch: Stopwatch,
+        self, view: View, config: Config, watch: Stopwatch
     ) -> tuple[NDArray[np.uint16], Labelling]:
-        """The same by discretised normals as labels."""
-        least = least_pixels(config.min_pixels, image.shape)
+        """Regions by discretised normals as labels, and the labelling they are made from."""
+        image, grid = view.whole, view.grid
         before = self._labels_before(image)
         labelling = by_normals.segment(image, grid, config, before, watch.lap)
         if config.warm_start:
             self._before = image.camera, labelling.labels
-        regions = plane_regions(labelling.labels, image.valid, grid, config.noise_regions, least)
+        valid, least = image.valid, view.least
+        regions = plane_regions(labelling.labels, valid, grid, config.noise_regions, least)
         watch.lap('regions')
         return regions, labelling
 
@@ -179,25 +140,49 @@ def _for_every(step: int, config: Config) -> Config:
     )
 
 
-def _told_for_all(coarse: Segmentation, step: int, image: RangeImage) -> Segmentation:
-    """What was found in `image.every(step)`, for all pixels that it stands for."""
-    theta = np.zeros((1 + max((plane.label for plane in coarse.planes), default=0), 3))
-    for plane in coarse.planes:
-        theta[plane.label] = -plane.normal / (plane.distance + plane.normal @ image.place)
-    sensor = coarse.sensor
-    labels, counts = labels_of_all(coarse.labels, step, image.inverse, image.rays, theta, sensor)
-    sensor = sensor.magnified(step)
-    survey = coarse.survey
-    if isinstance(survey, Survey):
-        survey = replace(survey, image=image, sensor=sensor)
-    return replace(
-        coarse,
-        labels=labels,
-        planes=[replace(plane, count=int(counts[plane.label])) for plane in coarse.planes],
-        sensor=sensor,
-        jumps=coarse.jumps and edges_of_all(coarse.jumps, step, image.valid),
-        survey=survey,
-    )
+def _seen(
+    image: RangeImage, config: Config, step: int, watch: Stopwatch
+) -> tuple[View, GridEdges | None]:
+    """What is known of an image before planes are looked for, and its jump edges."""
+    blocks = Blocks.of(image)
+    # Much of what tells the noise runs on one thread: on another one meanwhile.
+    holes = submit(find_holes, image.inverse)
+    sensor = SensorModel.from_config(config, image.shape)
+    if config.sensor_model == 'measured':
+        sensor = measured_sensor(image, blocks, sensor)
+    watch.lap('noise')
+    # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
+    # a surface seen at a grazing angle costs it less than one too few.
+    grazing = sensor
+    if config.method == 'normals':
+        grazing = sensor._replace(column_noise=0.0, row_noise=0.0)
+    steps, slopes = jump_steps(blocks, grazing)
+    if config.edge_step > 0:
+        steps = np.full_like(steps, config.edge_step)
+    # What was measured tells the planes; where they end is told with small holes bridged.
+    whole = bridge_holes(image, steps, slopes, holes.result())
+    jumps = jump_edges(whole, config.jump_edges, steps, slopes)
+    grid = weights(whole, jumps, config.weighting)
+    watch.lap('edges')
+    least = least_pixels(config.min_pixels, image.shape)
+    return View(image, whole, blocks, grid, sensor, least, step), jumps
+
+
+def _of_all(
+    regions: NDArray[np.uint16],
+    fits: Fits,
+    view: View,
+    image: RangeImage,
+    whole: RangeImage,
+    config: Config,
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16], Fits]:
+    """Regions and labels of all pixels of an image, without bridged ones, and the fits of both."""
+    if view.step == 1:
+        return regions, regions * image.valid, fits
+    sensor = view.sensor.magnified(view.step)
+    planes = fits.theta, sensor, config.plane_smoothness * sensor.patch
+    regions, labels, pixels = labels_of_all(regions, view.step, image, whole, *planes)
+    return regions, labels, fits.magnified(view.step, pixels)
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.bends import Allowed, Residuals, find_bent, find_facets
 from rangeseg_ros.core.by_planes.quadratics import add_terms
 from rangeseg_ros.core.fitting.borders import Borders
-from rangeseg_ros.core.fitting.first_planes import STRIDE, FirstPlanes
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, squares_left
@@ -31,7 +31,7 @@ def find_curved(
     """Test the second-order part of the residuals of each region, and of those that touch.
 
     What is asked for is smooth: of a block of 4 x 4 pixels that a region fills its sums tell it,
-    elsewhere every other row and column.
+    elsewhere the pixels that `first` looks at.
 
     Parameters
     ----------
@@ -54,14 +54,14 @@ def find_curved(
     (M + 1,) bool
         Never true for 0.
     """
-    filled, moments, theta = first
+    filled, moments, theta, stride = first
     covered = np.maximum(moments[:, COUNT], 1)
     ratio = moments[:, RATIO] / covered
     # A residual is the region's up to noise and twice the distortion.
     limit = OUTLIER**2 * (1 + 4 * ratio)
     slope = np.linalg.norm(theta, axis=1)
     pixels = regions, filled, image.inverse, image.rays, image.pinhole
-    planes = blocks, sensor, theta, slope, limit
+    planes = blocks, sensor, theta, slope, limit, stride
     parts = map_halves(_normal_equations, len(filled), *pixels, *planes)
     powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
     residuals = Residuals(powers, right, square, area, scale, covered, ratio)
@@ -97,6 +97,7 @@ def _normal_equations(
     theta: NDArray[np.float64],
     slope: NDArray[np.float64],
     limit: NDArray[np.float64],
+    stride: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Normal equations of a quadratic in the pixel coordinates, from some rows of blocks.
 
@@ -152,8 +153,8 @@ def _normal_equations(
                 areas += pixels * area * slope[label]
                 deviations += pixels * deviation / slope[label]
                 continue
-            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), STRIDE):
-                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), STRIDE):
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height), stride):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width), stride):
                     label, value = int(regions[i, j]), float(inverse[i, j])
                     if label == 0 or value == 0 or slope[label] == 0:
                         continue
@@ -163,7 +164,7 @@ def _normal_equations(
                     for m in range(3):
                         residual -= theta[label, m] * ray[m]
                     residual /= np.sqrt(variance)
-                    square, pixels = residual * residual, float(STRIDE**2)
+                    square, pixels = residual * residual, float(stride**2)
                     if square <= limit[label]:
                         x, y = (2 * j - width) / width, (2 * i - height) / width
                         a, b = pixels * x * x, pixels * residual

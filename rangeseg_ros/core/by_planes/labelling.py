@@ -60,6 +60,7 @@ def refine(
     moments : (K + 1, 13) float64
         Of the surfaces.
     sensor : SensorModel
+        Errors of the image that the blocks are of.
     exact : bool
         Expand every label to all pixels within four blocks of its surface until no expansion
         helps; otherwise every label once, near its boundaries.
@@ -77,7 +78,8 @@ def refine(
         The planes the labelling was found for.
     """
     starts = surfaces.astype(np.int32)
-    models = _shifted(Models.of(moments, problem.smooth), starts, blocks, sensor, problem.block)
+    smooth, block = sensor.distortion_pixels, problem.block * problem.step
+    models = _shifted(Models.of(moments, smooth), starts, blocks, sensor, block)
     labels, cost = nearest(problem, starts, models)
     domains = _domains(starts, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
@@ -87,10 +89,8 @@ def refine(
         arrays = problem.inverse.reshape(shape), problem.rays.reshape(*shape, 3)
         weight = problem.weight.reshape(shape)
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
-        refitted = Models.of(moments, problem.smooth)._replace(
-            half_precision=models.half_precision
-        )
-        refitted = _shifted(refitted, starts, blocks, sensor, problem.block)
+        refitted = Models.of(moments, smooth)._replace(half_precision=models.half_precision)
+        refitted = _shifted(refitted, starts, blocks, sensor, block)
         better = labels.copy()
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains, cuts)
         last, value = value, energy(better, problem, refitted)
@@ -98,48 +98,6 @@ def refine(
             break
         labels, models = better, refitted
     return labels, models
-
-
-def refine_coarsely(
-    problem: Problem,
-    coarse: Problem,
-    surfaces: NDArray[np.intp],
-    blocks: NDArray[np.float64],
-    moments: NDArray[np.float64],
-    sensor: SensorModel,
-    cuts: float,
-) -> tuple[NDArray[np.int32], Models]:
-    """Label every second pixel of every second row as `refine` does, and all others after them.
-
-    These take the label of the one on their left and above, and descend: borders are then off by
-    no more than the descent finds by itself. (Of graph cuts at several resolutions: Lombaert et
-    al., A multilevel banded graph cuts method, ICCV 2005.)
-
-    Parameters
-    ----------
-    problem : Problem
-    coarse : Problem
-        Of every second pixel of every second row, in blocks of half the size.
-    surfaces, blocks, moments, sensor, cuts
-        As `refine` takes them, of all pixels.
-
-    Returns
-    -------
-    labels : (n,) int32
-    models : Models
-    """
-    few, models = refine(coarse, surfaces, blocks, moments, sensor.magnified(1 / 2), cuts=cuts)
-    measured = problem.weight.reshape(-1, problem.width) > 0
-    labels = np.empty(measured.shape, np.int32)
-    for i in range(2):
-        for j in range(2):
-            part = labels[i::2, j::2]
-            part[...] = few.reshape(-1, coarse.width)[: part.shape[0], : part.shape[1]]
-    labels *= measured
-    # Only of those beside a border are they asked.
-    cost = np.full(labels.size, -1, np.float32)
-    run_halves(descend, len(labels), labels.ravel(), cost, problem, models)
-    return labels.ravel(), models
 
 
 def _shifted(

@@ -9,21 +9,19 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
 from rangeseg_ros.core.by_planes.curvature import find_curved
-from rangeseg_ros.core.by_planes.labelling import refine, refine_coarsely
+from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.borders import Borders, find_borders
 from rangeseg_ros.core.fitting.coplanar import group_coplanar
-from rangeseg_ros.core.fitting.first_planes import FirstPlanes
+from rangeseg_ros.core.fitting.first_planes import STRIDE, FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.regions import by_falling_size, drop_regions, least_pixels, relabel
+from rangeseg_ros.core.regions import by_falling_size, drop_regions, relabel
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.view import View
 
 
 class Labelling:
@@ -33,19 +31,10 @@ class Labelling:
     ----------
     labels : (H, W) int32
         0 = no plane.
-    sensor : SensorModel
-        The errors that the image shows.
     """
 
-    def __init__(
-        self,
-        labels: NDArray[np.int32],
-        sensor: SensorModel,
-        problem: Problem,
-        models: Models,
-    ) -> None:
+    def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
         self.labels = labels
-        self.sensor = sensor
         self._problem = problem
         self._models = models
 
@@ -57,115 +46,80 @@ class Labelling:
         """None: regions have planes, and these their normals."""
 
 
-def segment(
-    image: RangeImage,
-    blocks: Blocks,
-    grid: Grid,
-    sensor: SensorModel,
-    config: Config,
-    lap: Callable[[str], None],
-) -> Labelling:
-    """Label every pixel with a plane.
+def segment(view: View, config: Config, lap: Callable[[str], None]) -> tuple[Labelling, View]:
+    """Label pixels with planes.
 
     Parameters
     ----------
-    image : RangeImage
-        (H, W), holes bridged.
-    blocks : Blocks
-        Of 4 x 4 pixels, without what was bridged.
-    grid : Grid
-        Of the image.
-    sensor : SensorModel
-        Errors of the image.
+    view : View
     config : Config
-        `plane_smoothness`, `min_pixels`, `exact`, `refits` and `work_budget` are read.
+        `plane_smoothness`, `exact`, `refits` and `work_budget` are read.
     lap : callable
         Told the name of every stage that ends.
+
+    Returns
+    -------
+    labelling : Labelling
+        Of the pixels of the view that follows.
+    seen : View
+        The one given. Where neighbours repeat each other, so that one pixel of four tells more
+        than half of what they do, every second one of every second row, unless `exact` or `refits`
+        ask for all. (Of graph cuts at several resolutions: Lombaert et al., A multilevel banded
+        graph cuts method, ICCV 2005.)
     """
-    size = block_size(image.shape)
+    whole, blocks, grid, sensor = view.whole, view.blocks, view.grid, view.sensor
+    size = block_size(whole.shape)
     if size == 2 * BLOCK:
-        blocks = blocks.merged(image.rays, size)
+        blocks = blocks.merged(whole.rays, size)
     elif size != BLOCK:
         # With what was bridged: a row of three pixels alone determines no plane.
-        blocks = Blocks.of(image, size)
-    nodes = Nodes.of(image.inverse, grid, blocks, sensor, size)
+        blocks = Blocks.of(whole, size)
+    nodes = Nodes.of(whole.inverse, grid, blocks, sensor, size)
     lap('blocks')
     patches = Patches.of(nodes, size, sensor)
     smoothness = config.plane_smoothness
-    pending = submit(Problem.of, image, sensor, grid, size, smoothness)
-    # Where neighbours repeat each other, one pixel of four tells more than half of what they do.
-    coarsely = sensor.patch > 2 and size >= BLOCK and not (config.exact or config.refits)
-    coarse = submit(every_second, image, sensor, grid, size, smoothness) if coarsely else None
+    thorough = config.exact or config.refits > 0
+    step = 2 if sensor.patch > 2 and size >= BLOCK and not thorough else 1
+    pending = submit(_posed, view, step, size, smoothness)
     # Surfaces as large as regions: smaller ones are clutter.
-    least = least_pixels(config.min_pixels, image.shape)
-    surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, least)
-    problem = pending.result()
+    surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, view.least)
+    seen, problem = pending.result()
     lap('surfaces')
     cuts = Work.within(config.work_budget).cuts
-    found = surface, nodes.moments, moments, sensor
-    if coarse is None:
-        labels, models = refine(problem, *found, config.exact, config.refits, cuts)
-    else:
-        labels, models = refine_coarsely(problem, coarse.result(), *found, cuts)
+    labels, models = refine(
+        problem, surface, nodes.moments, moments, sensor, config.exact, config.refits, cuts
+    )
     lap('labels')
-    return Labelling(labels.reshape(image.shape), sensor, problem, models)
+    return Labelling(labels.reshape(seen.image.shape), problem, models), seen
 
 
-def every_second(
-    image: RangeImage, sensor: SensorModel, grid: Grid, block: int, smoothness: float
-) -> Problem:
-    """What every second pixel of every second row has to explain.
-
-    A quarter of the data, and borders of half as many pixels, of which each costs half: the energy
-    of all pixels (thesis eq. 5.3), a quarter of it.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    sensor : SensorModel
-        Errors of the image.
-    grid : Grid
-        Of the image.
-    block : int
-        Rows and columns of its blocks, even.
-    smoothness : float
-        `plane_smoothness`.
-    """
-    coarser = sensor.magnified(1 / 2)
-    smoothness *= sensor.patch / coarser.patch / 2
-    problem = Problem.of(image.every(2), coarser, grid.every(2), block // 2, smoothness)
-    return problem._replace(smooth=sensor.distortion_pixels)
+def _posed(view: View, step: int, block: int, smoothness: float) -> tuple[View, Problem]:
+    """Every `step`-th pixel of every such row, and what they have to explain."""
+    seen = view.every(step) if step > 1 else view
+    grid, block = seen.grid, block // step
+    return seen, Problem.of(seen.whole, view.sensor, grid, block, smoothness, step)
 
 
 def flat_regions(
-    regions: NDArray[np.uint16],
-    image: RangeImage,
-    blocks: Blocks,
-    sensor: SensorModel,
-    grid: Grid,
-    flatness: float,
+    regions: NDArray[np.uint16], view: View, flatness: float
 ) -> tuple[NDArray[np.uint16], FirstPlanes, Borders]:
     """Regions (H, W) without those that bend, numbered anew, their first planes and borders.
 
     See `find_curved`.
     """
-    pending = submit(find_borders, regions, grid, int(regions.max()) + 1)
-    first = FirstPlanes.of(regions, image, blocks, sensor)
+    seen = view.whole, view.blocks, view.sensor
+    pending = submit(find_borders, regions, view.grid, int(regions.max()) + 1)
+    # Of a view of every second pixel all of them, as many as of one of all.
+    first = FirstPlanes.of(regions, *seen, max(STRIDE // view.step, 1))
     borders = pending.result()
-    curved = find_curved(regions, first, borders, image, blocks, sensor, flatness)
+    curved = find_curved(regions, first, borders, *seen, flatness)
     flat = submit(drop_regions, regions, curved)
     others = first.without(curved), borders.without(curved)
     return flat.result(), *others
 
 
 def unite_regions(
-    regions: NDArray[np.uint16],
-    first: FirstPlanes,
-    borders: Borders,
-    image: RangeImage,
-    blocks: Blocks,
-    sensor: SensorModel,
+    regions: NDArray[np.uint16], first: FirstPlanes, borders: Borders, view: View
 ) -> tuple[NDArray[np.uint16], Fits]:
     """Unite regions that touch and whose planes agree; the regions and their planes.
 
@@ -177,15 +131,12 @@ def unite_regions(
         Of the regions.
     borders : Borders
         Of the regions.
-    image : RangeImage
+    view : View
         (H, W).
-    blocks : Blocks
-        Of the image.
-    sensor : SensorModel
     """
     count = len(first.theta)
-    fits = Fits.of(regions, image, sensor, blocks, first, borders)
-    group = group_coplanar(fits, borders, sensor.agreement)
+    fits = Fits.of(regions, view.image, view.sensor, view.blocks, first, borders)
+    group = group_coplanar(fits, borders, view.sensor.agreement)
     if (group == np.arange(count)).all():
         return regions, fits
     pixels = np.zeros(count, np.intp)
@@ -193,5 +144,5 @@ def unite_regions(
     pixels[0] = 0
     table = by_falling_size(pixels)[group]
     united = submit(relabel, regions, table)
-    fits = fits.united(table, image.camera is not None)
+    fits = fits.united(table, view.image.camera is not None)
     return united.result(), fits

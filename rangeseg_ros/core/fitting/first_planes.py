@@ -41,15 +41,23 @@ class FirstPlanes(NamedTuple):
         Weighted. Their numbers are of all pixels of the blocks, as holes make no region smaller.
     theta : (M + 1, 3) float64
         theta . ray = inverse range.
+    stride : int
+        Rows and columns from one pixel that is looked at to the next, where blocks have borders.
     """
 
     filled: NDArray[np.uint16]
     moments: NDArray[np.float64]
     theta: NDArray[np.float64]
+    stride: int
 
     @classmethod
     def of(
-        cls, labels: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
+        cls,
+        labels: NDArray[np.uint16],
+        image: RangeImage,
+        blocks: Blocks,
+        sensor: SensorModel,
+        stride: int = STRIDE,
     ) -> FirstPlanes:
         """Fit planes to the blocks that regions fill and to pixels where there are none.
 
@@ -62,18 +70,22 @@ class FirstPlanes(NamedTuple):
         blocks : Blocks
             Of the image.
         sensor : SensorModel
+        stride : int
+            See above.
         """
         filled, count = fill(labels), int(labels.max(initial=0)) + 1
         pixels = labels, filled, image.inverse, image.rays, image.pinhole
-        moments = np.add(*map_halves(_sum_moments, len(filled), *pixels, blocks, sensor, count))
-        return cls(filled, moments, fit_all(moments)[0])
+        others = blocks, sensor, count, stride
+        moments = np.add(*map_halves(_sum_moments, len(filled), *pixels, *others))
+        return cls(filled, moments, fit_all(moments)[0], stride)
 
     def without(self, dropped: NDArray[np.bool_]) -> FirstPlanes:
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         if not dropped.any():
             return self
         table = np.where(dropped, 0, np.cumsum(~dropped) - 1).astype(np.uint16)
-        return FirstPlanes(table[self.filled], self.moments[~dropped], self.theta[~dropped])
+        moments, theta = self.moments[~dropped], self.theta[~dropped]
+        return FirstPlanes(table[self.filled], moments, theta, self.stride)
 
 
 @njit(cache=True, nogil=True)
@@ -88,6 +100,7 @@ def _sum_moments(
     blocks: Blocks,
     sensor: SensorModel,
     count: int,
+    stride: int,
 ) -> NDArray[np.float64]:
     """Moments (count, 13) of each region in some rows of blocks."""
     height, width = labels.shape
@@ -112,7 +125,7 @@ def _sum_moments(
             for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
                 for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
                     label, y = int(labels[i, j]), float(inverse[i, j])
-                    step = STRIDE if known[label] else 1
+                    step = stride if known[label] else 1
                     if label == 0 or y == 0 or i % step + j % step > 0:
                         continue
                     weight = step**2 / random_variance(sensor, y * y)

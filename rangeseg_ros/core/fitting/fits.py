@@ -58,6 +58,8 @@ class Fits(NamedTuple):
         Its systematic errors.
     inner : (rows, columns) uint16
         Region of each block of 4 x 4 pixels inside it, see `interior`.
+    step : int
+        Columns and rows of the image from one pixel that was looked at to the next.
     """
 
     cells: Cells
@@ -73,6 +75,7 @@ class Fits(NamedTuple):
     sensor: SensorModel
     systematic: Field
     inner: NDArray[np.uint16]
+    step: int = 1
 
     @classmethod
     def of(
@@ -158,9 +161,25 @@ class Fits(NamedTuple):
             inner=group.astype(np.uint16)[self.inner],
         )
 
+    def magnified(self, step: int, pixels: NDArray[np.intp]) -> Fits:
+        """The same planes, of regions of an image of which every `step`-th pixel was looked at.
+
+        Parameters
+        ----------
+        step : int
+        pixels : (M + 1,) int
+            Number of measured pixels of each region.
+        """
+        return self._replace(
+            pixels=pixels,
+            outliers=self.outliers * pixels // np.maximum(self.pixels, 1),
+            inner=self.inner.repeat(step, axis=0).repeat(step, axis=1),
+            step=step,
+        )
+
     def boxes(self) -> NDArray[np.intp]:
         """Bounding boxes (M + 1, 4), see `Cells.box`."""
-        box, first = self.cells.box[self.parts], self.start[:-1]
+        box, first = self.step * self.cells.box[self.parts], self.start[:-1]
         return np.concatenate(
             [np.minimum.reduceat(box[:, :2], first), np.maximum.reduceat(box[:, 2:], first)],
             axis=1,
