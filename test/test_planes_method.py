@@ -273,3 +273,28 @@ def test_labels_of_every_second_pixel_do_where_neighbours_repeat_each_other(
     assert areas == pytest.approx([far * (1.5 / camera.fx) ** 2, near * (1.2 / camera.fx) ** 2])
     width = np.ptp(result.planes[1].hull, axis=0)[0]
     assert width == pytest.approx((size[0] // 3 - 1) * 1.2 / camera.fx, rel=0.02)
+
+
+def test_planes_of_every_second_pixel_are_those_of_all():
+    frame = simulate_kinect(kinect_room(907), kinect_camera(), seed=907)
+    image = RangeImage.from_depth(frame.depth, frame.camera)
+    few, every = (Segmenter(Config(refits=n)).segment(image) for n in (0, 1))
+    assert few.labelling.labels.shape == (240, 320)
+    assert every.labelling.labels.shape == image.shape
+    compared = 0
+    for plane in every.planes:
+        mask = every.labels == plane.label
+        overlap = np.bincount(few.labels[mask], minlength=len(few.planes) + 1)
+        label = int(overlap.argmax())
+        if label == 0 or overlap[label] < 0.95 * max(mask.sum(), (few.labels == label).sum()):
+            continue
+        (same,) = (other for other in few.planes if other.label == label)
+        assert same.count == (few.labels == label).sum()
+        assert same.normal @ plane.normal > np.cos(np.radians(1))
+        assert same.distance == pytest.approx(plane.distance, rel=0.01)
+        assert same.rms == pytest.approx(plane.rms, rel=0.2)
+        assert same.confidence == pytest.approx(plane.confidence, abs=0.1)
+        assert same.area == pytest.approx(plane.area, rel=0.06)
+        assert np.linalg.norm(same.centre - plane.centre) < 0.1
+        compared += 1
+    assert compared > 5
