@@ -133,7 +133,8 @@ class Config:
     work_budget: float = option(
         1.0,
         'method planes: share of the full work that a frame may take; below 1 fewer boundaries '
-        'are refined, below 0.95 every second row and column is looked at, below 0.65 every fourth',
+        'are refined, below 0.95 every second row and column is looked at, below 0.65 every '
+        'fourth',
         low=0.0,
         high=1.0,
     )
