@@ -140,8 +140,8 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
     typical = int(np.median(views[views > 0]))
     if typical < _FEWEST_VIEWS:
         raise CalibrationError(
-            f'too few ranges: most parts of the image see planes at {typical} distances or less, '
-            f'{_FEWEST_VIEWS} are needed to tell the sensor from the shape of things; {ADVICE}'
+            f'too few ranges: most parts of the image see planes at no more than {typical} of the '
+            f'{_FEWEST_VIEWS} distances that tell the sensor from the shape of things; {ADVICE}'
         )
 
 
