@@ -147,11 +147,12 @@ class SequenceSegmenter:
             if height > 0 and not survey.sensor_height:
                 survey = replace(survey, sensor_height=height)
             survey = replace(survey, memory=self._ground, stamp=stamp)
-        known = [
-            replace(plane, id=seen.id, surface=seen.surface, role=seen.role)
-            for plane, seen in zip(result.planes, planes, strict=True)
-        ]
-        return replace(result, planes=known, survey=survey)
+        if image.place.any():
+            planes = [
+                replace(plane, id=seen.id, surface=seen.surface, role=seen.role)
+                for plane, seen in zip(result.planes, planes, strict=True)
+            ]
+        return replace(result, planes=planes, survey=survey)
 
     def _follow(
         self,

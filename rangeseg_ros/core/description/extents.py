@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK
+from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
@@ -203,17 +204,21 @@ def _limits(
     limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
     corners = 4 if half.any() else 1
     height, width = labels.shape
+    # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends. Others
+    # may bend, but lie inside where all neighbours are of the region, too.
+    outer, places = no_marks(width), np.empty(len(no_marks(width)), np.intp)
     for i in range(first, after):
+        if corners > 1:
+            _find_ends(labels[i], labels[i], labels[i], outer)
+        elif 0 < i < height - 1:
+            _find_ends(labels[i], labels[i - 1], labels[i + 1], outer)
+        else:
+            outer[:width] = 1
         within = inner[i // BLOCK]
-        for j in range(width):
+        for place in places[: find_marked(outer, 0, places)]:
+            j = int(place)
             label = labels[i, j]
-            if label == 0 or within[j // BLOCK] > 0:
-                continue
-            # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends.
-            alike = 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]
-            if alike and corners == 1:
-                alike = 0 < i < height - 1 and labels[i - 1, j] == label == labels[i + 1, j]
-            if alike or inverse[i, j] == 0:
+            if label == 0 or within[j // BLOCK] > 0 or inverse[i, j] == 0:
                 continue
             plane = theta[label]
             for corner in range(corners):
@@ -230,3 +235,23 @@ def _limits(
                     limits[label, a, 0] = min(limits[label, a, 0], value)
                     limits[label, a, 1] = max(limits[label, a, 1], value)
     return limits
+
+
+@njit(cache=True, nogil=True)
+def _find_ends(
+    row: NDArray[np.uint16],
+    above: NDArray[np.uint16],
+    below: NDArray[np.uint16],
+    ends: NDArray[np.uint8],
+) -> None:
+    """Mark the pixels of a row that have a neighbour of another region, or none."""
+    # Views, of which the compiler takes many pixels at a time.
+    last = len(row) - 1
+    middle, left, right = row[1:], row, row[2:]
+    upper, lower, inside = above[1:], below[1:], ends[1:]
+    for j in range(last - 1):
+        label = middle[j]
+        inside[j] = (
+            (label != left[j]) | (label != right[j]) | (label != upper[j]) | (label != lower[j])
+        )
+    ends[0] = ends[last] = 1
