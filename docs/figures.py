@@ -173,9 +173,10 @@ def stages(image, config):
     fine = Blocks.of(image)
     stated = SensorModel.from_config(config)
     sensor = measured_sensor(image, fine, stated)
-    steps, slopes = jump_steps(fine, sensor)
-    bridges = bridge_holes(image, steps, slopes)
-    jumps = jump_edges(bridges, config.jump_edges, steps, slopes)
+    steps = jump_steps(fine, sensor)
+    bridges = bridge_holes(image, steps.windows, steps.slopes)
+    told = steps.windows, steps.slopes, steps.pixels
+    jumps = jump_edges(bridges, config.jump_edges, *told)
     grid = weights(bridges, jumps, config.weighting)
     pictures['edges'] = with_edges(image, jumps)
 

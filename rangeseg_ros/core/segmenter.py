@@ -156,12 +156,14 @@ def _seen(
     grazing = sensor
     if config.method == 'normals':
         grazing = sensor._replace(column_noise=0.0, row_noise=0.0)
-    steps, slopes = jump_steps(blocks, grazing)
+    steps = jump_steps(blocks, grazing)
     if config.edge_step > 0:
-        steps = np.full_like(steps, config.edge_step)
+        given = np.full_like(steps.windows, config.edge_step)
+        steps = steps._replace(windows=given, pixels=given)
     # What was measured tells the planes; where they end is told with small holes bridged.
-    whole = bridge_holes(image, steps, slopes, holes.result())
-    jumps = jump_edges(whole, config.jump_edges, steps, slopes)
+    whole = bridge_holes(image, steps.windows, steps.slopes, holes.result())
+    told = steps.windows, steps.slopes, steps.pixels
+    jumps = jump_edges(whole, config.jump_edges, *told)
     grid = weights(whole, jumps, config.weighting)
     watch.lap('edges')
     least = least_pixels(config.min_pixels, image.shape)

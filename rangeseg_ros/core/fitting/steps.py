@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -13,9 +15,27 @@ from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, tilt_variance
 
 
-def jump_steps(
-    blocks: Blocks, sensor: SensorModel
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+class Steps(NamedTuple):
+    """Which steps of the inverse range are jumps, of blocks (rows, columns), 1/m.
+
+    Of a block that is not flat, by what is known of the flat ones beside it.
+
+    Attributes
+    ----------
+    windows : (rows, columns) float32
+        Smallest jump between means of windows: that of the flattest surface.
+    pixels : (rows, columns) float32
+        The same between pixels, which may be any surface's: that of the noisiest.
+    slopes : (rows, columns) float32
+        Change of the inverse range from pixel to pixel on the flattest surface.
+    """
+
+    windows: NDArray[np.float32]
+    pixels: NDArray[np.float32]
+    slopes: NDArray[np.float32]
+
+
+def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:
     """Smallest step of the inverse range that is a jump, and the slope of the surface.
 
     Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times
@@ -28,20 +48,11 @@ def jump_steps(
     blocks : Blocks
         (rows, columns).
     sensor : SensorModel
-
-    Returns
-    -------
-    steps : (rows, columns) float32
-        1/m.
-    slopes : (rows, columns) float32
-        Change of the inverse range from pixel to pixel, 1/m; where a block is not flat, that of
-        the flattest beside it.
     """
     shape = blocks.squared.shape
-    steps, slopes = np.empty(shape, np.float32), np.empty(shape, np.float32)
-    factor = 25 * 0.72 * sensor.agreement
-    run_rows(_find_steps, shape[0], blocks, sensor, factor, steps, slopes)
-    return steps, slopes
+    steps = Steps(*(np.empty(shape, np.float32) for _ in range(3)))
+    run_rows(_find_steps, shape[0], blocks, sensor, 25 * 0.72 * sensor.agreement, steps)
+    return steps
 
 
 @njit(cache=True, nogil=True)
@@ -51,15 +62,14 @@ def _find_steps(
     blocks: Blocks,
     sensor: SensorModel,
     factor: float,
-    steps: NDArray[np.float32],
-    slopes: NDArray[np.float32],
+    steps: Steps,
 ) -> None:
     """The same of some rows of blocks, in loops without branches but where a block is not flat."""
-    rows, columns = steps.shape
+    rows, columns = steps.windows.shape
     # Squared slopes of the flat blocks of three rows of blocks in turn with the variances that
-    # they add, and those taken for one row.
+    # they add, and those taken for one row: of the flattest, and the largest.
     flat, tilted = np.full((3, columns + 2), np.inf), np.zeros((3, columns + 2))
-    slope, tilt = np.empty(columns), np.empty(columns)
+    slope, tilt, rough = np.empty((3, columns))
     for i in range(first - 1, after + 1):
         flat[i % 3] = np.inf
         if 0 <= i < rows:
@@ -68,20 +78,25 @@ def _find_steps(
             continue
         for j in range(columns):
             slope[j], tilt[j] = flat[(i - 1) % 3, j + 1], tilted[(i - 1) % 3, j + 1]
+            rough[j] = tilt[j]
             if slope[j] == np.inf:
                 # That of a block that a jump crosses is the jump's: its neighbours' then.
+                rough[j] = 0.0
                 for k in range(3):
                     for m in range(j, j + 3):
                         if flat[k, m] < slope[j]:
                             slope[j], tilt[j] = flat[k, m], tilted[k, m]
+                        if flat[k, m] < np.inf:
+                            rough[j] = max(rough[j], tilted[k, m])
                 if slope[j] == np.inf:
                     slope[j] = tilt[j] = 0.0
         for j in range(columns):
             squared = blocks.squared[i - 1, j]
-            variance = random_variance(sensor, squared) + tilt[j]
-            rounding = max(sensor.quantum, sensor.range_quantum * squared)
-            steps[i - 1, j] = max(np.sqrt(factor * variance), 2.2 * rounding)
-            slopes[i - 1, j] = np.sqrt(slope[j])
+            variance = random_variance(sensor, squared)
+            rounding = 2.2 * max(sensor.quantum, sensor.range_quantum * squared)
+            steps.windows[i - 1, j] = max(np.sqrt(factor * (variance + tilt[j])), rounding)
+            steps.pixels[i - 1, j] = max(np.sqrt(factor * (variance + rough[j])), rounding)
+            steps.slopes[i - 1, j] = np.sqrt(slope[j])
 
 
 @njit(cache=True, nogil=True)

@@ -17,11 +17,15 @@ _SOBEL_GAIN = 4
 
 
 def jump_edges(
-    image: RangeImage, method: str, step: ArrayLike, slope: ArrayLike = 0.0
+    image: RangeImage,
+    method: str,
+    step: ArrayLike,
+    slope: ArrayLike = 0.0,
+    between: ArrayLike = 0.0,
 ) -> GridEdges | None:
-    """Jump edges by method `plane`, `sobel` or `none`; the first takes the smallest step."""
+    """Jump edges by method `plane`, `sobel` or `none`; the first takes the smallest steps."""
     if method == 'plane':
-        return plane_deviation(image, step, slope)
+        return plane_deviation(image, step, slope, between)
     if method == 'sobel':
         return sobel(image)
     return None

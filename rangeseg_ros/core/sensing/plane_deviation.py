@@ -19,7 +19,9 @@ _MARGIN = 2 * _WINDOW - 1
 _ROWS = 2 * _MARGIN
 
 
-def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) -> GridEdges:
+def plane_deviation(
+    image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0, between: ArrayLike = 0.0
+) -> GridEdges:
     """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
 
     In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
@@ -36,6 +38,8 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
         Deviation that makes a jump, 1/m, of all or of every block of 4 x 4 pixels.
     slope : float or (rows, columns) float
         Change of the inverse range from pixel to pixel on surfaces, 1/m.
+    between : float or (rows, columns) float
+        As `step`, between two pixels instead of windows; not less than `step`.
 
     Returns
     -------
@@ -47,10 +51,11 @@ def plane_deviation(image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0) 
     limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
     # Steps between two pixels that are no noise, and twice as steep as the flat surface around.
     clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
+    alone = np.maximum(limits, np.asarray(between, np.float32))
     horizontal = np.empty((height, width - 1), np.bool_)
     vertical = np.empty((height - 1, width), np.bool_)
     # Every strip looks once more at the rows around it: as few of them as there are threads.
-    arrays = image.inverse, limits, clear, horizontal, vertical
+    arrays = image.inverse, limits, alone, clear, horizontal, vertical
     run_rows(_find_jumps, height, *arrays, strips=1)
     return horizontal, vertical
 
@@ -61,6 +66,7 @@ def _find_jumps(
     after: int,
     inverse: NDArray[np.float32],
     steps: NDArray[np.float32],
+    alone: NDArray[np.float32],
     clear: NDArray[np.float32],
     horizontal: NDArray[np.bool_],
     vertical: NDArray[np.bool_],
@@ -73,8 +79,10 @@ def _find_jumps(
     """
     height, width = inverse.shape
     mean = np.full((_ROWS, width + 2 * _MARGIN), np.float32(np.nan))
-    # Of every second row of blocks in turn: the smallest deviation, and the clear step.
+    # Of every second row of blocks in turn: the smallest deviation, the clear step, and the
+    # smallest deviation between pixels.
     limit, bound = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
+    lone = np.empty((2, width), np.float32)
     # Between each pixel and the one before it, first and last there is none.
     across = np.zeros(width + 1, np.bool_)
     # Of every second row in turn: deviations from the next, strong pixels, their columns and the
@@ -94,6 +102,7 @@ def _find_jumps(
         if i % BLOCK == 0 or i < first:
             for j in range(width):
                 limit[block % 2, j] = steps[block, j // BLOCK]
+                lone[block % 2, j] = alone[block, j // BLOCK]
                 bound[block % 2, j] = clear[block, j // BLOCK]
         # Boundaries with the next row: the windows around the last row but one and so on.
         if 0 <= i < height - 1:
@@ -117,9 +126,9 @@ def _find_jumps(
         if count[now] > 0:
             _find_sides(i, inverse, places[now, : count[now]], side[now])
         if i < after:
-            _cross_right(i, inverse, strong, side, places, count, limit, bound, horizontal[i])
+            _cross_right(i, inverse, strong, side, places, count, lone, bound, horizontal[i])
         if i > first:
-            _cross_down(i - 1, inverse, strong, side, places, count, limit, bound, vertical[i - 1])
+            _cross_down(i - 1, inverse, strong, side, places, count, lone, bound, vertical[i - 1])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
