@@ -126,7 +126,9 @@ def test_pixels_between_take_the_label_of_the_least_energy(shape, step, kinds):
     inverse = (theta[truth] * camera.rays).sum(axis=2).astype(np.float32)
     inverse[draw.random(shape) < 0.1] = 0
     whole = RangeImage(camera.rays, inverse, camera)
-    image = RangeImage(camera.rays, inverse * (draw.random(shape) > 0.1), camera)
+    # As of a cloud, which has rays where something was measured.
+    measured = (inverse > 0) & (draw.random(shape) > 0.1)
+    image = RangeImage(camera.rays * measured[..., None], inverse * measured)
     sensor = SensorModel.from_config(Config(noise=0.003, distortion=0.002))
     told = few, step, image, whole, theta, sensor, 0.7
     for found, expected in zip(labels_of_all(*told), labels_by_hand(*told), strict=True):

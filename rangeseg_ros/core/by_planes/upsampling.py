@@ -56,7 +56,7 @@ def labels_of_all(
     """
     regions, labels = np.empty(image.shape, np.uint16), np.empty(image.shape, np.uint16)
     planes = theta, sensor, 4 * smoothness
-    pixels = image.inverse, whole.inverse, image.rays, image.pinhole
+    pixels = image.inverse, whole.inverse, whole.rays, whole.pinhole
     upper, lower = map_halves(_tell, len(labels), few, step, *planes, *pixels, regions, labels)
     return regions, labels, upper + lower
 
