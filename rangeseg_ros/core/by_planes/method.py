@@ -12,6 +12,7 @@ from rangeseg_ros.core.by_planes.curvature import find_curved
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
+from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.borders import Borders, find_borders
 from rangeseg_ros.core.fitting.coplanar import group_coplanar
@@ -33,14 +34,31 @@ class Labelling:
         0 = no plane.
     """
 
-    def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
+    def __init__(
+        self,
+        labels: NDArray[np.int32],
+        problem: Problem,
+        models: Models,
+        view: View,
+        smoothness: float,
+    ) -> None:
         self.labels = labels
         self._problem = problem
         self._models = models
+        # Of all pixels, where the labels are of every second one.
+        self._view = view
+        self._smoothness = smoothness
 
     def energy(self) -> float:
-        """Value of eq. 5.3."""
-        return energy(self.labels.ravel(), self._problem, self._models)
+        """Value of eq. 5.3 for all pixels, those left out with the labels of `labels_of_all`."""
+        labels, problem, view = self.labels, self._problem, self._view
+        if problem.step > 1:
+            size, sensor = problem.block * problem.step, view.sensor
+            few, planes = labels.astype(np.uint16), (self._models.theta, sensor)
+            pixels = view.image, view.whole, *planes, self._smoothness * sensor.patch
+            labels = labels_of_all(few, problem.step, *pixels)[0].astype(np.int32)
+            problem = Problem.of(view.whole, sensor, view.grid, size, self._smoothness)
+        return energy(labels.ravel(), problem, self._models)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""
@@ -90,7 +108,8 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> tuple[Lab
         problem, surface, nodes.moments, moments, sensor, config.exact, config.refits, cuts
     )
     lap('labels')
-    return Labelling(labels.reshape(seen.image.shape), problem, models), seen
+    labels = labels.reshape(seen.image.shape)
+    return Labelling(labels, problem, models, view, smoothness), seen
 
 
 def _posed(view: View, step: int, block: int, smoothness: float) -> tuple[View, Problem]:
