@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
+from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.jump_edges import beside, bridge_edges, plane_deviation, sobel
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -174,3 +175,20 @@ def test_small_images(shape):
         assert edges[0].shape == (shape[0], shape[1] - 1)
         assert edges[1].shape == (shape[0] - 1, shape[1])
         assert not edges[0].any() and not edges[1].any()
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('slope', [0.004, 0.012])
+def test_a_steep_face_whose_directions_err_reaches_the_jump_beside_it(slope, seed):
+    """Of blocks that the jump crosses, the wall behind tells the noise of no pixel of the face."""
+    random = np.random.default_rng(seed)
+    camera = Camera(100, 100, 80.0, 80.0, 49.5, 49.5)
+    rows, columns = np.indices(camera.shape)
+    face = 2 * columns < rows - 5
+    erring = columns + random.normal(0, 0.17, camera.shape)
+    inverse = np.where(face, 0.35 - slope * (erring - rows / 2), 0.23)
+    inverse += random.normal(0, 1e-4, camera.shape)
+    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    labels = Segmenter().segment(image).labels
+    found = labels == np.bincount(labels[face]).argmax()
+    assert (found & face).sum() > 0.996 * (found | face).sum()

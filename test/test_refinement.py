@@ -240,16 +240,6 @@ def test_no_pixel_gains_by_a_label_beside_it_after_the_descent(seed):
         assert energies(changed.reshape(-1, *labels.shape), problem, models).min() > value - 1e-4
 
 
-@pytest.mark.parametrize('seed', range(4))
-def test_costs_that_are_not_known_are_asked_for(seed):
-    problem, models, labels = random_case(seed, 20, 24, 4)
-    labels = labels.ravel()
-    known, unknown = labels.copy(), labels.copy()
-    descend((0, 20), known, costs(labels, problem, models), problem, models)
-    descend((0, 20), unknown, np.full(labels.size, -1, np.float32), problem, models)
-    assert (known == unknown).all() and (known != labels).any()
-
-
 @pytest.mark.parametrize('seed', [900, 901, 903])
 def test_every_second_pixel_tells_nearly_as_much_as_all(seed):
     frame = simulate_kinect(kinect_room(seed), kinect_camera(321, 241), seed=seed)

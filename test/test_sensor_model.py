@@ -13,7 +13,6 @@ from rangeseg_ros.core.fitting.errors import Errors, explaining
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.fitting.steps import jump_steps
-from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -280,24 +279,6 @@ def test_jumps_follow_the_noise():
     blocks = Blocks.of(image)
     steps = jump_steps(blocks, measured_sensor(image, blocks, STATED))
     assert np.median(steps.windows) < 6e-4
-
-
-@pytest.mark.parametrize('seed', range(3))
-@pytest.mark.parametrize('slope', [0.004, 0.012])
-def test_a_steep_face_whose_directions_err_reaches_the_jump_beside_it(slope, seed):
-    """Of blocks that the jump crosses, the wall behind tells the noise of no pixel of the face."""
-    random = np.random.default_rng(seed)
-    camera = Camera(100, 100, 80.0, 80.0, 49.5, 49.5)
-    rows, columns = np.indices(camera.shape)
-    face = 2 * columns < rows - 5
-    erring = columns + random.normal(0, 0.17, camera.shape)
-    inverse = np.where(face, 0.35 - slope * (erring - rows / 2), 0.23)
-    inverse += random.normal(0, 1e-4, camera.shape)
-    labels = (
-        Segmenter().segment(RangeImage(camera.rays, inverse.astype(np.float32), camera)).labels
-    )
-    found = labels == np.bincount(labels[face]).argmax()
-    assert (found & face).sum() > 0.996 * (found | face).sum()
 
 
 @pytest.mark.parametrize('width', [0.7, 2.0, 4.0])

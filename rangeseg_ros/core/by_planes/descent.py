@@ -196,7 +196,7 @@ def descend(
 
     In place, until no pixel of the rows from the first to before the second changes. It leaves the
     energy in a poor local minimum, but one from which the cuts have only the boundaries left to
-    move. A negative cost is not known yet.
+    move.
     """
     width = problem.width
     begin, end = rows[0] * width, rows[1] * width
@@ -227,8 +227,6 @@ def descend(
         waiting -= 1
         queued[p - begin] = False
         here = labels[p]
-        if cost[p] < 0:
-            cost[p] = data_cost(int(here), int(p), problem, models)
         least = np.float64(cost[p]) - LEAST_GAIN
         for k in range(4):
             q = p + offsets[k]

@@ -206,7 +206,8 @@ def _limits(
     height, width = labels.shape
     # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends. Others
     # may bend, but lie inside where all neighbours are of the region, too.
-    outer, places = no_marks(width), np.empty(len(no_marks(width)), np.intp)
+    outer = no_marks(width)
+    places = np.empty(len(outer), np.intp)
     for i in range(first, after):
         if corners > 1:
             _find_ends(labels[i], labels[i], labels[i], outer)
