@@ -8,6 +8,8 @@ import pytest
 from clouds import cloud_of
 from planes_of_labels import fit_planes
 
+from rangeseg_ros.core.description.extents import rectangles
+from rangeseg_ros.core.fitting.interior import fill, interior
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -187,3 +189,35 @@ def test_shapes_worked_out_later_or_in_another_process_are_the_same():
         for name in ('area', 'extents', 'centre', 'orientation', 'hull'):
             np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
             np.testing.assert_array_equal(getattr(here, name), getattr(later, name))
+
+
+@pytest.mark.parametrize('central', [True, False])
+@pytest.mark.parametrize('shape', [(40, 53), (9, 1), (1, 9), (2, 2)])
+def test_rectangles_reach_as_far_as_the_pixels(shape, central):
+    """Corners of the pixels of a pinhole camera, centres of others, each looked at by itself."""
+    draw = np.random.default_rng(3)
+    camera = Camera(shape[1], shape[0], 50.0, 55.0, shape[1] / 2, shape[0] / 2)
+    theta = np.array([[0.0, 0, 0], [0.1, 0.05, 0.5], [-0.1, 0.1, 0.7], [0.05, -0.2, 0.6]])
+    coarse = draw.integers(0, 4, (3, 4)).astype(np.uint16)
+    labels = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    labels[draw.random(shape) < 0.003] = 0
+    seen = camera.rays.copy()
+    if not central:
+        # Rows and columns that bend on a plane, one way and the other.
+        seen[..., 1] += np.sin(20 * camera.rays[..., 0]) / 3
+    inverse = (theta[labels] * seen).sum(axis=2).astype(np.float32)
+    inverse[draw.random(shape) < 0.01] = 0
+    image = RangeImage(seen, inverse, camera if central else None)
+    axes = np.stack([np.linalg.qr(draw.normal(size=(3, 2)))[0].T for _ in theta])
+    found = rectangles(labels, image, theta, axes, interior(labels, fill(labels)))
+    half = (0.5 / camera.fx, 0.5 / camera.fy) if central else (0.0, 0.0)
+    for label in range(1, 4):
+        rays = seen[(labels == label) & (inverse > 0)].astype(float)
+        if not len(rays):
+            assert not np.isfinite(found[label]).any()
+            continue
+        signs = [(x, y, 0) for x in (-1, 1) for y in (-1, 1)]
+        rays = np.concatenate([rays + np.multiply(sign, (*half, 0)) for sign in signs])
+        along = rays / (rays @ theta[label])[:, None] @ axes[label].T
+        np.testing.assert_allclose(found[label, :, 0], along.min(axis=0), atol=1e-6)
+        np.testing.assert_allclose(found[label, :, 1], along.max(axis=0), atol=1e-6)
