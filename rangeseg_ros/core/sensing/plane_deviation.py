@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
-from rangeseg_ros.core.sensing.marks import find_marked, no_marks
+from rangeseg_ros.core.sensing.marks import no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import OUTLIER
 
@@ -48,15 +48,11 @@ def plane_deviation(
     """
     height, width = image.shape
     blocks = -(-height // BLOCK), -(-width // BLOCK)
-    limits = np.broadcast_to(np.asarray(step, np.float32), blocks).copy()
-    # Steps between two pixels that are no noise, and twice as steep as the flat surface around.
-    clear = np.float32(OUTLIER) * limits + 2 * np.asarray(slope, np.float32)
-    alone = np.maximum(limits, np.asarray(between, np.float32))
+    limits = (np.full(blocks, limit, np.float32) for limit in (step, slope, between))
     horizontal = np.empty((height, width - 1), np.bool_)
     vertical = np.empty((height - 1, width), np.bool_)
     # Every strip looks once more at the rows around it: as few of them as there are threads.
-    arrays = image.inverse, limits, alone, clear, horizontal, vertical
-    run_rows(_find_jumps, height, *arrays, strips=1)
+    run_rows(_find_jumps, height, image.inverse, *limits, horizontal, vertical, strips=1)
     return horizontal, vertical
 
 
@@ -66,8 +62,8 @@ def _find_jumps(
     after: int,
     inverse: NDArray[np.float32],
     steps: NDArray[np.float32],
-    alone: NDArray[np.float32],
-    clear: NDArray[np.float32],
+    slopes: NDArray[np.float32],
+    between: NDArray[np.float32],
     horizontal: NDArray[np.bool_],
     vertical: NDArray[np.bool_],
 ) -> None:
@@ -79,31 +75,38 @@ def _find_jumps(
     """
     height, width = inverse.shape
     mean = np.full((_ROWS, width + 2 * _MARGIN), np.float32(np.nan))
+    # Sums of three pixels of each column and how many were measured, with a margin of zeros.
+    columns = np.zeros((2, width + 2), np.float32)
     # Of every second row of blocks in turn: the smallest deviation, the clear step, and the
     # smallest deviation between pixels.
     limit, bound = np.empty((2, width), np.float32), np.empty((2, width), np.float32)
     lone = np.empty((2, width), np.float32)
     # Between each pixel and the one before it, first and last there is none.
     across = np.zeros(width + 1, np.bool_)
-    # Of every second row in turn: deviations from the next, strong pixels, their columns and the
-    # number of these, and on which side of their local mean they lie.
+    # Of every second row in turn: deviations from the next, and strong pixels.
     down, strong = np.zeros((2, width), np.bool_), np.stack((no_marks(width), no_marks(width)))
-    places, count = np.empty(strong.shape, np.int32), np.zeros(2, np.int32)
-    side = np.zeros((2, width), np.bool_)
+    # Sums of windows of columns, with a margin of zeros; in float64, in which no order of the sum
+    # rounds.
+    total, count = np.zeros(width + 2 * _WINDOW), np.zeros(width + 2 * _WINDOW, np.int32)
+    # A row of pixels between two that were not measured, and a row of these.
+    row, nothing = np.zeros(width + 2, np.float32), np.zeros(width, np.float32)
     for k in range(max(first - _MARGIN, 0), min(first + _MARGIN - 1, height)):
-        _find_means(k, inverse, mean[k % _ROWS])
+        _find_means(k, inverse, columns, mean[k % _ROWS])
     for i in range(first - 1, min(after + 1, height)):
         ahead = i + _MARGIN
         if ahead < height:
-            _find_means(ahead, inverse, mean[ahead % _ROWS])
+            _find_means(ahead, inverse, columns, mean[ahead % _ROWS])
         else:
             mean[ahead % _ROWS] = np.float32(np.nan)
-        block = max(i, 0) // BLOCK
+        block, now = max(i, 0) // BLOCK, i % 2
         if i % BLOCK == 0 or i < first:
             for j in range(width):
-                limit[block % 2, j] = steps[block, j // BLOCK]
-                lone[block % 2, j] = alone[block, j // BLOCK]
-                bound[block % 2, j] = clear[block, j // BLOCK]
+                step = steps[block, j // BLOCK]
+                limit[block % 2, j] = step
+                lone[block % 2, j] = max(step, between[block, j // BLOCK])
+                # No noise, and twice as steep as the flat surface around.
+                clear = np.float32(OUTLIER) * step + np.float32(2) * slopes[block, j // BLOCK]
+                bound[block % 2, j] = clear
         # Boundaries with the next row: the windows around the last row but one and so on.
         if 0 <= i < height - 1:
             _leave(
@@ -112,33 +115,50 @@ def _find_jumps(
                 mean[(i + 2) % _ROWS, _MARGIN:],
                 mean[(i + 5) % _ROWS, _MARGIN:],
                 limit[block % 2],
-                down[i % 2],
+                down[now],
             )
         else:
-            down[i % 2] = False
+            down[now] = False
         if i < first:
             continue
-        row, now = mean[i % _ROWS, _MARGIN - 4 :], i % 2
-        _leave(row, row[3:], row[6:], row[9:], limit[block % 2], across[1:width])
+        means = mean[i % _ROWS, _MARGIN - 4 :]
+        _leave(means, means[3:], means[6:], means[9:], limit[block % 2], across[1:width])
         for j in range(width):
             strong[now, j] = down[0, j] | down[1, j] | across[j] | across[j + 1]
-        count[now] = find_marked(strong[now], 0, places[now])
-        if count[now] > 0:
-            _find_sides(i, inverse, places[now, : count[now]], side[now])
+        _tell_sides(i, inverse, total, count, strong[now])
         if i < after:
-            _cross_right(i, inverse, strong, side, places, count, lone, bound, horizontal[i])
+            row[1:-1] = inverse[i]
+            _cross(
+                (row, row[1:], row[2:], row[3:]),
+                (bound[block % 2], lone[block % 2]),
+                (strong[now], strong[now, 1:]),
+                horizontal[i],
+            )
         if i > first:
-            _cross_down(i - 1, inverse, strong, side, places, count, lone, bound, vertical[i - 1])
+            block = (i - 1) // BLOCK
+            before = inverse[i - 2] if i > 1 else nothing
+            beyond = inverse[i + 1] if i + 1 < height else nothing
+            _cross(
+                (before, inverse[i - 1], inverse[i], beyond),
+                (bound[block % 2], lone[block % 2]),
+                (strong[1 - now], strong[now]),
+                vertical[i - 1],
+            )
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _find_means(i: int, inverse: NDArray[np.float32], mean: NDArray[np.float32]) -> None:
+def _find_means(
+    i: int,
+    inverse: NDArray[np.float32],
+    columns: NDArray[np.float32],
+    mean: NDArray[np.float32],
+) -> None:
     """Means of windows of 3 x 3 pixels around those of a row, NaN where nothing was measured.
 
-    `mean` has a margin, in which it keeps what it holds.
+    `columns` (2, W + 2) and `mean` have a margin, in which they keep what they hold.
     """
     height, width = inverse.shape
-    total, count = np.zeros(width + 2, np.float32), np.zeros(width + 2, np.float32)
+    total, count = columns[0], columns[1]
     sums, known = total[1:-1], count[1:-1]
     above, here, below = inverse[max(i - 1, 0)], inverse[i], inverse[min(i + 1, height - 1)]
     # Outside of the image there is nothing.
@@ -179,129 +199,89 @@ def _leave(
 
 
 @njit(cache=True, nogil=True)
-def _find_sides(
-    i: int, inverse: NDArray[np.float32], places: NDArray[np.int32], side: NDArray[np.bool_]
-) -> None:
-    """Whether pixels at some places of a row are nearer than the mean of the 7 x 7 around them."""
-    height, width = inverse.shape
-    top, bottom = max(i - _WINDOW, 0), min(i + _WINDOW + 1, height)
-    # Of the columns, each once; in float64, in which no order of the sum rounds.
-    total, count = np.empty(width), np.empty(width, np.int32)
-    summed = 0
-    for j in places:
-        left, right = max(j - _WINDOW, 0), min(j + _WINDOW + 1, width)
-        for m in range(max(left, summed), right):
-            around, measured = 0.0, 0
-            for k in range(top, bottom):
-                around += np.float64(inverse[k, m])
-                measured += inverse[k, m] > 0
-            total[m], count[m] = around, measured
-        summed = right
-        around, measured = 0.0, 0
-        for m in range(left, right):
-            around += total[m]
-            measured += count[m]
-        side[j] = inverse[i, j] * np.float32(measured) > np.float32(around)
-
-
-# Boundaries are crossed between strong pixels on unlike sides of the local mean, and at every
-# clear step, because where three surfaces meet, two may lie on the same side of the mean. At
-# corners, where the windows hold little of one surface, contours would have gaps: beside strong
-# pixels, the pixels by themselves are looked at as the windows are.
-
-
-@njit(cache=True, nogil=True)
-def _cross_right(
+def _tell_sides(
     i: int,
     inverse: NDArray[np.float32],
-    strong: NDArray[np.uint8],
-    side: NDArray[np.bool_],
-    places: NDArray[np.int32],
+    total: NDArray[np.float64],
     count: NDArray[np.int32],
-    limit: NDArray[np.float32],
-    bound: NDArray[np.float32],
-    result: NDArray[np.bool_],
-) -> None:
-    """Jumps between the pixels of a row."""
-    width = inverse.shape[1]
-    now, block = i % 2, i // BLOCK % 2
-    row = np.zeros(width + 2, np.float32)
-    row[1:-1] = inverse[i]
-    a, b, c, d = row, row[1:], row[2:], row[3:]
-    _step_clearly(a, b, c, d, bound[block], limit[block], result)
-    for k in range(count[now]):
-        for j in range(max(places[now, k] - 1, 0), min(places[now, k] + 1, width - 1)):
-            if b[j] == 0 or c[j] == 0:
-                continue
-            both = strong[now, j] & strong[now, j + 1]
-            result[j] |= (both and side[now, j] != side[now, j + 1]) or _stands_out(
-                a[j], b[j], c[j], d[j], limit[block, j]
-            )
-
-
-@njit(cache=True, nogil=True)
-def _cross_down(
-    i: int,
-    inverse: NDArray[np.float32],
     strong: NDArray[np.uint8],
-    side: NDArray[np.bool_],
-    places: NDArray[np.int32],
-    count: NDArray[np.int32],
-    limit: NDArray[np.float32],
-    bound: NDArray[np.float32],
-    result: NDArray[np.bool_],
 ) -> None:
-    """Jumps between the pixels of a row and those below."""
-    height, width = inverse.shape
-    block = i // BLOCK % 2
-    nothing = np.zeros(width, np.float32)
-    a = inverse[i - 1] if i > 0 else nothing
-    b, c = inverse[i], inverse[i + 1]
-    d = inverse[i + 2] if i + 2 < height else nothing
-    _step_clearly(a, b, c, d, bound[block], limit[block], result)
-    for now in range(2):
-        for k in range(count[now]):
-            j = places[now, k]
-            if b[j] == 0 or c[j] == 0:
-                continue
-            both = strong[0, j] & strong[1, j]
-            result[j] |= (both and side[0, j] != side[1, j]) or _stands_out(
-                a[j], b[j], c[j], d[j], limit[block, j]
-            )
+    """Mark strong pixels of a row by 2 that are nearer than the mean of the 7 x 7 around them.
 
-
-@njit(cache=True, nogil=True)
-def _step_clearly(
-    a: NDArray[np.float32],
-    b: NDArray[np.float32],
-    c: NDArray[np.float32],
-    d: NDArray[np.float32],
-    clear: NDArray[np.float32],
-    step: NDArray[np.float32],
-    result: NDArray[np.bool_],
-) -> None:
-    """Whether the steps from b to c are clear, and no part of a slope.
-
-    That is what the one from a to b, or that from c to d, continues to within `step`: of a face
-    so narrow that no block tells its slope. What was not measured (0) continues nothing.
+    `total` and `count` (W + 6,) have a margin of zeros. Told for runs of eight pixels of which
+    one is strong, as the compiler takes many at a time.
     """
+    height, width = inverse.shape
+    eight, k = strong.view(np.uint64), 0
+    while k < len(eight):
+        first = 8 * k
+        while k < len(eight) and eight[k] > 0:
+            k += 1
+        after = min(8 * k, width)
+        k += 1
+        if first >= after:
+            continue
+        left, right = max(first - _WINDOW, 0), min(after + _WINDOW, width)
+        sums, known = total[left + _WINDOW : right + _WINDOW], count[left + _WINDOW :]
+        sums[:], known[: len(sums)] = 0, 0
+        for m in range(max(i - _WINDOW, 0), min(i + _WINDOW + 1, height)):
+            row = inverse[m, left:right]
+            for j in range(len(row)):
+                sums[j] += np.float64(row[j])
+                known[j] += row[j] > 0
+        sums, known, row, marks = (
+            total[first:],
+            count[first:],
+            inverse[i, first:after],
+            strong[first:],
+        )
+        for j in range(len(row)):
+            around, measured = 0.0, 0
+            for m in range(2 * _WINDOW + 1):
+                around += sums[j + m]
+                measured += known[j + m]
+            marks[j] <<= row[j] * np.float32(measured) > np.float32(around)
+
+
+@njit(cache=True, nogil=True)
+def _cross(
+    pixels: tuple[NDArray[np.float32], ...],
+    limits: tuple[NDArray[np.float32], NDArray[np.float32]],
+    strong: tuple[NDArray[np.uint8], NDArray[np.uint8]],
+    result: NDArray[np.bool_],
+) -> None:
+    """Jumps between pixels of a row and those beside them.
+
+    Boundaries are crossed between strong pixels on unlike sides of the local mean, and at every
+    clear step, because where three surfaces meet, two may lie on the same side of the mean. At
+    corners, where the windows hold little of one surface, contours would have gaps: beside strong
+    pixels, the pixels by themselves are looked at as the windows are.
+
+    A step that the one before or after it continues is no clear one: it is part of a face so
+    narrow that no block tells its slope. What was not measured (0) continues nothing.
+
+    Parameters
+    ----------
+    pixels : tuple of 4 (N,) float32
+        Inverse ranges before, on either side of and after each boundary.
+    limits : tuple of 2 (N,) float32
+        The clear step, and by how much two steps differ that do not continue each other.
+    strong : tuple of 2 (N,) uint8
+        Of the pixels on either side: 0 where they are not, 1 and 2 on either side of the mean.
+    result : (N,) bool
+    """
+    a, b, c, d = pixels
+    clear, limit = limits
+    one, other = strong
     # Without branches, so that the compiler takes many at a time.
     for j in range(len(result)):
-        here = c[j] - b[j]
-        before, after = abs(here - (b[j] - a[j])), abs(here - (d[j] - c[j]))
-        continued = ((a[j] > 0) & (before <= step[j])) | ((d[j] > 0) & (after <= step[j]))
-        result[j] = (b[j] > 0) & (c[j] > 0) & (abs(here) > clear[j]) & ~continued
-
-
-@njit(cache=True, nogil=True)
-def _stands_out(a: np.float32, b: np.float32, c: np.float32, d: np.float32, step: float) -> bool:
-    """Whether the step from b to c leaves those from a to b and c to d by more than `step`.
-
-    On the same side of both; one that was not measured (0) is left out.
-    """
-    here = c - b
-    if a == 0 and d == 0:
-        return False
-    before = here - (b - a) if a > 0 else here - (d - c)
-    after = here - (d - c) if d > 0 else before
-    return bool(min(before, after) > step or max(before, after) < -step)
+        here, step, marks = c[j] - b[j], limit[j], one[j] | other[j]
+        before, after = here - (b[j] - a[j]), here - (d[j] - c[j])
+        first, last = a[j] == 0, d[j] == 0
+        higher, lower = before > step, before < -step
+        rises, falls = after > step, after < -step
+        above, below = (first | higher) & (last | rises), (first | lower) & (last | falls)
+        apart = (first | higher | lower) & (last | rises | falls)
+        jumps = (apart & (abs(here) > clear[j])) | (marks == 3)
+        jumps |= (above | below) & ~(first & last) & (marks > 0)
+        result[j] = (b[j] > 0) & (c[j] > 0) & jumps
