@@ -1,4 +1,4 @@
-"""Rotation matrices and unit quaternions x, y, z, w.
+"""Rotation matrices, unit quaternions x, y, z, w, and cross products.
 
 The few forms that the core needs: to import SciPy's takes longer than to segment a frame.
 """
@@ -57,3 +57,10 @@ def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
     second = np.sinc(angle / (2 * np.pi)) ** 2 / 2
     rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
     return rotation
+
+
+def cross_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Cross products (N, 3) of vectors (N, 3); of few of them much faster than NumPy's."""
+    x, y, z = a.T
+    u, v, w = b.T
+    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)

@@ -149,7 +149,7 @@ class SequenceSegmenter:
             survey = replace(survey, memory=self._ground, stamp=stamp)
         if image.place.any():
             planes = [
-                replace(plane, id=seen.id, surface=seen.surface, role=seen.role)
+                plane.named(id=seen.id, surface=seen.surface, role=seen.role)
                 for plane, seen in zip(result.planes, planes, strict=True)
             ]
         return replace(result, planes=planes, survey=survey)
@@ -177,4 +177,4 @@ def with_roles(
 ) -> list[Plane]:
     """`planes` with their `roles`."""
     named = zip(planes, roles(planes, config, up), strict=True)
-    return [replace(plane, role=role) for plane, role in named]
+    return [plane.named(role=role) for plane, role in named]

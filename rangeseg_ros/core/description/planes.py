@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from numba import njit
@@ -75,6 +76,15 @@ class Plane:
     shape: Shape | RegionShape = field(repr=False)
     outline: Outline = field(repr=False)
     role: str = ''
+
+    def named(self, **names: int | str) -> Self:
+        """The same plane with another `id`, `surface` or `role`.
+
+        As `dataclasses.replace` does it, which takes each field by itself, ten times as long.
+        """
+        plane = object.__new__(type(self))
+        vars(plane).update(vars(self), **names)
+        return plane
 
     @property
     def area(self) -> float:

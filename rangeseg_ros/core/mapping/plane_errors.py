@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.rotations import cross_products
+
 
 def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3).
@@ -59,15 +61,8 @@ def shifted(
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     first = first - (first * normal).sum(axis=1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=1, keepdims=True)
-    axes = np.stack([first, _cross(normal, first)], axis=1)
+    axes = np.stack([first, cross_products(normal, first)], axis=1)
     return normal, point - step[:, 2:] * normal, axes
-
-
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cross products (N, 3); for few of them much faster than numpy's."""
-    x, y, z = a.T
-    u, v, w = b.T
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
 
 
 def cross_matrices(vectors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ moves along with the camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from functools import cache
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.rotations import cross_products
 from rangeseg_ros.core.tracking.tracks import (
     SURE_TURN,
     Tracks,
@@ -151,8 +152,10 @@ class Tracker:
         lost = ~np.isin(known.id, seen.id) & (known.unseen + elapsed <= self.config.track_time)
         self._tracks = seen.joined(known.where(lost).aged(elapsed))
         return [
-            replace(plane, id=int(i), surface=int(surface))
-            for plane, i, surface in zip(planes, seen.id, seen.surface, strict=True)
+            plane.named(id=i, surface=surface)
+            for plane, i, surface in zip(
+                planes, seen.id.tolist(), seen.surface.tolist(), strict=True
+            )
         ]
 
     def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
@@ -166,13 +169,13 @@ class Tracker:
             size = sum(planes[n].count for n in members)
             # Of surfaces that come apart, the one with the plane that gave the id keeps it.
             claims.append((claim not in own, -size, min(own), claim, largest, members))
-        distance = distances(seen, seen)
         holders: dict[int, int] = {}
         surfaces = [0] * len(planes)
         for _, _, own, claim, largest, members in sorted(claims):
             # Parts once found on one surface stay together for as long as they may be on one.
             for surface in (claim, own, self._next):
-                if distance[holders.setdefault(surface, largest), largest] <= _GATE:
+                holder = holders.setdefault(surface, largest)
+                if holder == largest or seen.apart[holder, largest] <= _GATE:
                     break
             self._next += surface == self._next
             for n in members:
@@ -206,17 +209,18 @@ def _camera_motion(
     """
     t, s = np.nonzero(_sure_pairs(known, seen, shared, speed))
     angle, offset = (variance[t, s] for variance in variances(known, seen))
-    start, distance, c = known.normal[t], known.distance[t], seen.centroid[s]
+    start, distance = known.normal[t], known.distance[t]
+    end, c = seen.normal[s], seen.centroid[s]
     rotation, shift = np.eye(3), np.zeros(3)
     prior = np.diag(np.repeat((reach * speed) ** -2.0, 3))
     for _ in range(_MOTION_ROUNDS):
         n = start @ rotation.T
-        turn, lever = np.cross(n, np.stack([seen.normal[s], c]))
+        turn, lever = cross_products(n, end), cross_products(n, c)
         gap = np.einsum('ni,ni->n', n, c - shift) + distance
         weight = 1 / (1 + (np.einsum('ni,ni->n', turn, turn) / angle + gap**2 / offset) / 4)
         # For w x n = n' - n the normal equations are (I - n n^T) w = n x n'.
         across = np.eye(3) * (weight / angle).sum() - (n.T * (weight / angle)) @ n
-        slope = np.hstack([lever, -n])
+        slope = np.concatenate([lever, -n], axis=1)
         left = prior + (slope.T * (weight / offset)) @ slope
         left[:3, :3] += across
         right = -(weight / offset * gap) @ slope
@@ -296,17 +300,24 @@ def _inherit(
     are to be close, as scraps of a grazing face are: things far apart on one plane are things of
     their own. And no large part is renamed after a sliver.
     """
-    near = are_near(known, seen, shared, 'radius') & (distance <= _GATE)
-    near &= 4 * known.size[:, None] >= seen.size
+
+    @cache
+    def near() -> NDArray[np.bool_]:
+        close = are_near(known, seen, shared, 'radius') & (distance <= _GATE)
+        result: NDArray[np.bool_] = close & (4 * known.size[:, None] >= seen.size)
+        return result
+
     surface = dict(zip(known.id.tolist(), known.surface.tolist(), strict=True))
+    ids = seen.id.tolist()
     for members in _groups(planes):
-        claim = min((surface[i] for i in seen.id[members].tolist() if i), default=0)
-        lost = np.flatnonzero(known.id == claim)
-        if claim in seen.id or not len(lost):
+        claim = min((surface[ids[n]] for n in members if ids[n]), default=0)
+        if claim in ids or not (known.id == claim).any():
             continue
-        heirs = [n for n in members if near[lost[0], n]]
+        lost = int(np.flatnonzero(known.id == claim)[0])
+        heirs = [n for n in members if near()[lost, n]]
         if not heirs:
             continue
-        heir = max(heirs, key=lambda n: (shared[lost[0], n], planes[n].count))
-        own = known.id == seen.id[heir]
-        known.id[lost], known.id[own], seen.id[heir] = seen.id[heir], claim, claim
+        heir = max(heirs, key=lambda n: (shared[lost, n], planes[n].count))
+        own = known.id == ids[heir]
+        known.id[lost], known.id[own], ids[heir] = ids[heir], claim, claim
+    seen.id[:] = ids

@@ -67,7 +67,7 @@ class Tracks:
             np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4),
             np.array([p.centroid for p in planes], np.float64).reshape(-1, 3),
             np.sqrt(np.maximum([p.area for p in planes], _SMALLEST) / np.pi),
-            np.array([np.hypot(*p.extents) / 2 for p in planes], np.float64),
+            np.linalg.norm([p.extents for p in planes] or np.zeros((0, 2)), axis=1) / 2,
             np.full(len(planes), elapsed),
             np.zeros(len(planes)),
             footprint,
@@ -78,6 +78,30 @@ class Tracks:
     def size(self) -> NDArray[np.intp]:
         """(N,) number of samples of each plane."""
         return np.bincount(self.owner, minlength=len(self.id))
+
+    @cached_property
+    def spread(self) -> NDArray[np.float64]:
+        """(N, 16) h h^T of h = (centroid, 1): h^T C h is the variance of the offset there."""
+        lever = np.column_stack([self.centroid, np.ones(len(self.id))])
+        return (lever[:, :, None] * lever[:, None]).reshape(-1, 16)
+
+    @cached_property
+    def offset_variance(self) -> NDArray[np.float64]:
+        """(N,) variance of the offset of each plane at its own centroid."""
+        result: NDArray[np.float64]
+        result = np.einsum('nk,nk->n', self.covariance.reshape(-1, 16), self.spread)
+        return result
+
+    @cached_property
+    def angle_variance(self) -> NDArray[np.float64]:
+        """(N,) variance of the angle of each plane."""
+        diagonal = np.einsum('nii->ni', self.covariance)
+        return diagonal[:, 0] + diagonal[:, 1] + diagonal[:, 2]
+
+    @cached_property
+    def apart(self) -> NDArray[np.float64]:
+        """(N, N) `distances` of the planes from each other."""
+        return distances(self, self)
 
     def moved(self, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> Tracks:
         """The planes in a frame in which x is at rotation x + shift."""
@@ -143,15 +167,11 @@ def variances(known: Tracks, seen: Tracks) -> tuple[NDArray[np.float64], NDArray
     """(T, N) variances to expect of the angles and offsets of planes of one surface."""
     ranges = np.einsum('ni,ni->n', seen.centroid, seen.centroid)
     floor = OFFSET**2 * ranges
-    lever = np.column_stack([seen.centroid, np.ones(len(seen.id))])
-    spread = np.einsum('ni,nj->nij', lever, lever).reshape(len(lever), 16)
     # h^T C h for the covariances of both planes: that of the known one at a centroid far from
     # its own is large, as it should be.
-    offset = known.covariance.reshape(-1, 16) @ spread.T + floor
-    offset += np.einsum('nk,nk->n', seen.covariance.reshape(-1, 16), spread)
-    angle = np.add.outer(
-        *(np.trace(t.covariance[:, :3, :3], axis1=1, axis2=2) for t in (known, seen))
-    )
+    offset = known.covariance.reshape(-1, 16) @ seen.spread.T + floor
+    offset += seen.offset_variance
+    angle = np.add.outer(known.angle_variance, seen.angle_variance)
     angle += floor * np.add.outer(known.radius**-2, seen.radius**-2) + ANGLE**2
     return np.minimum(angle, _LARGEST_ANGLE**2), np.minimum(offset, _LARGEST_OFFSET**2 * ranges)
 
