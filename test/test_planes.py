@@ -1,6 +1,7 @@
 """Planes: fit, place, shape and common surfaces, on exact planes and simulated errors."""
 
 import pickle
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -8,8 +9,7 @@ import pytest
 from clouds import cloud_of
 from planes_of_labels import fit_planes
 
-from rangeseg_ros.core.description.extents import rectangles
-from rangeseg_ros.core.fitting.interior import fill, interior
+from rangeseg_ros.core.description.extents import areas_and_axes, rectangles
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -191,6 +191,41 @@ def test_shapes_worked_out_later_or_in_another_process_are_the_same():
             np.testing.assert_array_equal(getattr(here, name), getattr(later, name))
 
 
+@pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
+@pytest.mark.parametrize('shape', [(40, 52), (43, 55)])
+def test_areas_are_those_of_the_pixels(shape, form):
+    """And the longest axis is that of their moments; blocks count by their middles."""
+    draw = np.random.default_rng(4)
+    camera = Camera(shape[1], shape[0], 500.0, 550.0, shape[1] / 2, shape[0] / 2)
+    theta = np.array([[0.0, 0, 0], [0.1, 0.05, 0.5], [-0.3, 0.4, 0.7], [0.05, -0.2, 0.6]])
+    coarse = draw.integers(0, 4, (3, 4)).astype(np.uint16)
+    labels = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    labels[draw.random(shape) < 0.003] = 0
+    inverse = (theta[labels] * camera.rays).sum(axis=2).astype(np.float32)
+    image = form(RangeImage(camera.rays, inverse, camera))
+    slope = np.linalg.norm(theta, axis=1)
+    tangents = np.stack([np.linalg.qr(np.column_stack([t, np.eye(3)]))[0].T[1:] for t in theta])
+    area, major = areas_and_axes(labels, image, theta, tangents)
+    for label in np.unique(labels[labels > 0]):
+        rays = camera.rays[labels == label].astype(float)
+        level = rays @ theta[label]
+        sizes = slope[label] / (camera.fx * camera.fy * level**3)
+        assert area[label] == pytest.approx(sizes.sum(), rel=1e-6 if image.camera else 2e-3)
+        points = rays / level[:, None]
+        values, axes = np.linalg.eigh(np.cov(points.T, aweights=sizes))
+        if values[2] > 1.2 * values[1]:
+            assert abs(axes[:, 2] @ major[label]) > np.cos(np.radians(0.5))
+
+
+def test_a_plane_by_another_name_is_the_same_plane():
+    labels = boxes((100, 100, 200, 300))
+    (plane,) = fit_planes(labels, plane_image(), KINECT)
+    found, told = plane.named(id=7, role='wall'), replace(plane, id=7, role='wall')
+    assert type(found) is type(told) and (plane.id, plane.role) == (1, '')
+    for field in fields(plane):
+        assert getattr(found, field.name) is getattr(told, field.name)
+
+
 @pytest.mark.parametrize('central', [True, False])
 @pytest.mark.parametrize('shape', [(40, 53), (9, 1), (1, 9), (2, 2)])
 def test_rectangles_reach_as_far_as_the_pixels(shape, central):
@@ -209,7 +244,7 @@ def test_rectangles_reach_as_far_as_the_pixels(shape, central):
     inverse[draw.random(shape) < 0.01] = 0
     image = RangeImage(seen, inverse, camera if central else None)
     axes = np.stack([np.linalg.qr(draw.normal(size=(3, 2)))[0].T for _ in theta])
-    found = rectangles(labels, image, theta, axes, interior(labels, fill(labels)))
+    found = rectangles(labels, image, theta, axes)
     half = (0.5 / camera.fx, 0.5 / camera.fy) if central else (0.0, 0.0)
     for label in range(1, 4):
         rays = seen[(labels == label) & (inverse > 0)].astype(float)

@@ -10,9 +10,12 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.ray_rows import ray_of
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
 _FAR = 2.0
+# Variance of the places of a block's pixels, along its rows or columns, pixels squared.
+_SPREAD = (BLOCK**2 - 1) / 12
 
 
 def areas_and_axes(
@@ -20,7 +23,6 @@ def areas_and_axes(
     image: RangeImage,
     theta: NDArray[np.float64],
     tangents: NDArray[np.float64],
-    inner: NDArray[np.uint16],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Area of regions and the axis along which they are longest.
 
@@ -34,8 +36,6 @@ def areas_and_axes(
         Planes, theta . ray = inverse range.
     tangents : (M + 1, 2, 3) float64
         Two orthonormal vectors in each plane.
-    inner : (rows, columns) uint16
-        Blocks inside regions, see `interior`.
 
     Returns
     -------
@@ -44,8 +44,9 @@ def areas_and_axes(
     major : (M + 1, 3) float64
         Unit vector in the plane of the largest second moment of the area, to the image's right.
     """
-    arrays = labels, image.inverse, image.rays, _footprints(image), theta, tangents, inner
-    upper, lower = map_halves(_area_moments, len(labels), *arrays)
+    pixels = image.inverse, image.rays, image.pinhole, _footprints(image)
+    rows = -(-len(labels) // BLOCK)
+    upper, lower = map_halves(_area_moments, rows, labels, *pixels, theta, tangents)
     sums = upper + lower
     # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
     area = sums[:, 0] * np.linalg.norm(theta, axis=1)
@@ -64,7 +65,6 @@ def rectangles(
     image: RangeImage,
     theta: NDArray[np.float64],
     axes: NDArray[np.float64],
-    inner: NDArray[np.uint16],
 ) -> NDArray[np.float64]:
     """Rectangles around regions on their planes.
 
@@ -74,8 +74,6 @@ def rectangles(
         As for `areas_and_axes`.
     axes : (M + 1, 2, 3) float64
         Directions of the rectangles' sides.
-    inner
-        As for `areas_and_axes`.
 
     Returns
     -------
@@ -85,7 +83,7 @@ def rectangles(
     """
     camera = image.camera
     half = (0.5 / camera.fx, 0.5 / camera.fy) if camera and camera.pinhole else (0.0, 0.0)
-    arrays = labels, image.inverse, image.rays, theta, axes, inner
+    arrays = labels, image.inverse, image.rays, image.pinhole, theta, axes
     upper, lower = map_halves(_limits, len(labels), *arrays, image.axes[:, :2] * half)
     # Smallest and largest.
     return np.stack([np.minimum(upper, lower)[..., 0], np.maximum(upper, lower)[..., 1]], axis=2)
@@ -94,7 +92,8 @@ def rectangles(
 def _footprints(image: RangeImage) -> NDArray[np.float32]:
     """|du x dv . r|, (H, W), of the rays r and their differences from pixel to pixel."""
     if image.camera and image.camera.pinhole:
-        return np.full(image.shape, 1 / (image.camera.fx * image.camera.fy), np.float32)
+        same = np.float32(1 / (image.camera.fx * image.camera.fy))
+        return np.broadcast_to(same, image.shape)
     return _ray_footprints(image.rays, image.inverse)
 
 
@@ -132,56 +131,94 @@ def _area_moments(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     footprints: NDArray[np.float32],
     theta: NDArray[np.float64],
     tangents: NDArray[np.float64],
-    inner: NDArray[np.uint16],
 ) -> NDArray[np.float64]:
-    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2: a is area over |theta|.
+    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2 of rows of blocks.
 
-    A block inside a region counts as so many times its middle.
+    a is area over |theta|. A block of one label counts as so many times its middle.
     """
     sums = np.zeros((len(theta), 6))
-    width = labels.shape[1]
-    for i in range(first, after):
-        within, middle = inner[i // BLOCK], i % BLOCK == BLOCK // 2
-        j = 0
-        while j < width:
-            label = int(labels[i, j])
-            if label == 0:
-                j += 1
+    height, width = labels.shape
+    for bi in range(first, after):
+        top, bottom = bi * BLOCK, min((bi + 1) * BLOCK, height)
+        for left in range(0, width, BLOCK):
+            right, label = min(left + BLOCK, width), labels[top, left]
+            if bottom - top == BLOCK and right - left == BLOCK and _is_filled(labels, top, left):
+                if label == 0:
+                    continue
+                i, j = top + BLOCK // 2, left + BLOCK // 2
+                # Of the four pixels in the middle, three tell all.
+                one = _ray(rays, pinhole, i - 1, j - 1)
+                next_one, other = _ray(rays, pinhole, i - 1, j), _ray(rays, pinhole, i, j)
+                ray = (one[0] + other[0]) / 2, (one[1] + other[1]) / 2, (one[2] + other[2]) / 2
+                level = _along(theta, label, ray)
+                right_step = _along(theta, label, next_one) - _along(theta, label, one)
+                down_step = _along(theta, label, other) - _along(theta, label, next_one)
+                # The mean of 1 / level^3 over them, to the second order.
+                bend = 6 * _SPREAD * (right_step**2 + down_step**2) / max(level**2, 1e-300)
+                size = BLOCK * BLOCK * (1 + bend) * footprints[i, j]
+                _add_area(sums, label, theta, tangents, ray, inverse[i, j], size)
                 continue
-            plane, across, along = theta[label], tangents[label, 0], tangents[label, 1]
-            # In variables of their own: sums in an array go through memory for every pixel.
-            one = su = sv = suu = suv = svv = 0.0
-            while j < width and labels[i, j] == label:
-                pixels = 1
-                if within[j // BLOCK] > 0:
-                    if not middle:
-                        j = (j // BLOCK + 1) * BLOCK
-                        continue
-                    pixels = BLOCK * BLOCK
-                    j = j // BLOCK * BLOCK + BLOCK // 2
-                y = inverse[i, j]
-                x0, x1, x2 = float(rays[i, j, 0]), float(rays[i, j, 1]), float(rays[i, j, 2])
-                if pixels > 1:
-                    # Of the four pixels in the middle, two will do.
-                    x0 = (x0 + rays[i - 1, j - 1, 0]) / 2
-                    x1 = (x1 + rays[i - 1, j - 1, 1]) / 2
-                    x2 = (x2 + rays[i - 1, j - 1, 2]) / 2
-                level = plane[0] * x0 + plane[1] * x1 + plane[2] * x2
-                if y > 0 and level * _FAR >= y:
-                    z = 1 / level
-                    u = z * (across[0] * x0 + across[1] * x1 + across[2] * x2)
-                    v = z * (along[0] * x0 + along[1] * x1 + along[2] * x2)
-                    area = pixels * footprints[i, j] * z * z * z
-                    au, av = area * u, area * v
-                    one, su, sv = one + area, su + au, sv + av
-                    suu, suv, svv = suu + au * u, suv + au * v, svv + av * v
-                j += 1 if pixels == 1 else BLOCK // 2
-            for entry, value in enumerate((one, su, sv, suu, suv, svv)):
-                sums[label, entry] += value
+            for i in range(top, bottom):
+                for j in range(left, right):
+                    label = labels[i, j]
+                    if label > 0:
+                        ray, size = _ray(rays, pinhole, i, j), float(footprints[i, j])
+                        _add_area(sums, label, theta, tangents, ray, inverse[i, j], size)
     return sums
+
+
+@njit(cache=True, inline='always')
+def _is_filled(labels: NDArray[np.uint16], top: int, left: int) -> bool:
+    """Whether a block has one label."""
+    label = labels[top, left]
+    # Without branches.
+    unlike = label ^ label
+    for i in range(BLOCK):
+        for j in range(BLOCK):
+            unlike |= labels[top + i, left + j] ^ label
+    return unlike == 0
+
+
+@njit(cache=True, inline='always')
+def _add_area(
+    sums: NDArray[np.float64],
+    label: int,
+    theta: NDArray[np.float64],
+    tangents: NDArray[np.float64],
+    ray: tuple[float, float, float],
+    inverse: float,
+    size: float,
+) -> None:
+    """Add the moments of what is seen along a ray; `size` is its footprint."""
+    level = _along(theta, label, ray)
+    if inverse > 0 and level * _FAR >= inverse:
+        depth = 1 / level
+        across = depth * _along(tangents[:, 0], label, ray)
+        along = depth * _along(tangents[:, 1], label, ray)
+        area = size * depth * depth * depth
+        sums[label, 0] += area
+        sums[label, 1] += area * across
+        sums[label, 2] += area * along
+        sums[label, 3] += area * across * across
+        sums[label, 4] += area * across * along
+        sums[label, 5] += area * along * along
+
+
+@njit(cache=True, inline='always')
+def _ray(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[float, float, float]:
+    """Ray of a pixel."""
+    x, y, z = ray_of(rays, pinhole, i, j)
+    return float(x), float(y), float(z)
+
+
+@njit(cache=True, inline='always')
+def _along(vectors: NDArray[np.float64], label: int, ray: tuple[float, float, float]) -> float:
+    """Product of a ray and the vector of a region."""
+    return vectors[label, 0] * ray[0] + vectors[label, 1] * ray[1] + vectors[label, 2] * ray[2]
 
 
 @njit(cache=True, nogil=True)
@@ -191,9 +228,9 @@ def _limits(
     labels: NDArray[np.uint16],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     theta: NDArray[np.float64],
     axes: NDArray[np.float64],
-    inner: NDArray[np.uint16],
     half: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Smallest and largest coordinates (M + 1, 2, 2) along the axes.
@@ -215,18 +252,17 @@ def _limits(
             _find_ends(labels[i], labels[i - 1], labels[i + 1], outer)
         else:
             outer[:width] = 1
-        within = inner[i // BLOCK]
         for place in places[: find_marked(outer, 0, places)]:
             j = int(place)
             label = labels[i, j]
-            if label == 0 or within[j // BLOCK] > 0 or inverse[i, j] == 0:
+            if label == 0 or inverse[i, j] == 0:
                 continue
-            plane = theta[label]
+            plane, ray = theta[label], ray_of(rays, pinhole, i, j)
             for corner in range(corners):
                 right, down = 1 - 2 * (corner & 1), 1 - (corner & 2)
-                x = rays[i, j, 0] + half[0, 0] * right + half[0, 1] * down
-                y = rays[i, j, 1] + half[1, 0] * right + half[1, 1] * down
-                z = rays[i, j, 2] + half[2, 0] * right + half[2, 1] * down
+                x = ray[0] + half[0, 0] * right + half[0, 1] * down
+                y = ray[1] + half[1, 0] * right + half[1, 1] * down
+                z = ray[2] + half[2, 0] * right + half[2, 1] * down
                 level = plane[0] * x + plane[1] * y + plane[2] * z
                 if level * _FAR < inverse[i, j]:
                     continue

@@ -157,7 +157,7 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         distance, covariance = distance - normal @ image.place, told @ covariance @ told.T
         centroid = centroid + image.place
 
-    shapes = Shapes(labels, image, theta, fits.inner)
+    shapes = Shapes(labels, image, theta)
     boxes = fits.boxes()
     places = boxes.tolist()
     outlines = {k: _outline(k, labels, image, places[k], theta[k]) for k in found.tolist()}

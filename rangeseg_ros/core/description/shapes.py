@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.extents import areas_and_axes, rectangles
-from rangeseg_ros.core.rotations import quaternions
+from rangeseg_ros.core.rotations import cross_products, quaternions
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
@@ -33,8 +33,6 @@ class Shapes:
         (H, W).
     theta : (M + 1, 3) float64
         Planes, theta . ray = inverse range; zeros where there is none.
-    inner : (rows, columns) uint16
-        Blocks inside regions, see `interior`.
     """
 
     def __init__(
@@ -42,11 +40,10 @@ class Shapes:
         labels: NDArray[np.uint16],
         image: RangeImage,
         theta: NDArray[np.float64],
-        inner: NDArray[np.uint16],
     ) -> None:
         self._lock = Lock()
         self._source: tuple[NDArray[np.uint16], RangeImage] | None = labels, image
-        self._theta, self._inner = theta, inner
+        self._theta = theta
         self._shapes: list[Shape] = []
         self._finite = np.zeros(0, np.bool_)
 
@@ -61,9 +58,11 @@ class Shapes:
         return self._finite
 
     def _work_out(self) -> None:
+        if self._source is None:
+            return
         with self._lock:
             if self._source is not None:
-                self._shapes, self._finite = _measure(*self._source, self._theta, self._inner)
+                self._shapes, self._finite = _measure(*self._source, self._theta)
                 # The image may be large, and planes are kept.
                 self._source = None
 
@@ -98,15 +97,14 @@ def _measure(
     labels: NDArray[np.uint16],
     image: RangeImage,
     theta: NDArray[np.float64],
-    inner: NDArray[np.uint16],
 ) -> tuple[list[Shape], NDArray[np.bool_]]:
     """The shapes, and which of them are finite."""
     slope = np.linalg.norm(theta, axis=1)
     distance = np.divide(1, slope, out=np.zeros_like(slope), where=slope > 0)
     normal = -theta * distance[:, None]
-    area, major = areas_and_axes(labels, image, theta, _tangents(normal), inner)
-    axes = np.stack([major, np.cross(normal, major)], axis=1)
-    limits = rectangles(labels, image, theta, axes, inner)
+    area, major = areas_and_axes(labels, image, theta, _tangents(normal))
+    axes = np.stack([major, cross_products(normal, major)], axis=1)
+    limits = rectangles(labels, image, theta, axes)
     finite = np.isfinite(limits).all(axis=(1, 2)) & np.isfinite(area) & (slope > 0)
     limits[~finite], area[~finite] = 0, 0
     extents = limits[..., 1] - limits[..., 0]
@@ -120,6 +118,6 @@ def _measure(
 def _tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
     """Two unit vectors across each normal, (N, 2, 3)."""
     across = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, across)
+    first = cross_products(normal, across)
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
-    return np.stack([first, np.cross(normal, first)], axis=1)
+    return np.stack([first, cross_products(normal, first)], axis=1)
