@@ -9,7 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
+
+_SQUARE = np.ones((3, 3), np.uint8)
 
 
 def colours(ids: Sequence[int] | NDArray) -> NDArray[np.uint8]:
@@ -76,7 +79,7 @@ def overlay(
         numbers[plane.label] = plane.id
     palette = colours(numbers)
     base = cv2.cvtColor(grey(inverse), cv2.COLOR_GRAY2RGB)
-    picture: NDArray = cv2.addWeighted(base, 0.45, np.take(palette, labels, axis=0), 0.55, 0)
+    picture: NDArray = cv2.addWeighted(base, 0.45, look_up(palette, labels), 0.55, 0)
     cv2.copyTo(base, (labels == 0).view(np.uint8), picture)
     cv2.copyTo(np.zeros_like(base), _borders(labels).view(np.uint8), picture)
     half = labels[::2, ::2].copy()
@@ -126,7 +129,7 @@ def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale
     (wide, high), below = cv2.getTextSize(text, font, scale, 1)
     letters = np.zeros((high + below + 2 * margin, wide + 2 * margin), np.uint8)
     cv2.putText(letters, text, (margin, margin + high), font, scale, 255, 1, cv2.LINE_AA)
-    outline = cv2.dilate(letters, np.ones((3, 3), np.uint8))
+    outline = cv2.dilate(letters, _SQUARE)
     top, left = (
         max(0, min(middle - size // 2, full - size))
         for middle, size, full in zip(centre[::-1], letters.shape, picture.shape, strict=False)

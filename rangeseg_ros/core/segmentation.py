@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.meaning.ramps import Ramp, ramps_of
@@ -108,7 +109,7 @@ class Segmentation:
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
             table[plane.label] = plane.normal
-        return np.take(table, self.labels, axis=0)
+        return look_up(table, self.labels)
 
     @cached_property
     def edges(self) -> NDArray[np.bool_]:

@@ -167,20 +167,10 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     return _cloud(make, header, rows)
 
 
-def points_message(
-    make: Make,
-    header: Any,
-    points: NDArray[np.floating],
-    height: NDArray[np.floating] | None = None,
-) -> Any:
-    """sensor_msgs/PointCloud2 of points (N, 3), metres, and of their `height` (N,) if given."""
-    if height is None:
-        rows = np.ascontiguousarray(points, '<f4').view(_POINT_TYPE)[:, 0]
-    else:
-        columns = np.empty((len(points), 4), '<f4')
-        columns[:, :3], columns[:, 3] = points, height
-        rows = columns.view(_HEIGHT_TYPE)[:, 0]
-    return _cloud(make, header, rows)
+def points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
+    """sensor_msgs/PointCloud2 of points (N, 3), metres, or (N, 4) with their height."""
+    kind = _POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
+    return _cloud(make, header, np.ascontiguousarray(points, '<f4').view(kind)[:, 0])
 
 
 def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.meaning.class_points import points_of_class
 from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
 from rangeseg_ros.core.meaning.ground import Terrain
@@ -31,6 +32,8 @@ from rangeseg_ros.messages.markers import (
     of_stairs,
 )
 from rangeseg_ros.messages.status import status_message
+
+_NONE = np.zeros((0, 4), np.float32)
 
 
 @dataclass(frozen=True)
@@ -87,13 +90,11 @@ def _terrain(make: Make, header: Any, image: RangeImage, result: Segmentation) -
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, np.flatnonzero(result.terrain == GROUND)))
+    return points_message(make, header, _points(image, result, GROUND)[:, :3])
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    pixels = np.flatnonzero(result.terrain == OBSTACLE)
-    height = np.take(result.height, pixels)
-    return points_message(make, header, _points(image, pixels), height)
+    return points_message(make, header, _points(image, result, OBSTACLE))
 
 
 def _drops(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -111,16 +112,12 @@ def _crossings(
     result: Segmentation,
     find: Callable[[RangeImage, Terrain], NDArray[np.float32]],
 ) -> Any:
-    found = np.zeros((0, 4), np.float32) if result.ground is None else find(image, result.ground)
-    return points_message(make, header, found[:, :3], found[:, 3])
+    found = _NONE if result.ground is None else find(image, result.ground)
+    return points_message(make, header, found)
 
 
-def _points(image: RangeImage, pixels: NDArray[np.intp]) -> NDArray[np.float32]:
-    # Of these pixels only, which is faster than RangeImage.points, and by number than by mask.
-    points = np.take(image.rays.reshape(-1, 3), pixels, axis=0)
-    points /= np.take(image.inverse, pixels)[:, None]
-    points += image.place
-    return points
+def _points(image: RangeImage, result: Segmentation, kind: int) -> NDArray[np.float32]:
+    return _NONE if result.ground is None else points_of_class(image, result.ground, kind)
 
 
 def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
