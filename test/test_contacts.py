@@ -38,7 +38,8 @@ def as_matrix(contacts, values):
 def test_contacts_stay_those_of_the_grid(seed):
     rng = np.random.default_rng(seed)
     shape, count = (14, 17), 25
-    part = np.repeat(np.repeat(rng.integers(0, count, (7, 9)), 2, 0), 2, 1)[:, : shape[1]]
+    coarse = rng.integers(0, count, (7, 9), np.int32)
+    part = coarse.repeat(2, 0).repeat(2, 1)[:, : shape[1]]
     right = rng.random((shape[0], shape[1] - 1)) < 0.8
     below = rng.random((shape[0] - 1, shape[1])) < 0.8
     contacts = find_contacts(part, right, below, count)
@@ -56,7 +57,7 @@ def test_contacts_stay_those_of_the_grid(seed):
             assert least == pytest.approx(later.min(initial=np.inf))
             assert h == -1 or contacts.target[h] == a + 1 + later.argmin()
         a, b = (int(k) for k in rng.choice(np.argwhere(found > 0)))
-        part = np.where(part == b, a, part)
+        part[part == b] = a
         absorb(contacts, values, a, b)
         both = np.nansum(told[[a, b]], 0)
         both[[a, b]] = 0

@@ -38,13 +38,13 @@ class Contacts(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def find_contacts(
-    part: NDArray[np.intp], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
+    part: NDArray[np.int32], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
 ) -> Contacts:
     """Contacts between the parts of a grid of blocks.
 
     Parameters
     ----------
-    part : (rows, columns) int
+    part : (rows, columns) int32
         0 for none, otherwise 1...N - 1.
     right, below : (rows, columns - 1), (rows - 1, columns) bool
         Whether a block touches its neighbour.
@@ -60,13 +60,15 @@ def find_contacts(
     for i in range(rows):
         for j in range(columns):
             a = part[i, j]
+            if a == 0:
+                continue
             for k in range(2):
                 if k == 0 and (j + 1 == columns or not right[i, j]):
                     continue
                 if k == 1 and (i + 1 == rows or not below[i, j]):
                     continue
                 b = part[i, j + 1] if k == 0 else part[i + 1, j]
-                if a == b or a == 0 or b == 0:
+                if b in (a, np.int32(0)):
                     continue
                 h = head[a]
                 while h >= 0 and target[h] != b:

@@ -38,7 +38,7 @@ _DOMAIN = 2 * REACH
 
 def refine(
     problem: Problem,
-    surfaces: NDArray[np.intp],
+    surfaces: NDArray[np.int32],
     blocks: NDArray[np.float64],
     moments: NDArray[np.float64],
     sensor: SensorModel,
@@ -53,7 +53,7 @@ def refine(
     Parameters
     ----------
     problem : Problem
-    surfaces : (rows, columns) int
+    surfaces : (rows, columns) int32
         Surface of each block, 0...K, 0 for none.
     blocks : (rows, columns, 13) float64
         Moments of the blocks, weighted.
@@ -77,11 +77,10 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    starts = surfaces.astype(np.int32)
     smooth, block = sensor.distortion_pixels, problem.block * problem.step
-    models = _shifted(Models.of(moments, smooth), starts, blocks, sensor, block)
-    labels, cost = nearest(problem, starts, models)
-    domains = _domains(starts, problem, len(moments)) if exact else None
+    models = _shifted(Models.of(moments, smooth), surfaces, blocks, sensor, block)
+    labels, cost = nearest(problem, surfaces, models)
+    domains = _domains(surfaces, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
     value = energy(labels, problem, models) if refits else 0.0
     for _ in range(refits):
@@ -90,7 +89,7 @@ def refine(
         weight = problem.weight.reshape(shape)
         moments = region_moments(labels.reshape(shape), len(moments), *arrays, weight, sensor)
         refitted = Models.of(moments, smooth)._replace(half_precision=models.half_precision)
-        refitted = _shifted(refitted, starts, blocks, sensor, block)
+        refitted = _shifted(refitted, surfaces, blocks, sensor, block)
         better = labels.copy()
         _minimise(better, costs(better, problem, refitted), problem, refitted, domains, cuts)
         last, value = value, energy(better, problem, refitted)

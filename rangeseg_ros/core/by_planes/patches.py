@@ -24,6 +24,8 @@ _ROUGH = OUTLIER**2
 _PER_VARIANCE = 256
 # Patches are nearly never rougher than their blocks.
 _LEVELS = 16 * _PER_VARIANCE
+# Above all numbers of patches.
+_NONE = np.uint32(0xFFFFFFFF)
 
 
 @njit(cache=True, nogil=True)
@@ -60,8 +62,17 @@ def grow_patches(
     for a in range(len(blocks)):
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     pairs = _pairs(smooth.reshape(shape), right, below)
-    parent = _quads(blocks, residual, smooth.reshape(shape), right, below, largest)
-    return _grow(blocks, residual, smooth, pairs, parent, largest, agreement) + first * shape[1]
+    root = find_roots(_quads(blocks, residual, smooth.reshape(shape), right, below, largest))
+    # Close together, as those that are left fit into the cache.
+    kept = np.flatnonzero(smooth & (root == np.arange(len(root))))
+    number = np.zeros(len(root), np.uint32)
+    for k in range(len(kept)):
+        number[kept[k]] = k
+    grown = _grow(blocks[kept], residual[kept], number[root], pairs, largest, agreement)
+    for a in range(len(root)):
+        if smooth[a]:
+            root[a] = kept[grown[number[root[a]]]]
+    return root + first * shape[1]
 
 
 @njit(cache=True)
@@ -86,7 +97,7 @@ def _pairs(
     return pairs[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def misfit(
     extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float, agreement: float
 ) -> float:
@@ -164,68 +175,68 @@ def _quads(
     return parent
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _grow(
     moments: NDArray[np.float64],
     residual: NDArray[np.float64],
-    nodes: NDArray[np.bool_],
+    number: NDArray[np.uint32],
     pairs: NDArray[np.intp],
-    parent: NDArray[np.intp],
     largest: float,
     agreement: float,
-) -> NDArray[np.intp]:
-    """Merge blocks to patches of at most `largest` pixels, the flattest first, each with the
+) -> NDArray[np.uint32]:
+    """Merge parts to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
 
-    Returns the root of each block's patch, itself for a block that is no node.
+    Given are the parts' moments (N, 13) and residuals (N,), and of blocks the part of each and
+    which ones touch. Returns the root of each part's patch.
     """
     count = len(moments)
     # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
-    head, tail = np.full(count, -1, np.int32), np.full(count, -1, np.int32)
-    link = np.full(2 * len(pairs), -1, np.int32)
-    target = np.empty(2 * len(pairs), np.int32)
-    root = find_roots(parent)
+    # Unsigned, as indices that may be negative take longer.
+    head, tail = np.full(count, _NONE), np.full(count, _NONE)
+    link, target = np.full(2 * len(pairs), _NONE), np.empty(2 * len(pairs), np.uint32)
     for e in range(2 * len(pairs)):
-        a, b = root[pairs[e // 2, e % 2]], root[pairs[e // 2, 1 - e % 2]]
+        a, b = number[pairs[e // 2, e % 2]], number[pairs[e // 2, 1 - e % 2]]
         if a == b:
             continue
         target[e], link[e] = b, head[a]
         head[a] = e
-        if tail[a] < 0:
+        if tail[a] == _NONE:
             tail[a] = e
+    parent = np.arange(count).astype(np.uint32)
     # Those as flat wait in one chain, the first of which has waited longest.
-    first, last = np.full(_LEVELS, -1, np.int32), np.full(_LEVELS, -1, np.int32)
-    after = np.full(count, -1, np.int32)
-    for a in range(count):
-        if nodes[a] and parent[a] == a:
-            _wait(a, residual[a] / moments[a, COUNT], first, last, after)
-    seen = np.full(count, -1, np.int32)
-    turn, level = 0, 0
+    first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)
+    after = np.full(count, _NONE)
+    for a in parent:
+        _wait(a, residual[a] / moments[a, COUNT], first, last, after)
+    seen = np.full(count, _NONE)
+    turn, level = np.uint32(0), 0
     while level < _LEVELS:
         a = first[level]
-        if a < 0:
+        if a == _NONE:
             level += 1
             continue
         first[level] = after[a]
         if parent[a] != a:
             continue
-        turn += 1
-        best, partner, together = 1.0, -1, 0.0
-        before, e = -1, head[a]
-        while e >= 0:
+        turn += np.uint32(1)
+        seen[a] = turn
+        best, partner, together = 1.0, _NONE, 0.0
+        before, e = _NONE, head[a]
+        while e != _NONE:
             b = target[e]
             while parent[b] != b:
                 parent[b] = parent[parent[b]]
                 b = parent[b]
             target[e] = b
             following = link[e]
-            if b == a or seen[b] == turn:
+            if seen[b] == turn:
                 # An inner edge, or one more to the same patch.
-                if before < 0:
+                if before == _NONE:
                     head[a] = following
                 else:
                     link[before] = following
-                if following < 0:
+                if following == _NONE:
                     tail[a] = before
             else:
                 seen[b] = turn
@@ -237,12 +248,12 @@ def _grow(
                     if apart < best:
                         best, partner, together = apart, b, common
             e = following
-        if partner >= 0:
+        if partner != _NONE:
             residual[a] = together
             for entry in range(SIZE):
                 moments[a, entry] += moments[partner, entry]
             parent[partner] = a
-            if head[partner] >= 0:
+            if head[partner] != _NONE:
                 link[tail[a]] = head[partner]
                 tail[a] = tail[partner]
             level = min(level, _wait(a, together / moments[a, COUNT], first, last, after))
@@ -253,24 +264,24 @@ def _grow(
 def _wait(
     a: int,
     residual: float,
-    first: NDArray[np.int32],
-    last: NDArray[np.int32],
-    after: NDArray[np.int32],
+    first: NDArray[np.uint32],
+    last: NDArray[np.uint32],
+    after: NDArray[np.uint32],
 ) -> int:
     """Let a patch of such a mean residual wait behind those as flat; the number of its chain."""
     level = int(min(residual * _PER_VARIANCE, _LEVELS - 1.0))
-    if first[level] < 0:
+    if first[level] == _NONE:
         first[level] = a
     else:
         after[last[level]] = a
-    last[level], after[a] = a, -1
+    last[level], after[a] = a, _NONE
     return level
 
 
 @njit(cache=True)
-def find_roots(parent: NDArray[np.intp]) -> NDArray[np.intp]:
+def find_roots(parent: NDArray[np.integer]) -> NDArray[np.integer]:
     """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
-    root = np.empty(len(parent), np.intp)
+    root = np.empty_like(parent)
     for a in range(len(parent)):
         b = a
         while parent[b] != b:

@@ -48,13 +48,13 @@ class Patches(NamedTuple):
 
     Attributes
     ----------
-    labels : (rows, columns) int
+    labels : (rows, columns) int32
         Patch of each block: 0 for none, otherwise 1...P.
     moments : (P + 1, 13) float64
         Of the patches; zeros for 0.
     """
 
-    labels: NDArray[np.intp]
+    labels: NDArray[np.int32]
     moments: NDArray[np.float64]
 
     @classmethod
@@ -77,7 +77,7 @@ class Patches(NamedTuple):
         smallest = float(_BLOCKS_OF_PATCH * block**2)
         halves = map_halves(_patches, shape[0], nodes, largest, smallest, sensor.agreement)
         (upper, moments), (lower, beneath) = halves
-        lower = np.where(lower > 0, lower + len(moments) - 1, 0)
+        lower[lower > 0] += len(moments) - 1
         labels = np.concatenate([upper, lower]).reshape(shape)
         return cls(labels, np.concatenate([moments, beneath[1:]]))
 
@@ -89,7 +89,7 @@ def join_surfaces(
     sensor: SensorModel,
     smoothness: float,
     least: int = 1,
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
     Parameters
@@ -109,26 +109,50 @@ def join_surfaces(
 
     Returns
     -------
-    labels : (rows, columns) int
+    labels : (rows, columns) int32
         0 where no surface is, otherwise 1...K.
     moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
-    moments, smooth = patches.moments, sensor.distortion_pixels
-    contacts = find_contacts(patches.labels, nodes.right, nodes.below, len(moments))
-    part, moments = _renumber(_join(moments, contacts, smooth, sensor.agreement), moments, 1.0)
-    parts = part[patches.labels]
-    contacts = find_contacts(parts, nodes.right, nodes.below, len(moments))
     # What a block's side of border costs.
     side = smoothness * sensor.patch * block
-    surface, moments = _renumber(_unite(moments, contacts, side, smooth), moments, float(least))
-    return surface[parts], moments
+    smooth, agreement = sensor.distortion_pixels, sensor.agreement
+    return _surfaces(patches, nodes.right, nodes.below, smooth, agreement, side, float(least))
+
+
+@njit(cache=True, nogil=True)
+def _surfaces(
+    patches: Patches,
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    smooth: float,
+    agreement: float,
+    side: float,
+    least: float,
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """What `join_surfaces` returns."""
+    labels, moments = patches.labels.copy(), patches.moments
+    contacts = find_contacts(labels, right, below, len(moments))
+    part, moments = _renumber(_join(moments, contacts, smooth, agreement), moments, 1.0)
+    _rename(labels, part)
+    contacts = find_contacts(labels, right, below, len(moments))
+    surface, moments = _renumber(_unite(moments, contacts, side, smooth), moments, least)
+    _rename(labels, surface)
+    return labels, moments
+
+
+@njit(cache=True, nogil=True)
+def _rename(labels: NDArray[np.int32], table: NDArray[np.int32]) -> None:
+    """Labels by another name, in place."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            labels[i, j] = table[labels[i, j]]
 
 
 @njit(cache=True, nogil=True)
 def _patches(
     first: int, after: int, nodes: Nodes, largest: float, least: float, agreement: float
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Patches of at least so many pixels in some rows of blocks, 1...P, and their moments."""
     begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
     roots = grow_patches(first, after, nodes, largest, agreement) - begin
@@ -138,18 +162,18 @@ def _patches(
 @njit(cache=True, nogil=True)
 def _renumber(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
     count = np.zeros(len(root))
     for a in range(len(root)):
         count[root[a]] += moments[a, COUNT]
-    number = np.zeros(len(root), np.intp)
+    number = np.zeros(len(root), np.int32)
     clusters = 0
     for a in range(len(root)):
         if count[a] >= least:
             clusters += 1
             number[a] = clusters
-    labels = np.zeros(len(root), np.intp)
+    labels = np.zeros(len(root), np.int32)
     total = np.zeros((clusters + 1, SIZE))
     for a in range(len(root)):
         labels[a] = number[root[a]]
