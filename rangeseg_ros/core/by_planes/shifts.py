@@ -71,11 +71,8 @@ def shifts(
     agreement : float
         Pixels whose noise agrees, see `SensorModel.agreement`.
     """
-    box = _boxes(surfaces, len(theta), reach)
-    area = box[:, 2] * box[:, 3]
-    values = np.zeros(area.sum(), np.float32)
-    local = Shifts(box, np.cumsum(area) - area, values)
-    map_halves(_find_shifts, len(theta), local, _inner(surfaces), blocks, theta, around, agreement)
+    local, inner = _room_for_shifts(surfaces, len(theta), reach), _inner(surfaces)
+    map_halves(_find_shifts, len(theta), local, inner, blocks, theta, around, agreement)
     return local
 
 
@@ -90,8 +87,8 @@ def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _boxes(surfaces: NDArray[np.int32], count: int, reach: int) -> NDArray[np.intp]:
-    """Bounding boxes of the surfaces and so many blocks around them, see `Shifts`."""
+def _room_for_shifts(surfaces: NDArray[np.int32], count: int, reach: int) -> Shifts:
+    """Shifts, all 0, in the bounding boxes of the surfaces and so many blocks around them."""
     rows, columns = surfaces.shape
     first = np.full((count, 2), max(rows, columns))
     after = np.zeros((count, 2), np.intp)
@@ -108,7 +105,9 @@ def _boxes(surfaces: NDArray[np.int32], count: int, reach: int) -> NDArray[np.in
             box[k, 0], box[k, 1] = max(first[k, 0] - reach, 0), max(first[k, 1] - reach, 0)
             box[k, 2] = min(after[k, 0] + reach, rows) - box[k, 0]
             box[k, 3] = min(after[k, 1] + reach, columns) - box[k, 1]
-    return box
+    end = np.cumsum(box[:, 2] * box[:, 3])
+    start = end - box[:, 2] * box[:, 3]
+    return Shifts(box, start, np.zeros(end[-1], np.float32))
 
 
 @njit(cache=True, nogil=True)
