@@ -58,7 +58,7 @@ def _take_nearest(
     candidates, shifts = np.empty((columns, most), np.int32), np.empty((columns, most))
     count = np.empty(columns, np.intp)
     # The first of them, for each column of pixels.
-    label, planes = np.empty(width, np.int32), np.empty((5, width))
+    label, planes = np.empty(width, np.int32), np.zeros((5, width))
     rays = problem.rays.reshape(height, width, 3)
     ray = first_rays(rays, 0)
     above, around = np.empty((3, columns + 2 * REACH), np.int32), np.empty((3, columns), np.int32)
@@ -67,20 +67,21 @@ def _take_nearest(
         _find_ranges(bi, surfaces, above, around)
         for bj in range(columns):
             lowest, least, highest = around[0, bj], around[1, bj], around[2, bj]
-            # A plane at infinity explains nothing; one of precision 0 explains all.
-            plane = 0.0, 0.0, 0.0, 0.0, np.inf
             candidates[bj, 0] = highest
             count[bj] = highest > 0
-            if 0 < lowest == highest:
-                plane = 0.0, 0.0, 0.0, 0.0, 0.0
-            elif count[bj] > 0:
-                if least < highest:
-                    own = candidates[bj], shifts[bj]
-                    count[bj] = _find_candidates(bi, bj, surfaces, models, *own)
-                else:
-                    shifts[bj, 0] = shift_at(models.shifts, candidates[bj, 0], bi, bj)
-                plane = shifted_plane(candidates[bj, 0], shifts[bj, 0], models)
-            for j in range(bj * block, min((bj + 1) * block, width)):
+            left, right = bj * block, min((bj + 1) * block, width)
+            if lowest == highest:
+                # What is infinitely precise explains nothing; what is not precise explains all.
+                for j in range(left, right):
+                    label[j], planes[4, j] = highest, np.inf if highest == 0 else 0.0
+                continue
+            if least < highest:
+                own = candidates[bj], shifts[bj]
+                count[bj] = _find_candidates(bi, bj, surfaces, above, models, *own)
+            else:
+                shifts[bj, 0] = shift_at(models.shifts, highest, bi, bj)
+            plane = shifted_plane(candidates[bj, 0], shifts[bj, 0], models)
+            for j in range(left, right):
                 label[j] = candidates[bj, 0]
                 for entry in range(5):
                     planes[entry, j] = plane[entry]
@@ -110,8 +111,8 @@ def _find_ranges(
 ) -> None:
     """Labels of the blocks around each one of a row: the lowest, the lowest but 0, the highest.
 
-    To `around` (3, columns); the second is `_NONE` where there is no label but 0. Scratch are
-    those `above` and below, (3, columns + 2 REACH).
+    To `around` (3, columns); the second is `_NONE` where there is no label but 0. Those `above`
+    and below it, (3, columns + 2 REACH), are told as well.
     """
     rows, columns = surfaces.shape
     above[:2], above[2] = _NONE, 0
@@ -139,15 +140,21 @@ def _find_candidates(
     row: int,
     column: int,
     surfaces: NDArray[np.int32],
+    above: NDArray[np.int32],
     models: Models,
     candidates: NDArray[np.int32],
     shifts: NDArray[np.float64],
 ) -> int:
-    """Labels of the blocks around one and the shifts of their planes there; how many."""
+    """Labels of the blocks around one and the shifts of their planes there; how many.
+
+    `above` is that of `_find_ranges` for this row.
+    """
     rows, columns = surfaces.shape
     count, last = 0, np.int32(0)
-    for i in range(max(row - REACH, 0), min(row + REACH + 1, rows)):
-        for j in range(max(column - REACH, 0), min(column + REACH + 1, columns)):
+    top, bottom = max(row - REACH, 0), min(row + REACH + 1, rows)
+    for j in range(max(column - REACH, 0), min(column + REACH + 1, columns)):
+        alike = above[0, j + REACH] == above[2, j + REACH]
+        for i in range(top, top + 1 if alike else bottom):
             label = surfaces[i, j]
             if label in (np.int32(0), last):
                 continue

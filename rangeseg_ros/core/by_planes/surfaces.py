@@ -76,10 +76,8 @@ class Patches(NamedTuple):
         largest = max(sensor.distortion_pixels, 4.0 * block**2)
         smallest = float(_BLOCKS_OF_PATCH * block**2)
         halves = map_halves(_patches, shape[0], nodes, largest, smallest, sensor.agreement)
-        (upper, moments), (lower, beneath) = halves
-        lower[lower > 0] += len(moments) - 1
-        labels = np.concatenate([upper, lower]).reshape(shape)
-        return cls(labels, np.concatenate([moments, beneath[1:]]))
+        labels, moments = _put_together(*halves[0], *halves[1])
+        return cls(labels.reshape(shape), moments)
 
 
 def join_surfaces(
@@ -157,6 +155,20 @@ def _patches(
     begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
     roots = grow_patches(first, after, nodes, largest, agreement) - begin
     return _renumber(roots, nodes.moments.reshape(-1, SIZE)[begin:end], least)
+
+
+@njit(cache=True, nogil=True)
+def _put_together(
+    upper: NDArray[np.int32],
+    first: NDArray[np.float64],
+    lower: NDArray[np.int32],
+    second: NDArray[np.float64],
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Labels and moments of two halves as those of the whole."""
+    labels = np.concatenate((upper, lower))
+    for a in range(len(upper), len(labels)):
+        labels[a] += (labels[a] > 0) * (len(first) - 1)
+    return labels, np.concatenate((first, second[1:]))
 
 
 @njit(cache=True, nogil=True)
