@@ -12,7 +12,7 @@ from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
-I = TypeVar('I', bound=np.integer)
+N = TypeVar('N', bound=np.integer)
 
 # Chi-squared of the three degrees of freedom of a plane.
 _CHI2_LIMIT = chi2_quantile(3)
@@ -283,7 +283,7 @@ def _wait(
 
 
 @njit(cache=True)
-def find_roots(parent: NDArray[I]) -> NDArray[I]:
+def find_roots(parent: NDArray[N]) -> NDArray[N]:
     """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
     root = np.empty_like(parent)
     for a in range(len(parent)):
