@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
-
-N = TypeVar('N', bound=np.integer)
 
 # Chi-squared of the three degrees of freedom of a plane.
 _CHI2_LIMIT = chi2_quantile(3)
@@ -266,7 +264,7 @@ def _grow(
 
 @njit(cache=True)
 def _wait(
-    a: int,
+    a: np.uint32,
     residual: float,
     first: NDArray[np.uint32],
     last: NDArray[np.uint32],
@@ -283,7 +281,7 @@ def _wait(
 
 
 @njit(cache=True)
-def find_roots(parent: NDArray[N]) -> NDArray[N]:
+def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
     """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
     root = np.empty_like(parent)
     for a in range(len(parent)):
