@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -144,8 +145,8 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     rows = np.array(
         [
             (
-                *plane.centroid,
-                *plane.normal,
+                *plane.centroid.tolist(),
+                *plane.normal.tolist(),
                 plane.distance,
                 plane.label,
                 plane.id,
@@ -155,10 +156,10 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 plane.rms,
                 plane.confidence,
                 plane.area,
-                *plane.extents,
-                *plane.centre,
-                *plane.orientation,
-                *plane.covariance[upper],
+                *plane.extents.tolist(),
+                *plane.centre.tolist(),
+                *plane.orientation.tolist(),
+                *plane.covariance[upper].tolist(),
             )
             for plane in planes
         ],
@@ -175,28 +176,31 @@ def points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
 
 def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:
     """sensor_msgs/PointCloud2 of one row, a point for each of the records (N,)."""
-    datatypes = {kind: number for number, kind in _POINT_FIELD_TYPES.items()}
-    fields = []
-    for name in rows.dtype.names or ():
-        column, offset = rows.dtype.fields[name][:2]  # type: ignore[index]
-        fields.append(
-            make(
-                'sensor_msgs/msg/PointField',
-                name=name,
-                offset=offset,
-                datatype=datatypes[column.str[1:]],
-                count=1,
-            )
-        )
     return make(
         'sensor_msgs/msg/PointCloud2',
         header=header,
         height=1,
         width=rows.size,
-        fields=fields,
+        fields=_fields(make, rows.dtype),
         is_bigendian=False,
         point_step=rows.dtype.itemsize,
         row_step=rows.nbytes,
         data=rows.view(np.uint8),
         is_dense=True,
     )
+
+
+@lru_cache(maxsize=8)
+def _fields(make: Make, kind: np.dtype[np.void]) -> list[Any]:
+    """sensor_msgs/PointField of each field of a type; made once, as nobody changes them."""
+    datatypes = {kind: number for number, kind in _POINT_FIELD_TYPES.items()}
+    return [
+        make(
+            'sensor_msgs/msg/PointField',
+            name=name,
+            offset=offset,
+            datatype=datatypes[column.str[1:]],
+            count=1,
+        )
+        for name, (column, offset, *_) in (kind.fields or {}).items()
+    ]

@@ -21,6 +21,8 @@ TOLERANCE = 1.5
 
 # Of the largest component of a plane's theta; a ray whose inverse range is less grazes the plane.
 _GRAZING = 1e-3
+# The pixels that a corner belongs to.
+_CORNERS = np.ones((2, 2), np.uint8)
 
 
 @dataclass(eq=False)
@@ -76,10 +78,8 @@ class Outline:
     def _rings(self) -> tuple[NDArray[np.float64], list[NDArray[np.float64]]]:
         # A pixel covers its four corners. On this lattice, contours run along the sides of the
         # pixels, those of holes too, and holes of single pixels close.
-        lattice = np.zeros((self.mask.shape[0] + 1, self.mask.shape[1] + 1), np.uint8)
-        for i in (0, 1):
-            for j in (0, 1):
-                lattice[i : i + self.mask.shape[0], j : j + self.mask.shape[1]] |= self.mask
+        room = cv2.copyMakeBorder(self.mask.view(np.uint8), 0, 1, 0, 1, cv2.BORDER_CONSTANT)
+        lattice = cv2.dilate(room, _CORNERS, anchor=(1, 1))
         contours, tree = cv2.findContours(lattice, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
         # Each with the number of the border around it, -1 for outer ones.
         rings = list(zip(contours, tree[0, :, 3].tolist(), strict=True))
@@ -97,13 +97,13 @@ class Outline:
         if len(corners) < 3:  # of regions no wider than the tolerance nothing would be left
             corners = contour[:, 0]
         rays = self._rays(corners)
-        ahead = self._ahead(rays)
-        points: NDArray[np.float64] = rays[ahead] / (rays[ahead] @ self.theta)[:, None]
+        level = rays @ self.theta
+        # Grazing planes end in the distance.
+        ahead = level > _GRAZING * np.abs(self.theta).max()
+        if not ahead.all():
+            rays, level = rays[ahead], level[ahead]
+        points: NDArray[np.float64] = rays / level[:, None]
         return points + self.rays.place if isinstance(self.rays, Camera) else points
-
-    def _ahead(self, rays: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Where rays (N, 3) meet the plane: grazing planes end in the distance."""
-        return rays @ self.theta > _GRAZING * np.abs(self.theta).max()
 
     def _rays(self, corners: NDArray[Any]) -> NDArray[np.float64]:
         """Rays (N, 3) of corners (x, y) of pixels in the box."""
@@ -146,7 +146,7 @@ def lies_ahead(
 def _corners_lie_ahead(
     boxes: NDArray[np.intp], theta: NDArray[np.float64], lens: tuple[float, float, float, float]
 ) -> NDArray[np.bool_]:
-    """Whether the corners of each box meet its plane, optical frame: see `Outline._ahead`."""
+    """Whether the corners of each box meet its plane, optical frame: see `Outline._on_plane`."""
     fx, fy, cx, cy = lens
     ahead = np.ones(len(boxes), np.bool_)
     for k in range(len(boxes)):
@@ -176,8 +176,8 @@ def triangles(
     """
     corners = np.concatenate(rings)
     # Seen along the axis nearest to the normal, from the side that it points to.
-    axis = np.abs(normal).argmax()
-    right, up = (axis + np.array([1, 2] if normal[axis] > 0 else [2, 1])) % 3
-    flat = np.ascontiguousarray(corners[:, [right, up]])
+    axis = int(np.abs(normal).argmax())
+    right, up = (axis + 1) % 3, (axis + 2) % 3
+    flat = np.take(corners, (right, up) if normal[axis] > 0 else (up, right), axis=1)
     ends = np.cumsum([len(ring) for ring in rings], dtype=np.uint32)
     return triangulate_float64(flat, ends).astype(np.intp).reshape(-1, 3)

@@ -160,13 +160,13 @@ class Camera:
             NaN where a lens shows no ray.
         """
         x, y = self._distorted(np.asarray(u, float), np.asarray(v, float))
+        z: float | NDArray[np.float64] = 1.0
         if self.distortion_model:
             x, y = undistort(x, y, self.distortion_model, self.d)
             shown = (np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST)
-            x, y, z = (np.where(shown, value, np.nan) for value in (x, y, np.ones_like(x)))
-        else:
-            z = np.ones_like(x)
-        rays = np.stack([x, y, z], axis=-1)
+            x, y, z = (np.where(shown, value, np.nan) for value in (x, y, z))
+        rays = np.empty((*x.shape, 3))
+        rays[..., 0], rays[..., 1], rays[..., 2] = x, y, z
         return rays if self.turn == OPTICAL else rays @ self.axes.T
 
     def _distorted(
