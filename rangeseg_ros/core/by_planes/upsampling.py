@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.marks import no_marks
+from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -52,7 +52,7 @@ def labels_of_all(
     labels : (H, W) uint16
         The same, 0 for what was not measured.
     counts : (M + 1,) int
-        Measured pixels of each label.
+        Measured pixels of each plane; 0 for none.
     """
     regions, labels = np.empty(image.shape, np.uint16), np.empty(image.shape, np.uint16)
     planes = theta, sensor, 4 * smoothness
@@ -80,41 +80,66 @@ def _tell(
     """Fill in some rows; `unlike` is what it costs to be unlike all around."""
     columns, width = few.shape[1], inverse.shape[1]
     counts = np.zeros(len(theta), np.intp)
-    # Each word tells of eight pixels whether there is a border between them and the next.
-    edge = no_marks(columns)
-    eight = edge.view(np.uint64)
+    # Where the labels around a pixel differ, and where a label ends: in few places of a row.
+    edge, change = no_marks(columns), no_marks(width)
+    places = np.empty(len(change), np.intp)
+    around = np.empty(columns * step, np.uint16)
     for row in range(first, after):
         above = row // step
-        below = above if row == above * step else min(above + 1, len(few) - 1)
-        upper, lower = few[above], few[below]
-        top, bottom = bridged[above * step, ::step], bridged[below * step, ::step]
-        _find_edges(upper, lower, edge)
-        left = 0
-        while left < columns:
-            begin = left
-            while left < columns and edge[left] == 0:
-                left += 8 if left % 8 == 0 and eight[left // 8] == 0 else 1
-            left = min(left, columns)
-            part, label = slice(begin * step, min(left * step, width)), upper[begin]
-            _fill(label, bridged[row, part], regions[row, part])
-            counts[label] += _fill(label, inverse[row, part], labels[row, part])
-            for column in range(left * step, min((left + 1) * step, width)):
-                label, y = upper[left], bridged[row, column]
-                if y > 0:
-                    right = left if column == left * step else min(left + 1, columns - 1)
-                    around = label, lower[left], upper[right], lower[right]
-                    known = top[left], bottom[left], top[right], bottom[right]
-                    squared = y * y
-                    variance = random_variance(sensor, squared)
-                    variance += systematic_variance(sensor, squared)
-                    ray = ray_of(rays, pinhole, row, column)
-                    label = _best(around, known, y, ray, theta, variance, unlike)
-                regions[row, column] = label if y > 0 else 0
-                measured = inverse[row, column] > 0
-                labels[row, column] = label if measured else 0
-                counts[label] += measured
-            left += 1
+        exact = row == above * step
+        below = above if exact else min(above + 1, len(few) - 1)
+        if exact or row == first:
+            _spread(few[above], step, around)
+        _fill(around, bridged[row], regions[row])
+        _fill(around, inverse[row], labels[row])
+        _find_edges(few[above], few[below], edge)
+        for place in places[: find_marked(edge, 0, places)]:
+            left = int(place)
+            for column in range(left * step + exact, min((left + 1) * step, width)):
+                y = bridged[row, column]
+                if y == 0:
+                    continue
+                right = left if column == left * step else min(left + 1, columns - 1)
+                squared = y * y
+                variance = random_variance(sensor, squared)
+                variance += systematic_variance(sensor, squared)
+                pixel = y, ray_of(rays, pinhole, row, column), variance, unlike
+                one, last = (above, left), (below, right)
+                if exact or right == left:
+                    label = _best((one, last), few, step, bridged, theta, pixel)
+                else:
+                    four = one, (below, left), (above, right), last
+                    label = _best(four, few, step, bridged, theta, pixel)
+                regions[row, column] = label
+                labels[row, column] = label if inverse[row, column] > 0 else 0
+        _find_changes(labels[row], change)
+        begin = 0
+        for place in places[: find_marked(change, 0, places)]:
+            counts[labels[row, begin]] += place + 1 - begin
+            begin = int(place) + 1
+    counts[0] = 0
     return counts
+
+
+@njit(cache=True, inline='always')
+def _spread(few: NDArray[np.uint16], step: int, many: NDArray[np.uint16]) -> None:
+    """Repeat each label of a row so many times, most often at a distance the compiler knows."""
+    if step == 2:
+        for j in range(len(few)):
+            many[2 * j] = many[2 * j + 1] = few[j]
+    else:
+        for k in range(step):
+            many[k::step] = few
+
+
+@njit(cache=True, nogil=True)
+def _fill(
+    around: NDArray[np.uint16], inverse: NDArray[np.float32], found: NDArray[np.uint16]
+) -> None:
+    """Give their labels to the measured pixels of a row, 0 to others."""
+    for j in range(len(found)):
+        label = around[j]
+        found[j] = label if inverse[j] > 0 else label ^ label
 
 
 @njit(cache=True, nogil=True)
@@ -131,44 +156,40 @@ def _find_edges(
 
 
 @njit(cache=True, nogil=True)
-def _fill(label: int, inverse: NDArray[np.float32], found: NDArray[np.uint16]) -> int:
-    """Give a label to the measured pixels of a part of a row, 0 to others; how many they are."""
-    none, measured = label ^ label, 0
-    for j in range(len(found)):
-        found[j] = label if inverse[j] > 0 else none
-        measured += inverse[j] > 0
-    return measured
+def _find_changes(row: NDArray[np.uint16], change: NDArray[np.uint8]) -> None:
+    """Mark the last pixel of each label side by side."""
+    last, right = len(row) - 1, row[1:]
+    for j in range(last):
+        change[j] = row[j] != right[j]
+    change[last] = 1
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, inline='always')
 def _best(
-    around: tuple[int, int, int, int],
-    known: tuple[float, float, float, float],
-    y: float,
-    ray: tuple[float, float, float],
+    around: tuple[tuple[int, int], ...],
+    few: NDArray[np.uint16],
+    step: int,
+    bridged: NDArray[np.float32],
     theta: NDArray[np.float64],
-    variance: float,
-    unlike: float,
+    pixel: tuple[float, tuple[float, float, float], float, float],
 ) -> int:
-    """Of the labels around a pixel, the one of the least energy; `known` are their inverses."""
-    if around[0] == around[1] == around[2] == around[3]:
-        return around[0]
-    share = unlike / max((known[0] > 0) + (known[1] > 0) + (known[2] > 0) + (known[3] > 0), 1)
-    best, least = around[0], np.inf
-    for k in range(4):
-        label, cost, first = around[k], 0.0, True
-        for m in range(4):
-            differs = around[m] != label
-            first &= differs | (m >= k)
-            cost += share * ((known[m] > 0) & differs)
-        if not first or cost >= least:
-            continue
-        if label > 0:
-            residual = y - theta[label, 0] * ray[0] - theta[label, 1] * ray[1]
-            residual -= theta[label, 2] * ray[2]
-            cost += min(residual * residual / (2 * variance), CAP)
-        else:
-            cost += NO_PLANE
-        if cost < least:
-            best, least = label, cost
+    """Of the labels `around` a pixel, two or four places in `few`, the one of the least energy.
+
+    Of the pixel its inverse range, ray and variance, and what it costs to be unlike all around.
+    """
+    y, ray, variance, unlike = pixel
+    known = 0
+    for i, j in around:
+        known += bridged[i * step, j * step] > 0
+    share = unlike / max(known, 1)
+    best, least = few[around[0]], np.inf
+    for place in around:
+        label, others = few[place], 0
+        for i, j in around:
+            others += (bridged[i * step, j * step] > 0) & (few[i, j] != label)
+        residual = y - theta[label, 0] * ray[0] - theta[label, 1] * ray[1]
+        residual -= theta[label, 2] * ray[2]
+        misfit = min(residual * residual / (2 * variance), CAP) if label > 0 else NO_PLANE
+        if share * others + misfit < least:
+            best, least = label, share * others + misfit
     return best
