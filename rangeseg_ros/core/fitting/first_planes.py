@@ -8,9 +8,10 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.interior import fill
+from rangeseg_ros.core.fitting.interior import fill, find_loose
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.marks import no_marks
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
@@ -118,18 +119,18 @@ def _sum_moments(
     known = np.empty(count, np.bool_)
     for label in range(count):
         known[label] = total[label, COUNT] >= _ENOUGH * BLOCK**2
-    for bi in range(first, after):
-        for bj in range(filled.shape[1]):
-            if filled[bi, bj] > 0:
+    marks = no_marks(width)
+    places = np.empty(len(marks), np.intp)
+    for i in range(first * BLOCK, min(after * BLOCK, height)):
+        found = find_loose(labels[i], filled[i // BLOCK], marks, places)
+        for place in places[:found]:
+            j = int(place)
+            label, y = int(labels[i, j]), float(inverse[i, j])
+            step = stride if known[label] else 1
+            if y == 0 or (step > 1 and i % step + j % step > 0):
                 continue
-            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
-                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
-                    label, y = int(labels[i, j]), float(inverse[i, j])
-                    step = stride if known[label] else 1
-                    if label == 0 or y == 0 or i % step + j % step > 0:
-                        continue
-                    weight = step**2 / random_variance(sensor, y * y)
-                    ratio = weight * systematic_variance(sensor, y * y)
-                    add_pixel(total[label], ray_of(rays, pinhole, i, j), y, weight, ratio)
-                    total[label, COUNT] += step**2
+            weight = step**2 / random_variance(sensor, y * y)
+            ratio = weight * systematic_variance(sensor, y * y)
+            add_pixel(total[label], ray_of(rays, pinhole, i, j), y, weight, ratio)
+            total[label, COUNT] += step**2
     return total

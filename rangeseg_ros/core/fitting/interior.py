@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
+from rangeseg_ros.core.sensing.marks import find_marked
 
 RIM = 2
 """Pixels from another region up to which a pixel may be its neighbour's."""
@@ -93,6 +94,8 @@ def _leave_borders(
                 for i in range(bi * BLOCK - RIM, min((bi + 1) * BLOCK + RIM, len(labels))):
                     for j in range(bj * BLOCK - RIM, min((bj + 1) * BLOCK + RIM, labels.shape[1])):
                         unlike |= labels[i, j] ^ label
+                    if unlike:
+                        break
                 alike = unlike == 0
             if alike:
                 inner[bi, bj] = label
@@ -102,3 +105,37 @@ def _leave_borders(
 def rows_of_blocks(first: int, after: int) -> tuple[int, int]:
     """Rows of blocks that begin in some rows of pixels."""
     return -(-first // BLOCK), -(-after // BLOCK)
+
+
+@njit(cache=True, nogil=True)
+def find_loose(
+    labels: NDArray[np.uint16],
+    filled: NDArray[np.uint16],
+    marks: NDArray[np.uint8],
+    places: NDArray[np.intp],
+) -> int:
+    """Pixels of regions in a row, but for those of blocks that a region fills.
+
+    Parameters
+    ----------
+    labels : (W,) uint16
+        Of the row.
+    filled : (ceil(W / 4),) uint16
+        Of its row of blocks, see `fill`.
+    marks : (m,) uint8
+        Of the row, see `no_marks`.
+    places : (m,) int
+        Receives the columns of the pixels.
+
+    Returns
+    -------
+    int
+        How many they are.
+    """
+    for j in range(len(labels)):
+        marks[j] = labels[j] > 0
+    # Each word tells of a block.
+    four = marks.view(np.uint32)
+    for bj in range(len(filled)):
+        four[bj] = four[bj] if filled[bj] == 0 else 0
+    return find_marked(marks, 0, places)
