@@ -204,13 +204,8 @@ def _counts(
     eight = rim.view(np.uint64)
     for i in range(first, after):
         for k in range(i + 1 if i > first else max(i - 1, 0), min(i + 2, height)):
-            name = own = 0
             for j in range(width):
-                # Most pixels are called as the one before.
-                if found[k, j] != name:
-                    name = found[k, j]
-                    own = number[name]
-                rows[k % 3, j] = own
+                rows[k % 3, j] = number[found[k, j]]
         here = rows[i % 3]
         if i in (0, height - 1):
             rim[:width] = 1

@@ -125,7 +125,7 @@ def drop_regions(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDA
 
 def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:
     """New number of each region: 1...M by falling size, 0 for size 0; at most 65535."""
-    order = np.argsort(-area, kind='stable')[: min(np.count_nonzero(area), 65535)]
+    order = (-area).argsort(kind='stable')[: min(np.count_nonzero(area), 65535)]
     table = np.zeros(len(area), np.uint16)
     table[order] = np.arange(1, len(order) + 1)
     return table

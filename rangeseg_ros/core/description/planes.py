@@ -168,28 +168,15 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
         found = np.setdiff1d(found, doubtful[~kept])
     surface = surfaces.result()
-    columns = surface, distance, fits.pixels, rms, confidence
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    numbers = zip(*(column[found].tolist() for column in columns), strict=True)
-    return [
-        Plane(
-            label=k,
-            id=k,
-            surface=group,
-            normal=normal[k],
-            distance=offset,
-            covariance=covariance[k],
-            centroid=centroid[k],
-            count=pixels,
-            rms=residual,
-            confidence=certainty,
-            shape=RegionShape(shapes, k),
-            outline=outlines[k],
-        )
-        for k, (group, offset, pixels, residual, certainty) in zip(
-            found.tolist(), numbers, strict=True
-        )
-    ]
+    group, offset, pixels, residual, certainty = (
+        column[found].tolist() for column in (surface, distance, fits.pixels, rms, confidence)
+    )
+    known = found.tolist()
+    forms = [RegionShape(shapes, k) for k in known], [outlines[k] for k in known]
+    equations = normal[found], offset, covariance[found]
+    figures = centroid[found], pixels, residual, certainty
+    return list(map(Plane, known, known, group, *equations, *figures, *forms))
 
 
 @njit(cache=True, nogil=True)

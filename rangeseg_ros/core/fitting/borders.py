@@ -45,12 +45,7 @@ class Borders(NamedTuple):
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         if not dropped.any():
             return self
-        table, kept = np.cumsum(~dropped) - 1, ~dropped
-        one = np.arange(len(kept)).repeat(np.diff(self.start))
-        both = kept[one] & kept[self.other]
-        start = np.cumsum([0, *np.bincount(table[one[both]], minlength=kept.sum())])
-        touching = table[self.other[both]], self.links[both], self.cuts[both]
-        return Borders(self.box[kept], self.length[kept], start, *touching)
+        return _without(self, dropped)
 
 
 def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders:
@@ -66,6 +61,20 @@ def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders
         M + 1.
     """
     return _put_together(*map_halves(_find_stretches, len(regions), regions, grid, count))
+
+
+@njit(cache=True, nogil=True)
+def _without(borders: Borders, dropped: NDArray[np.bool_]) -> Borders:
+    """What `Borders.without` returns where there is something to drop."""
+    kept = ~dropped
+    number, start = np.cumsum(kept) - 1, [0]
+    left = np.zeros(len(borders.other), np.bool_)
+    for k in np.flatnonzero(kept):
+        for e in range(borders.start[k], borders.start[k + 1]):
+            left[e] = kept[borders.other[e]]
+        start.append(start[-1] + left[borders.start[k] : borders.start[k + 1]].sum())
+    touching = number[borders.other[left]], borders.links[left], borders.cuts[left]
+    return Borders(borders.box[kept], borders.length[kept], np.array(start), *touching)
 
 
 @njit(cache=True, nogil=True)

@@ -226,12 +226,10 @@ def _kind(
     residual -= theta[label, 2] * x2
     squared = y * y
     variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-    if residual * residual > OUTLIER**2 * variance:
-        return _OUTLYING
-    if inside[j // BLOCK] > 0:
-        return _SURE
     above, below = max(i - RIM, 0), min(i + RIM, labels.shape[0] - 1)
     left, right = max(j - RIM, 0), min(j + RIM, labels.shape[1] - 1)
-    alike = labels[above, left] == label and labels[above, right] == label
-    alike = alike and labels[below, left] == label and labels[below, right] == label
-    return _SURE if alike else _AT_RIM
+    # Without branches: no processor foretells them.
+    alike = (labels[above, left] == label) & (labels[above, right] == label)
+    alike &= (labels[below, left] == label) & (labels[below, right] == label)
+    kind = _SURE if alike | (inside[j // BLOCK] > 0) else _AT_RIM
+    return _OUTLYING if residual * residual > OUTLIER**2 * variance else kind

@@ -56,8 +56,6 @@ class Fits(NamedTuple):
     sensor : SensorModel
     systematic : Field
         Its systematic errors.
-    inner : (rows, columns) uint16
-        Region of each block of 4 x 4 pixels inside it, see `interior`.
     step : int
         Columns and rows of the image from one pixel that was looked at to the next.
     """
@@ -74,7 +72,6 @@ class Fits(NamedTuple):
     middle: NDArray[np.float64]
     sensor: SensorModel
     systematic: Field
-    inner: NDArray[np.uint16]
     step: int = 1
 
     @classmethod
@@ -127,7 +124,7 @@ class Fits(NamedTuple):
         parts, start = np.arange(count), np.arange(count + 1)
         counts = pixels, outliers, explained
         planes = theta, inverse, covariance, middle
-        return cls(cells, parts, start, *counts, *planes, sensor, systematic, inner)
+        return cls(cells, parts, start, *counts, *planes, sensor, systematic)
 
     def united(self, group: NDArray[np.integer], central: bool) -> Fits:
         """Planes of regions united to groups.
@@ -158,7 +155,6 @@ class Fits(NamedTuple):
             inverse=inverse,
             covariance=sandwiches(inverse, middle),
             middle=middle,
-            inner=group.astype(np.uint16)[self.inner],
         )
 
     def magnified(self, step: int, pixels: NDArray[np.intp]) -> Fits:
@@ -173,7 +169,6 @@ class Fits(NamedTuple):
         return self._replace(
             pixels=pixels,
             outliers=self.outliers * pixels // np.maximum(self.pixels, 1),
-            inner=self.inner.repeat(step, axis=0).repeat(step, axis=1),
             step=step,
         )
 

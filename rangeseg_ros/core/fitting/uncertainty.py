@@ -298,6 +298,9 @@ def _correlation(
     result = np.empty((count_a, count_b))
     for i in range(count_a):
         for j in range(count_b):
+            if a == b and min(i, j) > 0:
+                result[i, j] = result[i - 1, j - 1]
+                continue
             lag = cells.origin[a, axis] + (i + 0.5) * size_a
             lag -= cells.origin[b, axis] + (j + 0.5) * size_b
             result[i, j] = gain * np.exp(-(lag**2) / (2 * wide))
