@@ -126,6 +126,23 @@ def test_only_the_curved_region_is():
     assert verdict(inverse, regions).tolist() == [False, False, True]
 
 
+def test_first_planes_are_those_of_every_pixel():
+    """Of stripes with holes, most of which fill no block: sums over their pixels one by one."""
+    draw = np.random.default_rng(0)
+    theta = draw.normal((0, 0, 0.6), 0.1, (6, 3))
+    regions = np.arange(320)[None] // draw.integers(2, 30, (240, 1)) % 6
+    regions[:40, :50] = 5
+    inverse = (theta[regions] * CAMERA.rays).sum(axis=2) + draw.normal(0, 0.002, CAMERA.shape)
+    inverse = np.where(draw.random(CAMERA.shape) < 0.1, 0, inverse).astype(np.float32)
+    image = RangeImage(CAMERA.rays, inverse, CAMERA)
+    first = FirstPlanes.of(regions.astype(np.uint16), image, Blocks.of(image), SENSOR, stride=1)
+    assert first.filled.max() == 5 and np.count_nonzero(first.filled) < 200
+    for k in range(1, 6):
+        pixels = (regions == k) & (inverse > 0)
+        found = np.linalg.lstsq(CAMERA.rays[pixels], inverse[pixels], rcond=None)[0]
+        np.testing.assert_allclose(first.theta[k], found, atol=1e-5)
+
+
 def strips(count, first=60, after=260, rows=slice(40, 200)):
     """Upright strips side by side, of the same width."""
     regions = np.zeros(CAMERA.shape, int)
