@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SLOPE
 from rangeseg_ros.core.sensing.sensor import (
@@ -103,97 +103,114 @@ def _fill_in(
     nodes: Nodes,
 ) -> None:
     """Fill in some rows of nodes."""
-    whole = np.zeros(blocks.squared.shape, np.bool_)
-    _find_whole(first, after, inverse, grid, size, whole)
-    _weigh(first, after, blocks, whole, sensor, max(size * size // 4, 3), nodes)
-    _link(first, after, grid, size, nodes)
+    count = nodes.residual.shape[1]
+    # Zeros beyond the image, and bytes, as the compiler takes many of these at a time.
+    columns, whole = np.empty((6, count * size), np.uint8), np.empty(count, np.bool_)
+    for bi in range(first, after):
+        _look(bi * size, min((bi + 1) * size, len(inverse)), inverse, grid, columns)
+        # Nearly always of a size that the compiler knows.
+        if size == BLOCK:
+            _link(bi, columns, BLOCK, whole, nodes)
+        else:
+            _link(bi, columns, size, whole, nodes)
+        _weigh(bi, blocks, whole, sensor, max(size * size // 4, 3), nodes)
 
 
 @njit(cache=True, nogil=True)
-def _find_whole(
-    first: int,
-    after: int,
+def _look(
+    top: int,
+    bottom: int,
     inverse: NDArray[np.float32],
     grid: Grid,
-    size: int,
-    result: NDArray[np.bool_],
+    columns: NDArray[np.uint8],
 ) -> None:
-    """Which of some rows of blocks no jump crosses and were measured, bridged holes included."""
-    height, width = inverse.shape
-    measured, across = np.empty(width, np.uint8), np.empty(width, np.bool_)
-    down = np.empty(width, np.bool_)
-    for bi in range(first, after):
-        bottom = min((bi + 1) * size, height)
-        measured[:], across[:], down[:] = 0, False, False
-        for i in range(bi * size, bottom):
-            for j in range(width):
-                measured[j] += inverse[i, j] > 0
-            for j in range(width - 1):
-                both = (inverse[i, j] > 0) & (inverse[i, j + 1] > 0)
-                across[j] |= both & (grid.right[i, j] == 0)
-            if i + 1 < bottom:
-                for j in range(width):
-                    both = (inverse[i, j] > 0) & (inverse[i + 1, j] > 0)
-                    down[j] |= both & (grid.below[i, j] == 0)
-        for bj in range(result.shape[1]):
-            right = min((bj + 1) * size, width)
-            crossed, count = False, 0
-            for j in range(bj * size, right):
-                count += measured[j]
-                crossed |= down[j] | (across[j] & (j + 1 < right))
-            result[bi, bj] = not crossed and count >= _MEASURED * size * size
+    """Look at the pixels of a row of blocks.
+
+    `columns` (6, W or more) receives for every column how many were measured, how many are
+    connected with the next one to the right and whether a jump parts one from it, and the same of
+    those below as far as they are in these rows; last, whether the one in the last row is
+    connected with that below.
+    """
+    columns[:] = 0
+    for i in range(top, bottom):
+        here = inverse[i]
+        for j in range(len(here)):
+            columns[0, j] += here[j] > 0
+        _look_beside(here, here[1:], grid.right[i], columns[1], columns[2])
+        if i + 1 < bottom:
+            _look_beside(here, inverse[i + 1], grid.below[i], columns[3], columns[4])
+    if bottom < len(inverse):
+        below = grid.below[bottom - 1]
+        for j in range(len(below)):
+            columns[5, j] = below[j] > 0
 
 
 @njit(cache=True, nogil=True)
-def _link(
-    first: int,
-    after: int,
-    grid: Grid,
-    size: int,
-    nodes: Nodes,
+def _look_beside(
+    here: NDArray[np.float32],
+    beside: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    joined: NDArray[np.uint8],
+    parted: NDArray[np.uint8],
 ) -> None:
-    """Link some rows of blocks to their neighbours."""
-    right, below = nodes.right, nodes.below
-    height, width = len(grid.right), grid.below.shape[1]
-    for bi in range(first, after):
-        for bj in range(right.shape[1]):
+    """Count edges of a row that connect pixels, and mark those that jumps cross."""
+    for j in range(len(weight)):
+        joined[j] += weight[j] > 0
+        parted[j] |= (here[j] > 0) & (beside[j] > 0) & (weight[j] == 0)
+
+
+@njit(cache=True, inline='always')
+def _link(
+    bi: int, columns: NDArray[np.uint8], size: int, whole: NDArray[np.bool_], nodes: Nodes
+) -> None:
+    """Link a row of blocks to their neighbours, and tell which are `whole`.
+
+    Those that no jump crosses and that were measured, bridged holes included.
+    """
+    measured, joined, across, down = columns[0], columns[1], columns[2], columns[4]
+    least = np.ceil(_MEASURED * size * size)
+    for bj in range(len(whole)):
+        count, crossed = 0, 0
+        for k in range(size):
+            count += measured[bj * size + k]
+            crossed |= down[bj * size + k]
+        for k in range(size - 1):
+            crossed |= across[bj * size + k]
+        whole[bj] = (crossed == 0) & (count >= least)
+    right, below = nodes.right[bi], nodes.below[bi : bi + 1]
+    for bj in range(len(right)):
+        right[bj] = 2 * joined[(bj + 1) * size - 1] >= size
+    for i in range(len(below)):
+        for bj in range(len(whole)):
             touching = 0
-            for i in range(bi * size, min((bi + 1) * size, height)):
-                touching += grid.right[i, (bj + 1) * size - 1] > 0
-            right[bi, bj] = 2 * touching >= size
-    for bi in range(first, min(after, len(below))):
-        for bj in range(below.shape[1]):
-            touching = 0
-            for j in range(bj * size, min((bj + 1) * size, width)):
-                touching += grid.below[(bi + 1) * size - 1, j] > 0
-            below[bi, bj] = 2 * touching >= size
+            for k in range(size):
+                touching += columns[5, bj * size + k]
+            below[i, bj] = 2 * touching >= size
 
 
 @njit(cache=True, nogil=True)
 def _weigh(
-    first: int,
-    after: int,
+    i: int,
     blocks: Blocks,
     whole: NDArray[np.bool_],
     sensor: SensorModel,
     least: int,
     nodes: Nodes,
 ) -> None:
-    """Weigh the whole ones of some rows of blocks, of at least so many measurements."""
-    for i in range(first, after):
-        for j in range(whole.shape[1]):
-            count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
-            if not whole[i, j] or count < least:
-                nodes.moments[i, j] = 0
-                nodes.residual[i, j] = 0
-                continue
-            level = random_variance(sensor, squared)
-            tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
-            weight = 1 / (level * (1 + tilt))
-            for entry in range(COUNT):
-                nodes.moments[i, j, entry] = weight * blocks.moments[i, j, entry]
-            nodes.residual[i, j] = weight * blocks.residual[i, j]
-            nodes.moments[i, j, COUNT] = count
-            systematic = systematic_variance(sensor, squared)
-            nodes.moments[i, j, RATIO] = count * weight * systematic
-            nodes.moments[i, j, SLOPE] = count * tilt
+    """Weigh the whole ones of a row of blocks, of at least so many measurements."""
+    for j in range(len(whole)):
+        count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
+        if not whole[j] or count < least:
+            nodes.moments[i, j] = 0
+            nodes.residual[i, j] = 0
+            continue
+        level = random_variance(sensor, squared)
+        tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
+        weight = 1 / (level * (1 + tilt))
+        for entry in range(COUNT):
+            nodes.moments[i, j, entry] = weight * blocks.moments[i, j, entry]
+        nodes.residual[i, j] = weight * blocks.residual[i, j]
+        nodes.moments[i, j, COUNT] = count
+        systematic = systematic_variance(sensor, squared)
+        nodes.moments[i, j, RATIO] = count * weight * systematic
+        nodes.moments[i, j, SLOPE] = count * tilt
