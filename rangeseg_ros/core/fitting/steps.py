@@ -109,13 +109,13 @@ def _find_flat(
 ) -> None:
     """Slopes of the blocks of a row of which noise explains what their planes leave.
 
-    `flat` has a margin of one; it keeps what it holds there and for the other blocks. `tilted` are
-    the variances that slopes add.
+    `flat` has a margin of one, in which it keeps what it holds; infinite for the other blocks.
+    `tilted` are the variances that slopes add.
     """
     for j in range(blocks.squared.shape[1]):
         count, slope = blocks.moments[i, j, COUNT], blocks.across[i, j] + blocks.down[i, j]
         tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j])
         variance = random_variance(sensor, blocks.squared[i, j]) + tilt
         is_flat = (count > 3) & (blocks.residual[i, j] < ROUGH * variance * (count - 3))
-        flat[j + 1] = slope if is_flat else flat[j + 1]
+        flat[j + 1] = slope if is_flat else np.inf
         tilted[j + 1] = tilt
