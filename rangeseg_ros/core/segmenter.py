@@ -90,7 +90,8 @@ class Segmenter:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, view.image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
-        regions, labels, fits = _of_all(regions, fits, view, image, whole, config)
+        sensor = view.sensor.magnified(view.step)
+        regions, labels, fits = _of_all(regions, fits, view, sensor, image, whole, config)
         planes = describe_regions(regions, whole, fits)
         if len(planes) < len(fits.theta) - 1:
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
@@ -99,7 +100,6 @@ class Segmenter:
             labels = relabel(labels, kept)
         watch.lap('planes')
         reason = _reason(image, planes)
-        sensor = view.sensor.magnified(view.step)
         survey = Survey.of(image, sensor, config)
         if jumps is not None and step > 1:
             jumps = edges_of_all(jumps, step, image.valid)
@@ -174,6 +174,7 @@ def _of_all(
     regions: NDArray[np.uint16],
     fits: Fits,
     view: View,
+    sensor: SensorModel,
     image: RangeImage,
     whole: RangeImage,
     config: Config,
@@ -181,7 +182,6 @@ def _of_all(
     """Regions and labels of all pixels of an image, without bridged ones, and the fits of both."""
     if view.step == 1:
         return regions, regions * image.valid, fits
-    sensor = view.sensor.magnified(view.step)
     planes = fits.theta, sensor, config.plane_smoothness * sensor.patch
     regions, labels, pixels = labels_of_all(regions, view.step, image, whole, *planes)
     return regions, labels, fits.magnified(view.step, pixels)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from typing import Generic, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 Item = TypeVar('Item')
 
@@ -11,7 +12,8 @@ KEPT = 10
 """Camera infos to look among: as many as the queues of image and camera_info may lie apart."""
 
 
-class Found(NamedTuple, Generic[Item]):
+@dataclass(frozen=True)
+class Found(Generic[Item]):
     """What to use for an image, and whether it carries the stamp of the image."""
 
     item: Item

@@ -92,8 +92,8 @@ def rectangles(
 def _footprints(image: RangeImage) -> NDArray[np.float32]:
     """|du x dv . r|, (H, W), of the rays r and their differences from pixel to pixel."""
     if image.camera and image.camera.pinhole:
-        same = np.float32(1 / (image.camera.fx * image.camera.fy))
-        return np.broadcast_to(same, image.shape)
+        # An array like that of clouds, or the kernel that reads it is compiled twice.
+        return np.full(image.shape, 1 / (image.camera.fx * image.camera.fy), np.float32)
     return _ray_footprints(image.rays, image.inverse)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Self
 
 import numpy as np
 from numba import njit
@@ -77,7 +76,7 @@ class Plane:
     outline: Outline = field(repr=False)
     role: str = ''
 
-    def named(self, **names: int | str) -> Self:
+    def named(self, **names: int | str) -> Plane:
         """The same plane with another `id`, `surface` or `role`.
 
         As `dataclasses.replace` does it, which takes each field by itself, ten times as long.
