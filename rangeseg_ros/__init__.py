@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.sequence import SequenceSegmenter
     from rangeseg_ros.io.corrections import corrected
     from rangeseg_ros.messages.clouds import planes_from_message
+    from rangeseg_ros.notebook import segment
 
 __version__ = '1.0.0'
 
@@ -41,6 +42,7 @@ __all__ = [
     'camera_from_matrices',
     'corrected',
     'planes_from_message',
+    'segment',
 ]
 
 # Imported when used: `rangeseg --help`, and an interrupt at the start, need not wait for numba.
@@ -58,6 +60,7 @@ _HOMES = {
     'core.sequence': ('SequenceSegmenter',),
     'io.corrections': ('corrected',),
     'messages.clouds': ('planes_from_message',),
+    'notebook': ('segment',),
 }
 
 
@@ -66,3 +69,7 @@ def __getattr__(name: str) -> Any:
         if name in names:
             return getattr(import_module(f'rangeseg_ros.{home}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    return __all__

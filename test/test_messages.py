@@ -1,6 +1,6 @@
 """Results to messages and back, with the message classes of rosbags and of rclpy."""
 
-from types import SimpleNamespace
+from types import MethodType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import RangeImage, Segmentation, planes_from_message
+from rangeseg_ros import Plane, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
@@ -32,7 +32,7 @@ SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 
 def plane(label, hull=SQUARE, holes=()):
     """A region of the plane z = 2 m with the attributes of a Plane."""
-    return SimpleNamespace(
+    made = SimpleNamespace(
         label=label,
         id=label + 100,
         surface=label,
@@ -50,6 +50,8 @@ def plane(label, hull=SQUARE, holes=()):
         orientation=np.array([1.0, 0.0, 0.0, 0.0]),
         outline=MapOutline([[np.array(ring, float).reshape(-1, 3) for ring in (hull, *holes)]]),
     )
+    made.mesh = MethodType(Plane.mesh, made)
+    return made
 
 
 def test_label_image_reads_back_as_it_was():

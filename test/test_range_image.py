@@ -213,11 +213,27 @@ def test_dithering_adds_the_stated_noise_to_the_ranges():
     np.testing.assert_array_equal(image.inverse, again.inverse)
 
 
+@pytest.mark.parametrize('dtype', ['<u2', '>u2', '<i2', '>i4', '<u4'])
+def test_integers_of_other_widths_are_taken(dtype):
+    depth = np.array([[0, 1, 500], [32767, 7, 0]], np.uint16)
+    camera = Camera(3, 2, 300, 300, 1, 0.5)
+    wanted = RangeImage.from_depth(depth, camera).inverse
+    np.testing.assert_array_equal(
+        RangeImage.from_depth(depth.astype(dtype), camera).inverse, wanted
+    )
+
+
+def test_wider_integers_keep_what_is_far_and_lose_what_is_none():
+    depth = np.array([[-5, 65535, 200000]], np.int32)
+    inverse = RangeImage.from_depth(depth, Camera(3, 1, 300, 300, 1, 0), 0.0001).inverse
+    np.testing.assert_allclose(inverse, [[0, 0, 1 / 20]])
+
+
 @pytest.mark.parametrize(
     ('depth', 'scale', 'message'),
     [
         (np.zeros((3, 4, 3), np.uint16), None, 'one channel'),
-        (np.zeros((3, 4), np.uint8), None, 'uint16 or float'),
+        (np.zeros((3, 4), np.uint8), None, 'int32 or float, not uint8'),
         (np.zeros((4, 4), np.uint16), None, '4x4'),
         (np.zeros((3, 4), np.uint16), 0.0, 'scale'),
         (np.zeros((3, 4), np.uint16), np.nan, 'scale'),

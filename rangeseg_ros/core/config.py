@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -354,6 +354,11 @@ class Config:
     )
     seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
+    def __new__(cls, *values: Any, **named: Any) -> Config:
+        # The TypeError of the generated __init__ would suggest nothing.
+        _check_names(cls, named)
+        return super().__new__(cls)
+
     def __post_init__(self) -> None:
         for option_field in fields(self):
             value = checked(option_field, getattr(self, option_field.name))
@@ -395,11 +400,15 @@ class Config:
             A parameter has another name now; its value is converted.
         """
         mapping = _renamed(mapping)
-        known = {option_field.name for option_field in fields(cls)}
-        for name in mapping:
-            if name not in known:
-                raise ConfigError(unknown_parameter(name, known))
+        _check_names(cls, mapping)
         return cls(**mapping)
+
+
+def _check_names(kind: type[Config], names: Iterable[object]) -> None:
+    known = kind.__dataclass_fields__
+    for name in names:
+        if name not in known:
+            raise ConfigError(unknown_parameter(name, known))
 
 
 def check_directions(distribution: str, count: int) -> None:

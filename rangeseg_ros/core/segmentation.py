@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 STATED = SensorModel.from_config(Config())
@@ -49,7 +51,12 @@ class WorkedOut:
         return self.field
 
 
-@dataclass(frozen=True, eq=False)
+def _notebook() -> Any:
+    # Imported when asked for: the core draws nothing, and needs no other library.
+    return import_module('rangeseg_ros.notebook')
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Segmentation:
     """What was found in one range image.
 
@@ -73,6 +80,8 @@ class Segmentation:
         How the ground is found, or what was found.
     upright : tuple of 3 float
         Tolerance, smallest area and slope of `tilt_of`.
+    image : RangeImage or None
+        What was segmented; None in a result that was pickled.
     work_budget : float
         Share of the full work that the image was given: with the same, its labels are the same.
     """
@@ -87,6 +96,56 @@ class Segmentation:
     survey: Survey | Terrain | None = field(default=None, repr=False)
     upright: tuple[float, float, float] | None = None
     work_budget: float = 1.0
+    image: RangeImage | None = None
+
+    def __repr__(self) -> str:
+        height, width = self.labels.shape
+        if not self.planes:
+            return f'<Segmentation {width}x{height}: no plane: {self.reason}>'
+        names = (f'{plane.id} {plane.role}'.strip() for plane in self.planes[:6])
+        more = ', ...' if len(self.planes) > 6 else ''
+        share = np.count_nonzero(self.labels) / self.labels.size
+        found = f'{len(self.planes)} planes ({", ".join(names)}{more}) over {share:.0%}'
+        return f'<Segmentation {width}x{height}: {found}>'
+
+    def _repr_html_(self) -> str:
+        return str(_notebook().to_html(self))
+
+    def plot(self, axes: Any = None) -> Any:
+        """Show the planes over the depth with matplotlib.
+
+        Parameters
+        ----------
+        axes : matplotlib.axes.Axes, optional
+            The current ones when not given.
+
+        Returns
+        -------
+        matplotlib.axes.Axes
+        """
+        return _notebook().plot(self, axes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Planes and how they were found as numbers, texts and lists, as JSON takes it."""
+        return {
+            'shape': list(self.labels.shape),
+            'planes': [plane.to_dict() for plane in self.planes],
+            'reason': self.reason,
+            'sensor': str(self.sensor),
+        }
+
+    def to_pandas(self) -> Any:
+        """pandas.DataFrame with a row for each plane and the columns of planes.csv."""
+        return _notebook().to_pandas(self)
+
+    def to_trimesh(self) -> Any:
+        """trimesh.Scene with a coloured mesh for each plane."""
+        return _notebook().to_trimesh(self)
+
+    def to_open3d(self) -> list[Any]:
+        """Coloured open3d.geometry.TriangleMesh of each plane."""
+        meshes: list[Any] = _notebook().to_open3d(self)
+        return meshes
 
     @cached_property
     def tilt(self) -> Tilt | None:
@@ -165,5 +224,5 @@ class Segmentation:
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
-        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt}
+        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt, 'image': None}
         return {**self.__dict__, 'labelling': kept, **found}

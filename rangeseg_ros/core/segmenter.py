@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,14 @@ class Segmenter:
         box_safely()
         load_lazily()
 
+    def __repr__(self) -> str:
+        changed = (
+            f'{f.name}={value!r}'
+            for f in fields(self.config)
+            if (value := getattr(self.config, f.name)) != f.default
+        )
+        return f'<Segmenter {", ".join(changed) or "with default parameters"}>'
+
     def reset(self) -> None:
         """Forget the frame before, from which `warm_start` begins."""
         self._before: tuple[Camera | None, NDArray[np.integer]] | None = None
@@ -59,9 +67,14 @@ class Segmenter:
         Raises
         ------
         RangeImageError
-            There is a `distortion_map` or a `mask`, and nobody has applied it: the core reads no
-            files.
+            `image` is an array. Or there is a `distortion_map` or a `mask`, and nobody has applied
+            it: the core reads no files.
         """
+        if not isinstance(image, RangeImage):
+            raise RangeImageError(
+                f'an image is a RangeImage, not {type(image).__name__}: make one with '
+                'RangeImage.from_depth(depth, camera) or RangeImage.from_points(points)'
+            )
         config = self.config
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
@@ -105,7 +118,7 @@ class Segmenter:
             jumps = edges_of_all(jumps, step, image.valid)
         upright = config.role_tolerance, config.role_area, config.ground_slope
         others = jumps, survey, upright, config.work_budget
-        return Segmentation(labels, planes, watch.laps, reason, sensor, labelling, *others)
+        return Segmentation(labels, planes, watch.laps, reason, sensor, labelling, *others, image)
 
     def _by_normals(
         self, view: View, config: Config, watch: Stopwatch

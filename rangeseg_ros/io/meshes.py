@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.mapping.plane_map import MapPlane
 from rangeseg_ros.io.files import replacing
 
@@ -41,12 +40,10 @@ def write_mesh(path: Path, planes: Sequence[MapPlane], colours: NDArray[np.uint8
     vertices: list[str] = []
     faces: list[str] = []
     for plane, colour in zip(planes, colours.tolist(), strict=True):
-        for rings in plane.outline.parts:
-            first = len(vertices)
-            rgb = ' '.join(map(str, colour))
-            corners = np.concatenate(rings).tolist()
-            vertices += [f'{x:.6f} {y:.6f} {z:.6f} {rgb}' for x, y, z in corners]
-            faces += ['3 {} {} {}'.format(*t) for t in first + triangles(rings, plane.normal)]
+        corners, triangles = plane.mesh()
+        rgb = ' '.join(map(str, colour))
+        faces += ['3 {} {} {}'.format(*t) for t in len(vertices) + triangles]
+        vertices += [f'{x:.6f} {y:.6f} {z:.6f} {rgb}' for x, y, z in corners.tolist()]
     text = _HEADER.format(len(vertices), len(faces))
     with replacing(path) as partial:
         partial.write_text(text + ''.join(f'{line}\n' for line in [*vertices, *faces]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import fields
 from itertools import combinations_with_replacement
 from operator import attrgetter, itemgetter
@@ -69,8 +69,19 @@ def columns(kind: type[Plane] = Plane, without: Collection[str] = ()) -> list[st
 
 
 def row(plane: Plane, without: Collection[str] = ()) -> list[str]:
-    """Values of `plane` for `columns`."""
-    return [_text(value) for value in _values(plane, without)]
+    """Values of `plane` for `columns`, as text."""
+    return [_text(value) for value in values(plane, without)]
+
+
+def values(plane: Plane, without: Collection[str] = ()) -> list[Any]:
+    """Values of `plane` for `columns` as they are."""
+    found: list[Any] = []
+    for field in fields(plane):
+        if field.name not in without:
+            value = getattr(plane, field.name)
+            parts = _PARTS.get(field.name)
+            found += [part(value) for part in parts.values()] if parts else [value]
+    return found
 
 
 def write_map(path: Path, planes: Sequence[MapPlane]) -> None:
@@ -119,17 +130,6 @@ class PlaneTable:
         csv.writer(text, lineterminator='\n').writerows(rows)
         self._file.write(text.getvalue())
         self._file.flush()
-
-
-def _values(plane: Plane, without: Collection[str]) -> Iterator[Any]:
-    for field in fields(plane):
-        if field.name in without:
-            continue
-        value = getattr(plane, field.name)
-        if field.name in _PARTS:
-            yield from (part(value) for part in _PARTS[field.name].values())
-        else:
-            yield value
 
 
 def _text(value: Any) -> str:

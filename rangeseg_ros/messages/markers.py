@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.meaning.ramps import Ramp
 from rangeseg_ros.core.meaning.stairs import Stairs
@@ -72,8 +71,10 @@ def of_planes(planes: Sequence[Plane]) -> list[Marker]:
         normal = np.array((plane.centroid, tip))
         size, thin = (1.0, 1.0, 1.0), (0.02, 0.04, 0.06)
         opaque, clear = (red, green, blue, 1.0), (red, green, blue, 0.6)
+        vertices, triangles = plane.mesh()
+        corners = vertices[triangles.ravel()]
         markers += [
-            Marker('hulls', plane.id, TRIANGLE_LIST, size, clear, _triangles(plane)),
+            Marker('hulls', plane.id, TRIANGLE_LIST, size, clear, corners),
             Marker('normals', plane.id, ARROW, thin, opaque, normal),
             _text('ids', plane.id, f'{plane.id} {plane.role}'.strip(), tip),
         ]
@@ -123,16 +124,6 @@ def _text(namespace: str, number: int, text: str, position: NDArray[np.floating]
     x, y, z = position.tolist()
     size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
     return Marker(namespace, number, TEXT_VIEW_FACING, size, white, text=text, position=(x, y, z))
-
-
-def _triangles(plane: Plane) -> NDArray[np.floating]:
-    """Corners (N, 3) of triangles that make up the outline of `plane` without its holes."""
-    corners = [
-        np.concatenate(rings)[triangles(rings, plane.normal).ravel()]
-        for rings in plane.outline.parts
-        if len(rings[0]) > 2
-    ]
-    return np.concatenate(corners) if corners else _NOWHERE
 
 
 def markers_message(make: Make, header: Any, markers: Iterable[Marker]) -> Any:

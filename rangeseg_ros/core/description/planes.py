@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import Outline, lies_ahead
+from rangeseg_ros.core.description.outlines import Outline, lies_ahead, triangles
 from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
 from rangeseg_ros.core.fitting.cells import POINT, SCATTER, is_empty, level_of
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
@@ -23,7 +24,7 @@ from rangeseg_ros.core.sensing.sensor import (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plane:
     """A planar region: normal . p + distance = 0 in metres, in the frame of the image.
 
@@ -85,6 +86,39 @@ class Plane:
         vars(plane).update(vars(self), **names)
         return plane
 
+    def __repr__(self) -> str:
+        x, y, z = self.normal
+        name = f'Plane {self.id}' + (f' ({self.role})' if self.role else '')
+        return (
+            f'<{name}: {self.area:.3g} m², normal ({x:.3f}, {y:.3f}, {z:.3f}), '
+            f'distance {self.distance:.4g} m, rms {1000 * self.rms:.2g} mm>'
+        )
+
+    def mesh(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Triangles of the outline without its holes.
+
+        Returns
+        -------
+        vertices : (N, 3) float64
+            Metres.
+        triangles : (T, 3) int
+            Rows of `vertices`, counter-clockwise seen from the sensor.
+        """
+        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.intp)]
+        first = 0
+        for rings in self.outline.parts:
+            if len(rings[0]) > 2:
+                vertices += rings
+                faces.append(first + triangles(rings, self.normal))
+                first += sum(map(len, rings))
+        return np.concatenate(vertices), np.concatenate(faces)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The plane as numbers, texts and lists of them, as JSON takes it."""
+        names = [f.name for f in fields(self) if f.name not in ('shape', 'outline')]
+        names += ['area', 'extents', 'centre', 'orientation', 'hull', 'holes']
+        return {name: _plain(getattr(self, name)) for name in names}
+
     @property
     def area(self) -> float:
         """Area of the pixels on the plane, square metres."""
@@ -123,6 +157,12 @@ class Plane:
     def holes(self) -> list[NDArray[np.float64]]:
         """Outlines (N, 3) of the holes in the hull, clockwise seen from the sensor."""
         return self.outline.holes
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(part) for part in value]
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
 def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:

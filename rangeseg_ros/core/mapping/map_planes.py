@@ -16,7 +16,7 @@ from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
 from rangeseg_ros.core.rotations import quaternions
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class MapPlane(Plane):
     """A plane of the map; normal . p + distance = 0 in the fixed frame.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, lru_cache
@@ -95,6 +96,27 @@ class Camera:
                 )
         if self.distortion_model != 'equidistant':
             self._check_slopes()
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, degrees: float) -> Camera:
+        """A pinhole camera with square pixels and the principal point in the middle.
+
+        Parameters
+        ----------
+        width, height : int
+            Size of the image, pixels.
+        degrees : float
+            Horizontal field of view, from 0 to 180.
+
+        Raises
+        ------
+        CameraError
+            An empty image, or a field of view that no pinhole camera has.
+        """
+        if not 0 < _finite('field of view', degrees) < 180:
+            raise CameraError(f'field of view must be between 0 and 180 degrees, not {degrees}')
+        focal = width / (2 * math.tan(math.radians(degrees) / 2))
+        return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     def _check_slopes(self) -> None:
         corners = np.array([(u, v) for u in (0, self.width - 1) for v in (0, self.height - 1)])

@@ -28,7 +28,7 @@ NOT_MEASURED = 65535
 """What drivers and data sets write for it beside 0: the largest value of 16 bits."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RangeImage:
     """Measurements along pixel rays: point = place + ray / inverse.
 
@@ -57,6 +57,17 @@ class RangeImage:
     corrected: bool = False
     body: NDArray[np.bool_] | None = None
 
+    def __repr__(self) -> str:
+        kind = 'organised cloud' if self.camera is None else 'depth image'
+        measured = self.inverse[self.valid]
+        if not len(measured):
+            return f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, nothing measured>'
+        return (
+            f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, '
+            f'{measured.size / self.inverse.size:.0%} measured, '
+            f'{1 / measured.max():.3g} to {1 / measured.min():.3g} m>'
+        )
+
     @classmethod
     def from_depth(
         cls, depth: ArrayLike, camera: Camera, scale: float | None = None
@@ -65,9 +76,9 @@ class RangeImage:
 
         Parameters
         ----------
-        depth : (H, W) uint16 or float, of either byte order
-            Depth along the optical axis; 0 and 65535 (integers), non-finite or <= 0 (floats) and
-            what the mask of a masked array hides are invalid.
+        depth : (H, W) uint16, int16, int32 or float, of either byte order
+            Depth along the optical axis; 0, negative values and 65535 (integers), non-finite or
+            <= 0 (floats) and what the mask of a masked array hides are invalid.
         camera : Camera
             Intrinsics; its size must be the image's.
         scale : float, optional
@@ -76,8 +87,8 @@ class RangeImage:
         Raises
         ------
         RangeImageError
-            Not a 2-D uint16 or float image, a size other than the camera's, a scale that is
-            not positive.
+            Not a 2-D image of these types, no camera, a size other than the camera's, a scale
+            that is not positive.
 
         Warns
         -----
@@ -87,9 +98,15 @@ class RangeImage:
         array, hidden = _unmasked(depth)
         if array.ndim != 2:
             raise RangeImageError(f'depth image must have one channel, not shape {array.shape}')
-        integers = array.dtype.kind == 'u' and array.itemsize == 2
+        if not isinstance(camera, Camera):
+            raise RangeImageError(
+                f'camera must be a Camera(width, height, fx, fy, cx, cy), not {camera!r:.60}'
+            )
+        integers = array.dtype.kind in 'iu' and 2 <= array.itemsize <= 4
         if not integers and array.dtype.kind != 'f':
-            raise RangeImageError(f'depth image must be uint16 or float, not {array.dtype}')
+            raise RangeImageError(
+                f'depth image must be uint16, int16, int32 or float, not {array.dtype}'
+            )
         if array.shape != camera.shape:
             raise RangeImageError(
                 f'depth image is {array.shape[1]}x{array.shape[0]}, '
@@ -99,7 +116,12 @@ class RangeImage:
             scale = 0.001 if integers else 1.0
         if not (np.isfinite(scale) and scale > 0):
             raise RangeImageError(f'depth scale must be positive, not {scale}')
-        inverse = _reciprocal(array.astype(np.uint16, copy=False) if integers else array, scale)
+        if integers and array.dtype != np.uint16:
+            # Older readers of 16-bit images give wider integers; those of 32 bits may be finer.
+            array = np.where(array == NOT_MEASURED, 0, array)
+            if array.max(initial=0) < NOT_MEASURED:
+                array = np.maximum(array, 0).astype(np.uint16)
+        inverse = _reciprocal(array, scale)
         if hidden is not None:
             inverse[hidden] = 0
         if camera.distortion_model:

@@ -1,0 +1,147 @@
+"""Segmenting in one call, and results as pictures, tables and meshes of other libraries."""
+
+from __future__ import annotations
+
+import base64
+import html
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rangeseg_ros.compilation.preparation import prepare
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sequence import with_roles
+from rangeseg_ros.drawing import colours, overlay
+from rangeseg_ros.extras import load
+from rangeseg_ros.io.corrections import corrected
+from rangeseg_ros.io.planes import columns, values
+
+
+def segment(
+    depth: ArrayLike, camera: Camera | None = None, scale: float | None = None, **parameters: Any
+) -> Segmentation:
+    """Segment a depth image or an organised cloud into planes.
+
+    Says on stderr when kernels are compiled first, once after the installation.
+
+    Parameters
+    ----------
+    depth : (H, W) uint16, int16, int32 or float, or (H, W, 3) float
+        Depth along the optical axis, see `RangeImage.from_depth`; without a camera points in
+        metres, see `RangeImage.from_points`.
+    camera : Camera, optional
+        Intrinsics of the depth image.
+    scale : float, optional
+        Metres per unit; 0.001 for integers and 1 for floats when not given.
+    **parameters
+        Of `Config`.
+
+    Raises
+    ------
+    ValueError
+        `ConfigError`, `RangeImageError` or another one, whose message says what is wrong.
+
+    Examples
+    --------
+    >>> result = rangeseg_ros.segment(depth, rangeseg_ros.Camera.from_fov(640, 480, 57))
+    """
+    config = Config.from_mapping(parameters)
+    if camera is None:
+        image = RangeImage.from_points(depth)
+    else:
+        image = RangeImage.from_depth(depth, camera, scale)
+    image = corrected(image, config)
+    prepare(config, ('points' if image.camera is None else 'image',), _report, ())
+    result = Segmenter(config).segment(image)
+    return replace(result, planes=with_roles(result.planes, config, result.up))
+
+
+def _report(progress: str) -> None:
+    # One line, on terminals as in notebooks.
+    print(f'{progress:40} (once, for a minute or two)', end='\r', file=sys.stderr, flush=True)
+
+
+def picture(result: Segmentation) -> NDArray[np.uint8]:
+    """Planes in colour over the depth, (H, W, 3) RGB; over black where the image is not kept."""
+    inverse = np.zeros(result.labels.shape) if result.image is None else result.image.inverse
+    return overlay(inverse, result.labels, result.planes)
+
+
+def plot(result: Segmentation, axes: Any = None) -> Any:
+    """Show `picture` in `axes` of matplotlib, the current ones when not given; returns them."""
+    if axes is None:
+        load('matplotlib')
+        axes = load('matplotlib.pyplot').gca()
+    axes.imshow(picture(result))
+    axes.set_title(f'{len(result.planes)} planes')
+    axes.set_axis_off()
+    return axes
+
+
+def to_html(result: Segmentation) -> str:
+    """Picture and table of the planes."""
+    _, png = cv2.imencode('.png', cv2.cvtColor(picture(result), cv2.COLOR_RGB2BGR))
+    names = ('plane', 'role', 'area (m²)', 'normal', 'distance (m)', 'rms (mm)', 'pixels')
+    rows = [''.join(f'<th>{name}</th>' for name in names)]
+    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+        normal = ' '.join(f'{x:.3f}' for x in plane.normal)
+        cells = (
+            f'<span style="color:rgb{tuple(colour.tolist())}">&#9632;</span> {plane.id}',
+            plane.role,
+            f'{plane.area:.3g}',
+            normal,
+            f'{plane.distance:.4g}',
+            f'{1000 * plane.rms:.2g}',
+            str(plane.count),
+        )
+        rows.append(''.join(f'<td>{cell}</td>' for cell in cells))
+    table = ''.join(f'<tr>{row}</tr>' for row in rows)
+    source = f'data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'
+    return (
+        f'<p>{html.escape(repr(result))}</p>'
+        f'<img src="{source}" style="max-width:100%"><table>{table}</table>'
+    )
+
+
+def to_pandas(result: Segmentation) -> Any:
+    """pandas.DataFrame with a row for each plane and the columns of planes.csv."""
+    rows = [values(plane) for plane in result.planes]
+    return load('pandas').DataFrame(rows, columns=columns())
+
+
+def to_trimesh(result: Segmentation) -> Any:
+    """trimesh.Scene with a coloured mesh for each plane, in the frame of the image."""
+    trimesh = load('trimesh')
+    scene = trimesh.Scene()
+    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+        mesh = trimesh.Trimesh(*plane.mesh(), face_colors=[*colour, 255], process=False)
+        scene.add_geometry(mesh, geom_name=f'plane {plane.id}')
+    return scene
+
+
+def to_open3d(result: Segmentation) -> list[Any]:
+    """Coloured open3d.geometry.TriangleMesh of each plane, in the frame of the image."""
+    open3d = load('open3d')
+    meshes = []
+    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+        vertices, triangles = plane.mesh()
+        mesh = open3d.geometry.TriangleMesh(
+            open3d.utility.Vector3dVector(vertices),
+            open3d.utility.Vector3iVector(triangles.astype(np.int32)),
+        )
+        meshes.append(mesh.paint_uniform_color(colour / 255))
+    return meshes
+
+
+def _colours(planes: Sequence[Plane]) -> NDArray[np.uint8]:
+    return colours([plane.id for plane in planes])

@@ -1,0 +1,141 @@
+"""One call to segment, and results as people look at them and take them elsewhere."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import rangeseg_ros
+from rangeseg_ros import Camera, CameraError, Config, ConfigError, RangeImage, Segmenter
+from rangeseg_ros.drawing import colours
+from rangeseg_ros.extras import MissingExtraError, load
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+
+
+@pytest.fixture(scope='module')
+def seen():
+    return simulate(kinect_room(3), SENSORS['kinect'](1), seed=3)
+
+
+@pytest.fixture(scope='module')
+def result(seen):
+    return rangeseg_ros.segment(seen.depth, seen.camera)
+
+
+def test_completion_sees_the_interface():
+    assert set(dir(rangeseg_ros)) == set(rangeseg_ros.__all__)
+    for name in dir(rangeseg_ros):
+        assert getattr(rangeseg_ros, name) is not None
+
+
+def test_one_call_gives_what_the_segmenter_gives(seen, result):
+    image = RangeImage.from_depth(seen.depth, seen.camera)
+    assert (result.labels == Segmenter(Config()).segment(image).labels).all()
+    assert 'wall' in {plane.role for plane in result.planes}
+    scaled = rangeseg_ros.segment(seen.depth / 1000, seen.camera, min_pixels=3000)
+    assert 0 < len(scaled.planes) < len(result.planes)
+
+
+def test_points_need_no_camera(seen, result):
+    points = RangeImage.from_depth(seen.depth, seen.camera).points
+    assert len(rangeseg_ros.segment(points).planes) == len(result.planes)
+
+
+def test_texts_are_short(seen, result):
+    for thing in (result, result.planes[0], result.image, Segmenter(Config(noise=0.001))):
+        assert 10 < len(repr(thing)) < 200
+    assert f'{len(result.planes)} planes' in repr(result)
+    assert 'noise=0.001' in repr(Segmenter(Config(noise=0.001)))
+    assert 'default' in repr(Segmenter())
+    assert 'nothing' in repr(RangeImage.from_depth(np.zeros((480, 640)), seen.camera))
+
+
+def test_the_mesh_covers_the_plane(result):
+    for plane in result.planes:
+        vertices, triangles = plane.mesh()
+        a, b, c = vertices[triangles].transpose(1, 0, 2)
+        across = np.cross(b - a, c - a) / 2
+        # Every triangle faces the sensor; the outline simplifies the region by 1.5 pixels.
+        assert (across @ plane.normal > -1e-9).all()
+        assert np.abs(vertices @ plane.normal + plane.distance).max() < 1e-6
+        if plane.count > 5000:
+            assert np.linalg.norm(across, axis=1).sum() == pytest.approx(plane.area, rel=0.1)
+
+
+def test_dictionaries_are_json_and_hold_the_numbers(result):
+    told = json.loads(json.dumps(result.to_dict()))
+    assert told['shape'] == list(result.labels.shape)
+    for plane, known in zip(result.planes, told['planes'], strict=True):
+        assert np.array_equal(plane.normal, known['normal'])
+        assert np.array_equal(plane.hull, known['hull'])
+        assert (plane.id, plane.role, plane.count) == (known['id'], known['role'], known['count'])
+
+
+def test_html_has_a_picture_and_a_row_for_each_plane(result):
+    page = result._repr_html_()
+    assert 'data:image/png;base64,' in page
+    assert page.count('<tr>') == len(result.planes) + 1
+
+
+def test_pandas(result):
+    pytest.importorskip('pandas')
+    table = result.to_pandas()
+    assert table['count'].tolist() == [plane.count for plane in result.planes]
+    assert table['normal_z'].tolist() == [plane.normal[2] for plane in result.planes]
+
+
+def test_trimesh(result):
+    pytest.importorskip('trimesh')
+    scene = result.to_trimesh()
+    for plane in result.planes:
+        mesh = scene.geometry[f'plane {plane.id}']
+        assert len(mesh.faces) == len(plane.mesh()[1])
+        assert tuple(mesh.visual.face_colors[0][:3]) == tuple(colours([plane.id])[0])
+
+
+def test_open3d(result):
+    pytest.importorskip('open3d', exc_type=ImportError)
+    for plane, mesh in zip(result.planes, result.to_open3d(), strict=True):
+        assert np.allclose(np.asarray(mesh.vertices), plane.mesh()[0])
+
+
+def test_plot(result):
+    pytest.importorskip('matplotlib').use('agg')
+    (shown,) = result.plot().images
+    assert shown.get_array().shape == (480, 640, 3)
+
+
+def test_errors_are_value_errors_with_a_suggestion(seen):
+    depth, camera = seen.depth, seen.camera
+    for call, kind, words in (
+        (lambda: Config(smothness=3), ConfigError, "'smoothness' meant"),
+        (lambda: rangeseg_ros.segment(depth, camera, smothness=3), ConfigError, 'smoothness'),
+        (lambda: Segmenter().segment(depth), ValueError, r'RangeImage.from_depth\(depth, camera'),
+        (lambda: RangeImage.from_depth(depth, (525, 525)), ValueError, r'a Camera\(width'),
+        (lambda: rangeseg_ros.segment(depth), ValueError, r'\(H, W, 3\)'),
+        (lambda: Camera.from_fov(640, 480, 180), CameraError, 'between 0 and 180'),
+    ):
+        with pytest.raises(kind, match=words):
+            call()
+
+
+def test_field_of_view():
+    camera = Camera.from_fov(640, 480, 90)
+    left, right = camera.rays_at([-0.5, 639.5], [0, 0])
+    assert np.degrees(np.arctan(right[0]) - np.arctan(left[0])) == pytest.approx(90)
+
+
+def test_a_missing_library_is_told_with_its_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'pandas', None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'rangeseg_ros\[notebook\]'"):
+        load('pandas')
+
+
+def test_the_core_is_imported_without_drawing():
+    code = 'import sys, rangeseg_ros.core.segmenter; print("rangeseg_ros.drawing" in sys.modules)'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == 'False'
