@@ -1,6 +1,8 @@
-# Needs python3 with venv, and make. A sourced ROS 2 is used where there is one: its rclpy then
+# Needs Python with venv, and make. A sourced ROS 2 is used where there is one: its rclpy then
 # comes before any wheel, through a virtual environment that sees the system's packages.
-PYTHON ?= python3
+# ROS 2 Jazzy's Python where there is one that starts, which a shim of pyenv need not.
+PYTHON ?= $(shell for python in python3.12 "$$(pyenv prefix 3.12 2>&1)/bin/python" python3; do \
+  "$$python" -c '' 2>/dev/null && echo "$$python" && break; done)
 VENV ?= .venv
 BIN := $(VENV)/bin
 SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-site-packages)

@@ -22,7 +22,6 @@ from numba.core.lowering import BaseLower
 
 from rangeseg_ros.compilation.discovery import Kernel, discover
 from rangeseg_ros.compilation.rehearsal import rehearse
-from rangeseg_ros.core.runtime.boxing import box_safely
 
 
 def main() -> None:
@@ -39,7 +38,6 @@ def main() -> None:
             os._exit(0)  # the parent has ended
 
     cv2.setNumThreads(1)
-    box_safely()
     _share_work()
     _compile_for_python_only()
     while True:

@@ -17,7 +17,6 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
-from rangeseg_ros.core.runtime.boxing import box_safely
 from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
@@ -46,7 +45,6 @@ class Segmenter:
         self.config = config or Config()
         self.reset()
         keep_freed_memory()
-        box_safely()
         load_lazily()
 
     def __repr__(self) -> str:

@@ -60,7 +60,7 @@ class _Table:
         stacked = len(self.tops) > 0 and pose != 'leaning' and self.random.random() < 0.25
         if stacked:
             scale = scale / 2
-        outline, height = _outline(sides, scale[0], scale[1]), scale[2]
+        outline, height = _outline(int(sides), scale[0], scale[1]), scale[2]
         rotation = Rotation.from_euler('z', self.random.uniform(0, 360), degrees=True)
         if pose == 'lying':
             # The outline upright, its first edge on the floor.

@@ -28,13 +28,7 @@ class Graph(NamedTuple):
     links: NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
-def adjacency(
-    image: NDArray[np.int32],
-    count: int,
-    grid: Grid,
-    smoothness: float,
-) -> Graph:
+def adjacency(image: NDArray[np.int32], count: int, grid: Grid, smoothness: float) -> Graph:
     """Graph of pieces.
 
     Parameters
@@ -47,6 +41,14 @@ def adjacency(
     smoothness : float
         Lambda.
     """
+    return Graph(*_adjacency(image, count, grid, smoothness))
+
+
+@njit(cache=True, nogil=True)
+def _adjacency(
+    image: NDArray[np.int32], count: int, grid: Grid, smoothness: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+    """Fields of the `Graph`."""
     height, width = image.shape
     room = np.zeros(count + 1, np.int32)
     for filling in range(2):
@@ -85,5 +87,4 @@ def adjacency(
         for e in range(n):
             neighbours[start[p] + e] = neighbours[room[p] + e]
             links[start[p] + e] = links[room[p] + e]
-    neighbours, links = neighbours[: start[count]].copy(), links[: start[count]].copy()
-    return Graph(start, neighbours, links)
+    return start, neighbours[: start[count]].copy(), links[: start[count]].copy()

@@ -71,7 +71,8 @@ def shifts(
     agreement : float
         Pixels whose noise agrees, see `SensorModel.agreement`.
     """
-    local, inner = _room_for_shifts(surfaces, len(theta), reach), _inner(surfaces)
+    local = Shifts(*_room_for_shifts(surfaces, len(theta), reach))
+    inner = _inner(surfaces)
     map_halves(_find_shifts, len(theta), local, inner, blocks, theta, around, agreement)
     return local
 
@@ -87,8 +88,10 @@ def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _room_for_shifts(surfaces: NDArray[np.int32], count: int, reach: int) -> Shifts:
-    """Shifts, all 0, in the bounding boxes of the surfaces and so many blocks around them."""
+def _room_for_shifts(
+    surfaces: NDArray[np.int32], count: int, reach: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
+    """Fields of `Shifts`, all 0, in the boxes of the surfaces and so many blocks around them."""
     rows, columns = surfaces.shape
     first = np.full((count, 2), max(rows, columns))
     after = np.zeros((count, 2), np.intp)
@@ -107,7 +110,7 @@ def _room_for_shifts(surfaces: NDArray[np.int32], count: int, reach: int) -> Shi
             box[k, 3] = min(after[k, 1] + reach, columns) - box[k, 1]
     end = np.cumsum(box[:, 2] * box[:, 3])
     start = end - box[:, 2] * box[:, 3]
-    return Shifts(box, start, np.zeros(end[-1], np.float32))
+    return box, start, np.zeros(end[-1], np.float32)
 
 
 @njit(cache=True, nogil=True)

@@ -278,7 +278,7 @@ def _deviation(
         variance += without_plane(bias.reshape(grid), known.reshape(grid)) ** 2
     weight = known.reshape(grid).astype(np.float64)
     smooth = cv2.GaussianBlur(variance * weight, (0, 0), _AVERAGED)
-    smooth /= np.maximum(cv2.GaussianBlur(weight, (0, 0), _AVERAGED), 1e-6)
+    smooth = smooth / np.maximum(cv2.GaussianBlur(weight, (0, 0), _AVERAGED), 1e-6)
     return np.sqrt(smooth).ravel() * known
 
 

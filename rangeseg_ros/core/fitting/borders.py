@@ -14,6 +14,15 @@ from rangeseg_ros.core.sensing.marks import no_marks
 
 # Which neighbours of a pixel are of another region.
 _RIGHT, _BELOW = 1, 2
+# Of `Borders`.
+_Fields = tuple[
+    NDArray[np.intp],
+    NDArray[np.intp],
+    NDArray[np.intp],
+    NDArray[np.intp],
+    NDArray[np.intp],
+    NDArray[np.intp],
+]
 
 
 class Borders(NamedTuple):
@@ -45,7 +54,7 @@ class Borders(NamedTuple):
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         if not dropped.any():
             return self
-        return _without(self, dropped)
+        return Borders(*_without(self, dropped))
 
 
 def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders:
@@ -60,11 +69,13 @@ def find_borders(regions: NDArray[np.uint16], grid: Grid, count: int) -> Borders
     count : int
         M + 1.
     """
-    return _put_together(*map_halves(_find_stretches, len(regions), regions, grid, count))
+    return Borders(
+        *_put_together(*map_halves(_find_stretches, len(regions), regions, grid, count))
+    )
 
 
 @njit(cache=True, nogil=True)
-def _without(borders: Borders, dropped: NDArray[np.bool_]) -> Borders:
+def _without(borders: Borders, dropped: NDArray[np.bool_]) -> _Fields:
     """What `Borders.without` returns where there is something to drop."""
     kept = ~dropped
     number, start = np.cumsum(kept) - 1, [0]
@@ -72,9 +83,9 @@ def _without(borders: Borders, dropped: NDArray[np.bool_]) -> Borders:
     for k in np.flatnonzero(kept):
         for e in range(borders.start[k], borders.start[k + 1]):
             left[e] = kept[borders.other[e]]
-        start.append(start[-1] + left[borders.start[k] : borders.start[k + 1]].sum())
+        start.append(start[-1] + int(left[borders.start[k] : borders.start[k + 1]].sum()))
     touching = number[borders.other[left]], borders.links[left], borders.cuts[left]
-    return Borders(borders.box[kept], borders.length[kept], np.array(start), *touching)
+    return borders.box[kept], borders.length[kept], np.array(start), *touching
 
 
 @njit(cache=True, nogil=True)
@@ -135,8 +146,8 @@ def _find_stretches(
 def _put_together(
     upper: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]],
     lower: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]],
-) -> Borders:
-    """Borders, of what `_find_stretches` finds in the upper and in the lower rows."""
+) -> _Fields:
+    """Of `Borders`, from what `_find_stretches` finds in the upper and in the lower rows."""
     box, length = upper[0].copy(), upper[1] + lower[1]
     for k in range(len(box)):
         for axis in range(2):
@@ -144,7 +155,7 @@ def _put_together(
             box[k, 2 + axis] = max(box[k, 2 + axis], lower[0][k, 2 + axis])
         if k == 0 or box[k, 2] == 0:
             box[k] = 0
-    return Borders(box, length, *_summed(np.concatenate((upper[2], lower[2])), len(box)))
+    return box, length, *_summed(np.concatenate((upper[2], lower[2])), len(box))
 
 
 @njit(cache=True, nogil=True)

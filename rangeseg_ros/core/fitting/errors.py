@@ -62,7 +62,7 @@ def variances(
     return FLOOR + errors.constant + errors.quartic * squared**2 + errors.tilt * slope
 
 
-@njit(cache=True, nogil=True)
+@register_jitable
 def explaining(
     scale: Scale,
     variance: NDArray[np.float64],
@@ -76,6 +76,19 @@ def explaining(
     At `least` so much there is, and of this so much is `known` and not asked for. Errors are in
     disparity, or `in_range` if these explain more: of both together a few blocks tell nothing.
     """
+    return Errors(*_explaining(scale, variance, quantile, in_range, least, known))
+
+
+@njit(cache=True, nogil=True)
+def _explaining(
+    scale: Scale,
+    variance: NDArray[np.float64],
+    quantile: float,
+    in_range: bool,
+    least: Errors,
+    known: Errors,
+) -> tuple[float, float, float]:
+    """Fields of the `Errors`."""
     squared = quantiles(scale.squared, scale.sets, 0.5)
     tilt = quantiles(scale.slope, scale.sets, 0.5)
     shown = quantiles(variance, scale.sets, quantile)
@@ -97,10 +110,9 @@ def explaining(
     straight, unlikely = _likeliest(tilt, shown, there, blocks)
     if there.min() > 0 and _advantage(_deviance(there, shown), unlikely, shown) < _SIGNIFICANT:
         straight = 0.0
-    return Errors(constant, quartic, straight)
+    return constant, quartic, straight
 
 
-@njit(cache=True, nogil=True)
 def by_turn(
     squared: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
 ) -> ByTurn:
@@ -108,13 +120,30 @@ def by_turn(
 
     Of N blocks of these squared inverse ranges, and slopes along the row and down the column.
     """
+    order, start, slopes, *medians = _by_turn(squared, across, down)
+    return ByTurn(Sets(order, start, slopes), *medians)
+
+
+@njit(cache=True, nogil=True)
+def _by_turn(
+    squared: NDArray[np.float64], across: NDArray[np.float64], down: NDArray[np.float64]
+) -> tuple[
+    NDArray[np.int32],
+    NDArray[np.intp],
+    int,
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+]:
+    """Fields of the `Sets` and of the `ByTurn`."""
     sets = alike(squared, down - across)
+    order, start, slopes = sets
     medians = (
         quantiles(squared, sets, 0.5),
         quantiles(across, sets, 0.5),
         quantiles(down, sets, 0.5),
     )
-    return ByTurn(sets, *medians)
+    return order, start, slopes, *medians
 
 
 @njit(cache=True, nogil=True)

@@ -61,7 +61,7 @@ class Compared(NamedTuple):
 
 
 class Nested(NamedTuple):
-    """What all scales show, from blocks of 8 pixels up.
+    """What all scales show, from blocks of 8 pixels up; nothing where these are too few.
 
     Attributes
     ----------
@@ -114,9 +114,10 @@ def compare(
     return Compared(whole, mean, excess, found >= SAMPLES, choose(blocks, whole, way, ENOUGH))
 
 
-@njit(cache=True, nogil=True)
 def over_scales(
-    compared: Compared,
+    flat: NDArray[np.bool_],
+    residual: NDArray[np.float64],
+    level: NDArray[np.float64],
     blocks: Blocks,
     rays: NDArray[np.float32],
     way: tuple[float, float],
@@ -128,8 +129,12 @@ def over_scales(
 
     Parameters
     ----------
-    compared : Compared
-        Of `blocks`, those of 8 pixels.
+    flat : (rows, columns) bool
+        Blocks of 4 pixels that count.
+    residual, level : (rows, columns) float64
+        Theirs, and the variances expected of them.
+    blocks : Blocks
+        Those of 8 pixels.
     rays : (H, W, 3) float32
         Of the image.
     way : tuple of 2 float
@@ -141,6 +146,26 @@ def over_scales(
     length : float
         Of the distortion at most, pixels.
     """
+    found = _over_scales(flat, residual, level, blocks, rays, way, in_range, shown, length)
+    return Nested(*found[:4], Errors(*found[4]), found[5])
+
+
+@njit(cache=True, nogil=True)
+def _over_scales(
+    flat: NDArray[np.bool_],
+    residual: NDArray[np.float64],
+    level: NDArray[np.float64],
+    blocks: Blocks,
+    rays: NDArray[np.float32],
+    way: tuple[float, float],
+    in_range: bool,
+    shown: Errors,
+    length: float,
+) -> tuple[
+    NDArray[np.float64], NDArray[np.float64], float, float, tuple[float, float, float], float
+]:
+    """Fields of the `Nested`."""
+    compared = compare(flat, residual, level, blocks, way)
     none = Errors(0.0, 0.0, 0.0)
     distortion, side, clear = none, 2 * BLOCK, False
     within, freedom = [0.0], [0.0]
@@ -187,7 +212,8 @@ def over_scales(
     if before == most > 0 and width > 0 and clear:
         hidden = max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
         distortion = Errors(hidden * distortion.constant, hidden * distortion.quartic, 0.0)
-    return Nested(np.array(within), np.array(freedom), between, filled, distortion, wide)
+    errors = distortion.constant, distortion.quartic, distortion.tilt
+    return np.array(within), np.array(freedom), between, filled, errors, wide
 
 
 @njit(cache=True, nogil=True)

@@ -17,8 +17,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.fitting.alike import Sets
 from rangeseg_ros.core.fitting.errors import BOTH, Errors, by_turn, explaining, turning, variances
-from rangeseg_ros.core.fitting.nested import compare, over_scales
+from rangeseg_ros.core.fitting.nested import over_scales
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.scale import (
     ENOUGH,
@@ -68,7 +69,7 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if used < SAMPLES:
         return prior
     turns = submit(by_turn, squared, across, down)
-    scale, ratio = _shown(coarse, place)
+    scale, ratio = _scale_and_ratio(coarse, place)
     variance = ratio.values / share(ratio.freedom)
     quantum, range_quantum = quanta.result()
     # Rounding errors spread evenly over a step.
@@ -82,16 +83,16 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     if not flat.any():
         return prior
     smallest = submit(_within, blocks, flat, way, level)
-    compared = compare(flat, blocks.residual, level, coarse, way)
-    if not compared.enough:
-        return prior
     quantile, freedom = smallest.result()
     # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
     shown = noise.times(quantile / share(freedom))
     shown = shown._replace(constant=max(shown.constant, rounding**2))
     # Lasers err in range alone.
     length = prior.distortion_length
-    nested = over_scales(compared, coarse, image.rays, way, noise.quartic > 0, shown, length)
+    ways = way, noise.quartic > 0
+    nested = over_scales(flat, blocks.residual, level, coarse, image.rays, *ways, shown, length)
+    if not len(nested.within):
+        return prior
     shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
     within = list(np.array([quantile, *nested.within]) / shares)
     distortion = nested.distortion
@@ -144,11 +145,26 @@ def _telling(
     return found, place, squared, across, down
 
 
-@njit(cache=True, nogil=True)
-def _shown(blocks: Blocks, place: NDArray[np.intp]) -> tuple[Scale, Ratio]:
+def _scale_and_ratio(blocks: Blocks, place: NDArray[np.intp]) -> tuple[Scale, Ratio]:
     """The scale of blocks of such numbers (N,), and what they show of a variance of 1."""
+    squared, slope, sets, ratio = _shown(blocks, place)
+    return Scale(place, squared, slope, Sets(*sets)), Ratio(*ratio)
+
+
+@njit(cache=True, nogil=True)
+def _shown(
+    blocks: Blocks, place: NDArray[np.intp]
+) -> tuple[
+    NDArray[np.float64],
+    NDArray[np.float64],
+    tuple[NDArray[np.int32], NDArray[np.intp], int],
+    tuple[NDArray[np.float64], float],
+]:
+    """Fields of a `Scale`, of its `Sets` and of the `Ratio`."""
     scale = scale_of(blocks, place, BOTH)
-    return scale, variance_ratio(scale, blocks, np.ones(blocks.squared.shape))
+    ratio = variance_ratio(scale, blocks, np.ones(blocks.squared.shape))
+    order, start, slopes = scale.sets
+    return scale.squared, scale.slope, (order, start, slopes), (ratio.values, ratio.freedom)
 
 
 @njit(cache=True, nogil=True)
@@ -216,7 +232,7 @@ def _white_and_correlated(
     aa, ab, bb = (one * one).sum(), (one * other).sum(), (other * other).sum()
     a, b = one.sum(), other.sum()
     determinant = aa * bb - ab * ab
-    white, correlated = 0.0, b / bb
+    white, correlated = 0.0, float(b / bb)
     if determinant > 1e-12 * aa * bb:
         white, correlated = (a * bb - b * ab) / determinant, (b * aa - a * ab) / determinant
     # Where one of them would be negative, the other explains it alone, and better than the sum

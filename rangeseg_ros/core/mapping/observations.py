@@ -171,7 +171,7 @@ def views(
     rows, columns = (np.arange(size) // side for size in coarse.shape)
     count = int(rows[-1] + 1) * int(columns[-1] + 1)
     listed = np.array([plane.label for plane in planes], np.intp)
-    first = np.zeros(max(listed.max(initial=0), coarse.max(initial=0)) + 1, np.intp)
+    first = np.zeros(max(int(listed.max(initial=0)), int(coarse.max(initial=0))) + 1, np.intp)
     first[listed] = count * np.arange(1, len(planes) + 1)
     place = first[coarse] + (rows[:, None] * (columns[-1] + 1) + columns)
     pixels = np.bincount(place.ravel(), minlength=count * (len(planes) + 1))

@@ -41,7 +41,6 @@ class Sides(NamedTuple):
     beyond: NDArray[np.bool_]
 
 
-@njit(cache=True, nogil=True)
 def sides_of(
     height: NDArray[np.float32],
     unsure: NDArray[np.float32],
@@ -51,6 +50,25 @@ def sides_of(
     fallen: NDArray[np.bool_],
 ) -> Sides:
     """Of the surfaces 1...count of cells (rows, columns), where `near` is beside the ground."""
+    return Sides(*_sides_of(height, unsure, surface, count, near, fallen))
+
+
+@njit(cache=True, nogil=True)
+def _sides_of(
+    height: NDArray[np.float32],
+    unsure: NDArray[np.float32],
+    surface: NDArray[np.int32],
+    count: int,
+    near: NDArray[np.uint8],
+    fallen: NDArray[np.bool_],
+) -> tuple[
+    NDArray[np.int64],
+    NDArray[np.float64],
+    NDArray[np.float64],
+    NDArray[np.int64],
+    NDArray[np.bool_],
+]:
+    """Fields of the `Sides`."""
     rows, columns = surface.shape
     sizes = np.zeros(count + 1, np.int64)
     beside = np.zeros(count + 1, np.int64)
@@ -85,4 +103,4 @@ def sides_of(
         if filled[k]:
             side[k] = np.median(heights[start[k] : start[k] + filled[k]])
             noise[k] = np.median(noises[start[k] : start[k] + filled[k]])
-    return Sides(sizes, side, noise, width, beyond)
+    return sizes, side, noise, width, beyond

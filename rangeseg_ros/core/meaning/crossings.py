@@ -153,4 +153,4 @@ def _extremes(inverse: NDArray[np.float32], where: NDArray[np.bool_]) -> tuple[f
             value = inverse[i, j]
             low[j] = min(low[j], value) if where[i, j] else low[j]
             high[j] = max(high[j], value) if where[i, j] else high[j]
-    return low.min(), high.max()
+    return float(low.min()), float(high.max())

@@ -37,7 +37,6 @@ class Said(NamedTuple):
     unsure: NDArray[np.float32]
 
 
-@njit(cache=True, nogil=True)
 def decide(
     verdict: NDArray[np.int8],
     surface: NDArray[np.int32],
@@ -73,6 +72,24 @@ def decide(
     alike : (int, int)
         Rows and columns that err alike.
     """
+    found = _decide(verdict, surface, ground, fallen, foot, height, unsure, least, most, alike)
+    return Said(*found, unsure)
+
+
+@njit(cache=True, nogil=True)
+def _decide(
+    verdict: NDArray[np.int8],
+    surface: NDArray[np.int32],
+    ground: NDArray[np.bool_],
+    fallen: NDArray[np.bool_],
+    foot: NDArray[np.bool_],
+    height: NDArray[np.float32],
+    unsure: NDArray[np.float32],
+    least: tuple[float, float],
+    most: float,
+    alike: tuple[int, int],
+) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]]:
+    """Kind, low and high of `Said`."""
     rows, columns = surface.shape
     kind = np.empty((rows, columns), np.int8)
     low, top = np.empty((2, rows, columns), np.float32)
@@ -105,7 +122,7 @@ def decide(
             told = unsure[i, c] - np.float32(least[1])
             bound = told if height[i, c] > told else np.float32(np.inf)
             low[i, c] = bound if (doubtful[i, c] > 0) & (told > deep) else low[i, c]
-    return Said(kind, low, top, unsure)
+    return kind, low, top
 
 
 @njit(cache=True, nogil=True)

@@ -197,7 +197,8 @@ def _line(
     error = np.abs(slope - slope.mean() - step * away)
     if step <= 0 or error.max() > _CLOSE * step:
         return None
-    return tuple(round(n / _STEP) * _STEP for n in (1 / step, place.mean() - slope.mean() / step))
+    focal, centre = float(1 / step), float(place.mean() - slope.mean() / step)
+    return round(focal / _STEP) * _STEP, round(centre / _STEP) * _STEP
 
 
 @lru_cache(maxsize=4)
