@@ -98,4 +98,5 @@ def test_no_kernel_returns_a_named_tuple_to_python(method):
 
 def test_exceptions_of_signal_handlers_come_through_what_kernels_return():
     done = subprocess.run([sys.executable, '-c', CODE], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, '')
+    # Where a collection of garbage comes upon one it prints it (see `interrupts.silence_losses`).
+    assert done.returncode == 0, done.stderr
