@@ -20,15 +20,18 @@ def rangeseg() -> None:
 
 def segment_planes() -> None:
     """Run the node."""
-    from rangeseg_ros.core.runtime.memory import share_memory
-
-    share_memory()  # before rclpy starts its threads
     try:
+        from rangeseg_ros.core.runtime.memory import share_memory
+
+        share_memory()  # before rclpy starts its threads
         from rangeseg_ros.ros.node import main
     except ModuleNotFoundError as error:
         if error.name != 'rclpy':
             raise
         needed = 'source a ROS 2 installation, or install the extra jazzy'
         print(f'segment_planes: no rclpy: {needed}', file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:  # nowhere to keep compiled kernels
+        print(f'segment_planes: {error}', file=sys.stderr)
         sys.exit(2)
     main()

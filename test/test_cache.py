@@ -1,6 +1,7 @@
 """Compiled kernels are kept where that is possible, and nothing fails where it is not."""
 
 import os
+import pickle
 import subprocess
 import sys
 from pathlib import Path
@@ -25,11 +26,25 @@ def temporary_file(*arguments, dir=None, **options):
 tempfile.TemporaryFile = temporary_file
 tempfile.tempdir = allowed or '/proc'
 """
+NO_TEMPORARY = """
+def mkdtemp(*arguments, **options):
+    raise PermissionError(13, 'Permission denied')
+
+tempfile.mkdtemp = mkdtemp
+"""
 KERNEL = """
 import numpy as np
 from rangeseg_ros.core.sensing.moments import fit_all
 fit_all(np.zeros((1, 10)))
 """
+
+
+class Poison:
+    def __reduce__(self):
+        return print, ('poison',)
+
+
+CODE_IN_A_PICKLE = pickle.dumps(Poison()) * 2
 
 
 def run_restricted(code, allowed='', **environment):
@@ -59,7 +74,7 @@ def test_without_a_temporary_folder_kernels_are_kept_in_shared_memory(monkeypatc
 
     monkeypatch.setattr(cache.tempfile, 'gettempdir', none)
     monkeypatch.setattr(cache, '_private', lambda folder: True)
-    assert list(cache._folders())[-1] == Path(f'/dev/shm/rangeseg_ros-{os.getuid()}')
+    assert list(cache._roots())[-1] == Path(f'/dev/shm/rangeseg_ros-{os.getuid()}')
 
 
 @pytest.mark.parametrize(
@@ -73,10 +88,63 @@ def test_folders_that_the_user_names_come_first(tmp_path, variable, folder):
     assert list((named / folder).rglob('*.nbi'))
 
 
-def test_where_nothing_can_be_written_it_works_with_a_warning():
-    run = run_restricted(KERNEL)
+@pytest.mark.parametrize('start', ['rangeseg', 'segment_planes'])
+def test_where_nothing_can_be_written_one_line_says_so(start):
+    code = f"sys.argv[1:] = ['compile']\nfrom rangeseg_ros.start import {start}; {start}()"
+    run = run_restricted(NO_TEMPORARY + code)
+    assert run.returncode == 2
+    assert run.stderr.startswith(start) and run.stderr.count('\n') == 1
+    assert 'NUMBA_CACHE_DIR' in run.stderr
+
+
+def test_where_no_folder_is_the_users_alone_nothing_is_kept(tmp_path):
+    tmp_path.chmod(0o777)
+    run = run_restricted(KERNEL, tmp_path)
     assert run.returncode == 0, run.stderr
     assert run.stderr.count('CacheWarning') == 1 and 'NUMBA_CACHE_DIR' in run.stderr
+    assert not [*tmp_path.rglob('*.nbi')]
+
+
+@pytest.mark.parametrize('mode', [0o777, 0o1777, 0o755])
+@pytest.mark.parametrize(
+    ('variable', 'within'), [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')]
+)
+def test_nothing_is_taken_from_where_others_can_write(tmp_path, variable, within, mode):
+    """What is unpickled from there is executed."""
+    named = tmp_path / 'named'
+    run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
+    assert (run.returncode, run.stderr) == (0, '')
+    indices = [*(named / within).rglob('*.nbi')]
+    assert indices
+    for index in indices:
+        index.write_bytes(CODE_IN_A_PICKLE)
+    if mode == 0o755:  # as if somebody else had made it
+        (state,) = (named / within).glob('rangeseg_ros-*')
+        state.chmod(0o777)
+    named.chmod(mode)
+    run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
+    assert run.returncode == 0
+    # Of a folder that is the user's in one that all may write to, as /tmp, nobody can change it.
+    assert ('poison' in run.stdout) == (mode == 0o1777)
+    told = 'is not used' in run.stderr
+    assert told == (variable == 'NUMBA_CACHE_DIR' and mode != 0o1777)
+
+
+def test_only_folders_of_the_user_alone_are_private(tmp_path, monkeypatch):
+    own = tmp_path / 'own'
+    own.mkdir(mode=0o700)
+    assert cache._private(own)
+    for mode in (0o707, 0o702, 0o1777):
+        own.chmod(mode)
+        assert not cache._private(own)
+    own.chmod(0o700)
+    (tmp_path / 'link').symlink_to(own)
+    (tmp_path / 'loop').symlink_to(tmp_path / 'loop')
+    (tmp_path / 'file').touch()
+    for name in ('link', 'loop', 'file', 'none'):
+        assert not cache._private(tmp_path / name)
+    monkeypatch.setattr(os, 'getuid', lambda: own.stat().st_uid + 1)
+    assert not cache._private(own)
 
 
 def test_help_needs_no_place_to_write_to():
@@ -93,16 +161,6 @@ def test_import_and_help_load_no_kernel():
         'for name in rangeseg_ros.__all__: getattr(rangeseg_ros, name)\n'
     )
     subprocess.run([sys.executable, '-c', code], check=True, cwd=ROOT)
-
-
-def test_temporary_folders_that_others_could_write_to_are_not_used(tmp_path):
-    assert cache._private(tmp_path / 'new')
-    (tmp_path / 'open').mkdir()
-    (tmp_path / 'open').chmod(0o777)
-    (tmp_path / 'link').symlink_to(tmp_path / 'new')
-    (tmp_path / 'file').touch()
-    for name in ('open', 'link', 'file'):
-        assert not cache._private(tmp_path / name)
 
 
 def test_what_was_compiled_into_the_package_is_taken_along(tmp_path, monkeypatch):
@@ -157,5 +215,9 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
 
     assert call() == ['1', '3', '0', '0']
     assert call() == ['1', '3', '1', '1']
-    (package / 'core' / 'a.py').write_text(KERNEL_OF.format('f', 20))
-    assert call() == ['20', '3', '0', '1']
+    # Neither its time nor its size tells.
+    changed = package / 'core' / 'a.py'
+    before = changed.stat()
+    changed.write_text(KERNEL_OF.format('f', 2))
+    os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert call() == ['2', '3', '0', '1']

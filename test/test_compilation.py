@@ -4,13 +4,11 @@ import os
 import pickle
 import subprocess
 import sys
-from contextlib import contextmanager
 from importlib import import_module
 
 import numpy as np
 import pytest
 from clouds import cloud_of
-from numba import njit
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.compilation import preparation
@@ -128,25 +126,6 @@ def test_without_processes_it_is_compiled_all_the_same(monkeypatch):
     pool = preparation.Pool(told.append)
     pool.compile(Config(), KINDS)
     assert not told
-
-
-def test_what_cannot_be_kept_is_compiled_here_and_told(monkeypatch):
-    kernels = [njit(lambda x, k=k: x + k) for k in range(2)]
-    monkeypatch.setattr(
-        preparation, 'rehearse', lambda *rehearsed: [kernel(1.0) for kernel in kernels]
-    )
-    monkeypatch.setattr(preparation, '_nothing_compiled', refused)
-    monkeypatch.setattr(preparation, 'keeps_compiled', lambda: False)
-    told = []
-    prepare(Config(), report=told.append)
-    assert told == ['compiling kernels', *(f'compiling kernels, {n} so far' for n in (1, 2))]
-
-
-@contextmanager
-def refused():
-    """As where a kernel is not compiled."""
-    raise preparation._NotCompiledError
-    yield
 
 
 def test_needs_follow_choices_and_switches_but_not_sizes():

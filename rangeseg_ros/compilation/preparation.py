@@ -17,7 +17,6 @@ from numba.core import event
 from rangeseg_ros.compilation.discovery import PACKAGE, Kernel
 from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.cache import keeps_compiled
 from rangeseg_ros.messages.outputs import OUTPUTS
 
 MOST_WORKERS = 4
@@ -52,8 +51,7 @@ def prepare(
     kinds : tuple of str
         Of `rehearsal.KINDS`.
     report : callable
-        Gets the progress, 'compiling kernels, 12 of 35', or where none can be kept for other
-        processes 'compiling kernels, 12 so far'; nothing when nothing is compiled.
+        Gets the progress, 'compiling kernels, 12 of 35'; nothing when nothing is compiled.
     outputs : collection of str
         Of `OUTPUTS`: what is made of the frames.
     """
@@ -64,10 +62,8 @@ def prepare(
     except _NotCompiledError:
         pass
     report('compiling kernels')
-    if keeps_compiled():
-        Pool(report).compile(config, kinds, outputs)
-    with event.install_listener('numba:compile', _Told(report)):
-        rehearse(config, kinds, outputs)
+    Pool(report).compile(config, kinds, outputs)
+    rehearse(config, kinds, outputs)
 
 
 class _NotCompiledError(Exception):
@@ -88,23 +84,6 @@ def _nothing_compiled() -> Iterator[None]:
 
     with event.install_listener('numba:compile', Refuse()):
         yield
-
-
-class _Told(event.Listener):
-    """Reports what is compiled in this process, with all that it calls as one."""
-
-    def __init__(self, report: Report) -> None:
-        self._report = report
-        self._depth = self._done = 0
-
-    def on_start(self, event: Any) -> None:
-        self._depth += 1
-
-    def on_end(self, event: Any) -> None:
-        self._depth -= 1
-        if not self._depth:
-            self._done += 1
-            self._report(f'compiling kernels, {self._done} so far')
 
 
 class Pool:

@@ -1,12 +1,14 @@
 """Compiled kernels that the sources have left behind.
 
-numba compiles a kernel anew when its file has changed, but not when that of a kernel it calls has:
-after an update in place it would go on with what was compiled into it.
+numba compiles a kernel anew when its file has changed, before 0.68 when its time or size has, but
+not when that of a kernel it calls has: after an update in place it would go on with what was
+compiled into it.
 """
 
 from __future__ import annotations
 
 import ast
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -40,13 +42,12 @@ def drop_outdated(package: Path) -> None:
     os.replace(part, note)
 
 
-def stamps(package: Path) -> dict[str, list[int]]:
-    """Time of change and size of the sources of the core, by name; as numba tells changes."""
-    found = {}
-    for path in sorted((package / 'core').rglob('*.py')):
-        state = path.stat()
-        found[path.relative_to(package).as_posix()] = [state.st_mtime_ns, state.st_size]
-    return found
+def stamps(package: Path) -> dict[str, str]:
+    """Digests of the sources of the core, by name: times of change may be those of an archive."""
+    return {
+        path.relative_to(package).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((package / 'core').rglob('*.py'))
+    }
 
 
 def _dependents(package: Path, changed: set[str]) -> set[Path]:
