@@ -127,6 +127,8 @@ def over_scales(
 ) -> Nested:
     """What blocks of 8 pixels show, and larger ones as long as there are enough of them.
 
+    More than seven parameters: those of a kernel, which takes arrays.
+
     Parameters
     ----------
     flat : (rows, columns) bool

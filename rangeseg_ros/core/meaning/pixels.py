@@ -51,7 +51,7 @@ def decide(
 ) -> Said:
     """What is said of cells, by their surfaces and by themselves.
 
-    Ten parameters: a kernel that takes arrays.
+    More than seven parameters: those of a kernel, which takes arrays.
 
     Parameters
     ----------
