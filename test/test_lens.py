@@ -182,3 +182,20 @@ def test_lenses_that_distort_nothing_are_none():
 def test_unknown_lenses_are_refused(model, d, message):
     with pytest.raises(CameraError, match=message):
         lens(model, *d)
+
+
+@pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
+@pytest.mark.parametrize('value', [1e300, -1e300, -1e3])
+def test_coefficients_that_no_lens_has_are_refused(model, value):
+    with pytest.raises(CameraError, match=r'fits no lens: rays reach .*% of the image'):
+        lens(model, value, 0.0, 0.0, 0.0)
+
+
+def test_a_lens_that_folds_the_image_is_told():
+    with pytest.warns(CameraWarning, match=r'folds the image: .*% of it is left out'):
+        folded = lens('plumb_bob', -0.8, 0.0, 0.0, 0.0)
+    assert not folded.rays.any(axis=2).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        lens('plumb_bob', -0.2, 0.0, 0.0, 0.0)
+        lens('equidistant', 0.0, 0.0, 0.0, 0.0)

@@ -36,7 +36,9 @@ def test_links_are_followed(tmp_path):
     (tmp_path / 'hard').hardlink_to(tmp_path / 'there')
     (tmp_path / 'dangling').symlink_to('elsewhere')
     write(tmp_path / 'soft', 'one')
-    assert (tmp_path / 'hard').read_text() == 'one' and (tmp_path / 'soft').is_symlink()
+    assert (tmp_path / 'there').read_text() == 'one' and (tmp_path / 'soft').is_symlink()
+    # As of an input, say: what replaces a file is whole at any time, so it is another one.
+    assert (tmp_path / 'hard').read_text() == 'old'
     assert stat.S_IMODE((tmp_path / 'there').stat().st_mode) == 0o640
     write(tmp_path / 'dangling', 'two')
     assert (tmp_path / 'elsewhere').read_text() == 'two'

@@ -14,6 +14,7 @@ from zlib import crc32
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES
 from rangeseg_ros.batch.result_bag import read_record
+from rangeseg_ros.io.files import resolved
 from rangeseg_ros.io.planes import columns
 from rangeseg_ros.io.recordings import BagError, Recording
 
@@ -56,8 +57,8 @@ class ResultFolder:
 
     def check(self, recording: Path, overwrite: bool) -> None:
         """Raise BagError when something is there that is no replay's, and may not be replaced."""
-        source = recording.resolve()
-        if self.bag.resolve() in (source, *source.parents):
+        source = resolved(recording)
+        if resolved(self.bag) in (source, *source.parents):
             raise BagError(f'{self.bag}: exists already, not overwritten: it is the recording')
         ours = read_record(self.bag) or self._interrupted()
         if overwrite or ours:

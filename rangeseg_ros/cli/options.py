@@ -14,7 +14,13 @@ from tqdm import tqdm
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.io.files import NotReplacedError, check_regular, clear_abandoned, replacing
+from rangeseg_ros.io.files import (
+    NotReplacedError,
+    check_regular,
+    clear_abandoned,
+    replacing,
+    resolved,
+)
 from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
@@ -97,9 +103,9 @@ def check_replaceable(path: Path, beginning: bytes) -> None:
 
 def check_new(paths: Iterable[Path], inputs: Iterable[Path], overwrite: bool) -> None:
     """Refuse to write over the inputs of a command, and without `overwrite` over anything."""
-    taken = {path.resolve() for path in inputs}
+    taken = {resolved(path) for path in inputs}
     for path in paths:
-        if path.resolve() in taken:
+        if resolved(path) in taken:
             raise NotReplacedError(path, 'is an input, not overwritten')
         if not overwrite and path.exists():
             raise NotReplacedError(path, 'exists already, not overwritten (see --overwrite)')

@@ -86,7 +86,8 @@ class DepthBagWriter:
     Raises
     ------
     BagError
-        `path` exists, or an image does not have the camera's size or a depth image's type.
+        `path` exists, an image does not have the camera's size or a depth image's type, or a stamp
+        is beyond the 32 bits that ROS 2 has for seconds.
 
     Examples
     --------
@@ -131,6 +132,8 @@ class DepthBagWriter:
 
     def write(self, depth: NDArray[np.uint16] | NDArray[np.float32], stamp: int) -> None:
         """Append an image, (H, W) uint16 millimetres or float32 metres, at `stamp` nanoseconds."""
+        if not -(2**31) <= stamp // 10**9 < 2**31:
+            raise BagError(f'stamp of {stamp // 10**9} s, which ROS 2 cannot tell')
         encodings = {np.dtype(np.uint16): '16UC1', np.dtype(np.float32): '32FC1'}
         if depth.shape != self.camera.shape or depth.dtype not in encodings:
             raise BagError(

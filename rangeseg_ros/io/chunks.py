@@ -16,6 +16,9 @@ import lz4.frame
 import zstandard
 
 _PIECE = 2**20
+# What is compressed may become so many bytes, 16 times the largest chunks that recorders make by
+# their presets, and more only where more is stored.
+_LARGEST, _EXPANSION = 2**26, 16
 
 
 class ChunkError(ValueError):
@@ -71,12 +74,15 @@ class ChunkReader:
     Raises
     ------
     ChunkError
-        Of another compression; here and while reading, whatever does not fit the declared size.
+        Of another compression, or far larger than what is stored; here and while reading, whatever
+        does not fit the declared size.
     """
 
     def __init__(self, compression: str, data: bytes, size: int) -> None:
         if compression not in _STREAMS:
             raise ChunkError(f'unknown compression {compression!r}')
+        if compression not in ('', 'none'):
+            check_expansion(len(data), size)
         self._stream = _STREAMS[compression](io.BytesIO(data))
         self.left = size
         self.crc = 0
@@ -101,6 +107,12 @@ class ChunkReader:
         """Raise ChunkError unless this is the end."""
         if self.left or self._stream.read(1):
             raise ChunkError('chunk is not as large as it declares')
+
+
+def check_expansion(stored: int, size: int) -> None:
+    """Raise ChunkError where compressed bytes declare to become far more."""
+    if size > max(_LARGEST, _EXPANSION * stored):
+        raise ChunkError(f'{stored} compressed bytes declare to be {size}')
 
 
 @dataclass(frozen=True)
@@ -163,6 +175,13 @@ class McapChannels:
         """Record of a message (5)."""
         channel, _, time, _ = struct.unpack_from('<HIQQ', body)
         return Record(*self.channels[channel], time, body[22:])
+
+
+def mcap_chunk_sizes(head: bytes) -> tuple[int, int]:
+    """Bytes that a chunk of mcap stores and declares, from the front of its record."""
+    (size,) = struct.unpack_from('<Q', head, 16)
+    (stored,) = struct.unpack_from('<Q', head, 32 + len(_string(head, 28)))
+    return stored, size
 
 
 def mcap_chunk(body: bytes, channels: McapChannels) -> Iterator[Record]:

@@ -10,7 +10,7 @@ import re
 import shutil
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import gettempdir
 
@@ -33,7 +33,8 @@ def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary place for a file or folder of the name of `path`.
 
     On success it is moved to `path`, or to what that links to; after an exception or an
-    interruption nothing is left. A file keeps its mode, and its other names where it has several.
+    interruption nothing is left. A file keeps its mode; other names (hard links) of one that is
+    replaced stay with what it was.
 
     Raises
     ------
@@ -42,7 +43,7 @@ def replacing(path: Path) -> Iterator[Path]:
     OSError
         It cannot be written; of a full disk, too, the error names the file.
     """
-    path = path.resolve() if path.is_symlink() else path
+    path = resolved(path) if path.is_symlink() else path
     check_regular(path)
     folder = path.with_name(f'.{os.getpid()}.{path.name}')
     with temporary_folder(folder):
@@ -50,14 +51,18 @@ def replacing(path: Path) -> Iterator[Path]:
             yield folder / path.name
             if path.is_file():
                 shutil.copymode(path, folder / path.name)
-                if path.stat().st_nlink > 1:
-                    path.write_bytes((folder / path.name).read_bytes())
-                    return
             os.replace(folder / path.name, path)
         except OSError as error:
             if error.errno in _NO_ROOM:
                 error.filename = str(path)
             raise
+
+
+def resolved(path: Path) -> Path:
+    """What a path leads to; OSError where its links lead in a circle."""
+    with suppress(FileNotFoundError):
+        path.stat()
+    return path.resolve()
 
 
 def check_regular(path: Path) -> None:

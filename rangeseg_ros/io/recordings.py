@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import shutil
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import zstandard
@@ -19,17 +22,22 @@ from rosbags.rosbag2.storage_mcap import McapReader
 
 from rangeseg_ros.io.chunks import (
     Chunk,
+    ChunkError,
     Lost,
     McapChannels,
     Record,
+    check_expansion,
     mcap_chunk,
+    mcap_chunk_sizes,
     merged,
     rosbag1_chunk,
     rosbag1_fields,
     rosbag1_part,
+    whole,
 )
 from rangeseg_ros.io.damaged_recordings import DamagedRecording
 from rangeseg_ros.io.message_types import deserialized
+from rangeseg_ros.io.yaml_files import LARGEST
 
 
 class BagError(ValueError):
@@ -38,6 +46,33 @@ class BagError(ValueError):
 
 class RecordingError(ValueError):
     """A file that is no recording, or of which nothing can be read."""
+
+
+class _McapReader(McapReader):
+    """Reads files without an index only where their chunks can be unpacked."""
+
+    def meta_scan(self) -> None:
+        with self.path.open('rb') as file:
+            place = self.data_start
+            while place < self.data_end:
+                file.seek(place)
+                opcode, size = struct.unpack('<BQ', whole(file.read(9), 9))
+                if opcode == 6:
+                    check_expansion(*mcap_chunk_sizes(file.read(64)))
+                place += 9 + size
+        super().meta_scan()
+
+
+class _DirectoryReader(DirectoryReader):
+    STORAGE_PLUGINS: Mapping[str, Any] = {**DirectoryReader.STORAGE_PLUGINS, 'mcap': _McapReader}
+
+
+class _Reader(rosbag2.Reader):
+    STORAGE_PLUGINS: Mapping[str, Any] = {
+        **rosbag2.Reader.STORAGE_PLUGINS,
+        'dir': _DirectoryReader,
+        '.mcap': _McapReader,
+    }
 
 
 class Recording:
@@ -57,7 +92,7 @@ class Recording:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        kind = rosbag1.Reader if path.suffix == '.bag' else rosbag2.Reader
+        kind = rosbag1.Reader if path.suffix == '.bag' else _Reader
         self._reader: Any = kind(path)
         self._reader.open()
         self.types: dict[str, str] = {}
@@ -103,10 +138,10 @@ def open_recording(path: Path) -> Recording | DamagedRecording:
     OSError
         The file is missing or may not be read.
     """
-    path.stat()
+    check_files(path)
     try:
         return Recording(path)
-    except PermissionError:
+    except (PermissionError, RecordingError):
         raise
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:
@@ -115,6 +150,27 @@ def open_recording(path: Path) -> Recording | DamagedRecording:
             reason = damaged.damage or why_unreadable(path, error)
             raise RecordingError(f'not a readable bag: {reason}') from None
         return damaged
+
+
+def check_files(path: Path) -> None:
+    """Raise RecordingError for what would never be read to its end, OSError where nothing is."""
+    path.stat()
+    for part in path.iterdir() if path.is_dir() else [path]:
+        if part.exists() and not (part.is_file() or part.is_dir()):
+            raise RecordingError(f'{part.name}: not a regular file')
+    metadata = path / 'metadata.yaml'
+    if metadata.is_file() and metadata.stat().st_size > LARGEST:
+        raise RecordingError('metadata.yaml: too large for such a file')
+    for packed in path.glob('*.zstd') if path.is_dir() else ():
+        _check_room(packed)
+
+
+def _check_room(packed: Path) -> None:
+    """Raise RecordingError where a whole compressed file, which is unpacked, has no room."""
+    with packed.open('rb') as file, suppress(zstandard.ZstdError):
+        size = zstandard.frame_content_size(file.read(18))
+        if size > shutil.disk_usage(gettempdir()).free:
+            raise RecordingError(f'{packed.name}: no room for {size} bytes in {gettempdir()}')
 
 
 def why_unreadable(path: Path, error: Exception) -> str:
@@ -129,8 +185,9 @@ def _unpacked(record: Record | Lost) -> Record | Lost:
     if isinstance(record, Lost):
         return record
     try:
+        check_expansion(len(record.data), zstandard.frame_content_size(record.data))
         data = zstandard.ZstdDecompressor().decompress(record.data)
-    except zstandard.ZstdError as error:
+    except (ChunkError, zstandard.ZstdError) as error:
         return Lost(record.topic, record.time, 1, f'damaged message: {error}')
     return record._replace(data=data)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-_LARGEST = 2**20
+LARGEST = 2**20
 """Bytes; of calibrations and parameters a thousand times what they have."""
 
 
@@ -28,10 +28,10 @@ def read_yaml(path: Path) -> Any:
         size = path.stat().st_size
         if not path.is_file():
             raise YamlError(f'{path}: not a regular file')
-        if size > _LARGEST:
+        if size > LARGEST:
             raise YamlError(f'{path}: too large for such a file')
         content = yaml.safe_load(path.read_text())
-        if _size(content, {}) > _LARGEST:
+        if _size(content, {}) > LARGEST:
             raise YamlError(f'{path}: too large for such a file')
     except OSError as error:
         raise YamlError(f'{path}: {error.strerror}') from None

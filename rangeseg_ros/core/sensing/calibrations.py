@@ -9,11 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.camera import Camera, CameraError, whole
-
-
-class CameraWarning(UserWarning):
-    """A part of a calibration is left out."""
+from rangeseg_ros.core.sensing.camera import Camera, CameraError, CameraWarning, whole
 
 
 def camera_from_matrices(

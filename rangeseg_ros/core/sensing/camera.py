@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 from dataclasses import astuple, dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -17,10 +18,17 @@ from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
 _STEEPEST = 1000.0
+# Share of an image that rays reach, at least: the circle of a fisheye, 180 degrees from top to
+# bottom, is 44 % of an image of 16:9.
+_LEAST_SHOWN = 0.1
 # By which the square of a unit quaternion may be off: decimals of files.
 _UNIT = 1e-6
 OPTICAL = (0.0, 0.0, 0.0, 1.0)
 """The turn of a camera in its own optical frame: none."""
+
+
+class CameraWarning(UserWarning):
+    """A part of a calibration is left out, or of which a part of the image is left out."""
 
 
 class CameraError(ValueError):
@@ -96,6 +104,8 @@ class Camera:
                 )
         if self.distortion_model != 'equidistant':
             self._check_slopes()
+        if self.distortion_model:
+            self._check_lens()
 
     @classmethod
     def from_fov(cls, width: int, height: int, degrees: float) -> Camera:
@@ -126,6 +136,19 @@ class Camera:
             raise CameraError(
                 f'focal lengths {self.fx:g}, {self.fy:g} and principal point {self.cx:g}, '
                 f'{self.cy:g} do not fit {self.width}x{self.height} pixels'
+            )
+
+    def _check_lens(self) -> None:
+        shown = _shown(self)
+        if shown < _LEAST_SHOWN:
+            raise CameraError(
+                f'lens distortion D fits no lens: rays reach {shown:.0%} of the image'
+            )
+        if shown < 1 and self.distortion_model != 'equidistant':
+            warnings.warn(
+                f'lens distortion D folds the image: {1 - shown:.0%} of it is left out',
+                CameraWarning,
+                stacklevel=4,
             )
 
     def __reduce__(self) -> tuple[type[Camera], tuple[Any, ...]]:
@@ -221,6 +244,13 @@ def _finite(name: str, value: Any) -> float:
     if not np.isfinite(number):
         raise CameraError(f'{name} must be finite, not {value!r}')
     return number
+
+
+@lru_cache(maxsize=64)
+def _shown(camera: Camera) -> float:
+    """Share of the image that rays reach, by a grid of places."""
+    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
+    return float(np.isfinite(camera.rays_at(u, v)[..., 0]).mean())
 
 
 @lru_cache(maxsize=4)
