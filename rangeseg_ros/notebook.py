@@ -108,7 +108,7 @@ def to_html(result: Segmentation) -> str:
     table = ''.join(f'<tr>{row}</tr>' for row in rows)
     source = f'data:image/png;base64,{base64.b64encode(png.tobytes()).decode()}'
     return (
-        f'<p>{html.escape(repr(result))}</p>'
+        f'<p>{html.escape(repr(result))}<br>Input: {html.escape(str(result.verdict))}</p>'
         f'<img src="{source}" style="max-width:100%"><table>{table}</table>'
     )
 

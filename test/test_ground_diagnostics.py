@@ -14,7 +14,6 @@ from rangeseg_ros.ros.diagnostics import FrameStatistics
 
 def status(**found):
     statistics = FrameStatistics()
-    statistics.planes = 3
     for name, value in found.items():
         setattr(statistics, name, value)
     source = SimpleNamespace(

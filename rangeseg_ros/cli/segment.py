@@ -90,6 +90,8 @@ def command(
             click.echo(f'{path}: {len(result.planes)} planes, {result.ground}')
         else:
             click.echo(f'{path}: no plane: {result.reason}')
+        if not result.verdict.ok:
+            click.echo(f'rangeseg: {path}: {result.verdict}', err=True)
         if result.tilt:
             click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
         if sensor:

@@ -22,6 +22,7 @@ from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.verdict import Cells, Verdict, judge
 
 STATED = SensorModel.from_config(Config())
 """The sensor that the defaults describe."""
@@ -82,6 +83,9 @@ class Segmentation:
         Tolerance, smallest area and slope of `tilt_of`.
     image : RangeImage or None
         What was segmented; None in a result that was pickled.
+    cells : Cells or None
+        Squares of equal pixels, when the image was enlarged: what was found is found in an image
+        with one pixel for each, and `count` of planes counts those.
     work_budget : float
         Share of the full work that the image was given: with the same, its labels are the same.
     """
@@ -97,6 +101,7 @@ class Segmentation:
     upright: tuple[float, float, float] | None = None
     work_budget: float = 1.0
     image: RangeImage | None = None
+    cells: Cells | None = field(default=None, repr=False)
 
     def __repr__(self) -> str:
         height, width = self.labels.shape
@@ -132,6 +137,7 @@ class Segmentation:
             'planes': [plane.to_dict() for plane in self.planes],
             'reason': self.reason,
             'sensor': str(self.sensor),
+            'verdict': list(self.verdict.reasons),
         }
 
     def to_pandas(self) -> Any:
@@ -146,6 +152,22 @@ class Segmentation:
         """Coloured open3d.geometry.TriangleMesh of each plane."""
         meshes: list[Any] = _notebook().to_open3d(self)
         return meshes
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """What is doubtful about the image, worked out when read."""
+        if self.image is None:
+            return Verdict()
+        place = self.image.place
+        thetas = {
+            plane.label: -plane.normal / (plane.distance + plane.normal @ place)
+            for plane in self.planes
+        }
+        return judge(self.image, self.labels, thetas)
+
+    def _of_all(self, array: NDArray[Any]) -> NDArray[Any]:
+        """Values of all pixels."""
+        return array if self.cells is None else self.cells.enlarged(array, self.labels.shape)
 
     @cached_property
     def tilt(self) -> Tilt | None:
@@ -164,6 +186,7 @@ class Segmentation:
         """
         normals = self.labelling.normals()
         if normals is not None:
+            normals = self._of_all(normals)
             return np.where((self.labels > 0)[..., None], normals, np.float32(np.nan))
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
@@ -175,7 +198,7 @@ class Segmentation:
         """(H, W) True on either side of a jump edge, worked out when read."""
         if self.jumps is None:
             return np.zeros(self.labels.shape, np.bool_)
-        return pixels_beside(self.jumps)
+        return self._of_all(pixels_beside(self.jumps))
 
     @cached_property
     def ground(self) -> Terrain | None:
@@ -207,14 +230,14 @@ class Segmentation:
         """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
         if self.ground is None:
             return np.zeros(self.labels.shape, np.uint8)
-        return self.ground.classes
+        return self._of_all(self.ground.classes)
 
     @property
     def height(self) -> NDArray[np.float32]:
         """(H, W) metres along up above the ground; NaN where that is not known."""
         if self.ground is None:
             return np.full(self.labels.shape, np.nan, np.float32)
-        return self.ground.height
+        return self._of_all(self.ground.height)
 
     @cached_property
     def energy(self) -> float:
@@ -225,4 +248,5 @@ class Segmentation:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
         found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt, 'image': None}
+        found['verdict'] = self.verdict
         return {**self.__dict__, 'labelling': kept, **found}

@@ -30,6 +30,7 @@ from rangeseg_ros.core.sensing.grid import GridEdges, weights
 from rangeseg_ros.core.sensing.jump_edges import edges_of_all, jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.sensing.verdict import replication
 from rangeseg_ros.core.sensing.view import View
 
 
@@ -73,6 +74,10 @@ class Segmenter:
                 f'an image is a RangeImage, not {type(image).__name__}: make one with '
                 'RangeImage.from_depth(depth, camera) or RangeImage.from_points(points)'
             )
+        if cells := replication(image):
+            found = self.segment(cells.reduced(image))
+            labels = cells.enlarged(found.labels, image.shape)
+            return replace(found, labels=labels, image=image, cells=cells)
         config = self.config
         if config.distortion_map and not image.corrected:
             raise RangeImageError(

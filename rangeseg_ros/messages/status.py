@@ -15,17 +15,19 @@ def status_message(make: Make, header: Any, result: Segmentation) -> Any:
     """diagnostic_msgs/DiagnosticArray of one frame, under its header.
 
     One status with the values `work_budget`, as many digits of it as give the same labels again,
-    `planes`, their number, `reason` why there is none, and `sensor`, as `/diagnostics` has them.
+    `planes`, their number, `reason` why there is none, `sensor`, and `input`, what is doubtful
+    about the image, as `/diagnostics` has them.
     """
     values = {
         'work_budget': repr(result.work_budget),
         'planes': str(len(result.planes)),
         'reason': result.reason,
         'sensor': str(result.sensor),
+        'input': str(result.verdict),
     }
     status = make(
         'diagnostic_msgs/msg/DiagnosticStatus',
-        level=WARN if result.reason else OK,
+        level=WARN if result.reason or not result.verdict.ok else OK,
         name='segmentation of a frame',
         message=result.reason or f'{len(result.planes)} planes',
         hardware_id='',

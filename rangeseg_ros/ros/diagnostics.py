@@ -8,6 +8,7 @@ from threading import get_ident
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
+from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.depth_input import DepthInput
 
@@ -101,16 +102,8 @@ class FrameStatistics:
         What up, fixed frame, target frame and map of the last frame come from.
     missing : str
         Which frames of the parameters were not known for the last frame, and why.
-    planes : int
-        Number of planes in the last frame.
-    reason : str
-        Why there is none.
-    sensor : str
-        Errors of the sensor as the last frame shows them.
-    work_budget : float
-        Share of the work that the last frame was given.
-    tilt : str
-        Where the planes of the last frame say that up is; empty when they agree with it.
+    found : Segmentation or None
+        What was found in the last frame.
     ground, stairs : str
         Of the last frame; empty when nobody listens to what needs it.
     times : FrameTimes or None
@@ -127,11 +120,7 @@ class FrameStatistics:
         self.problem = ''
         self.sources: dict[str, str] = {}
         self.missing = ''
-        self.planes = 0
-        self.reason = ''
-        self.sensor = ''
-        self.work_budget = 1.0
-        self.tilt = ''
+        self.found: Segmentation | None = None
         self.ground = ''
         self.stairs = ''
         self.times: FrameTimes | None = None
@@ -160,6 +149,7 @@ class FrameStatistics:
     ) -> DiagnosticStatus:
         """Summary of now; `source` is None while nobody listens."""
         level, message = self._judge(source, stall_timeout)
+        found = self.found
         unseen = self.losses.unseen
         values = {
             'input rate (Hz)': f'{self.received.rate():.2f}',
@@ -177,10 +167,11 @@ class FrameStatistics:
             'doing': self.doing() or 'waiting for a frame',
             'parameters': self.pending or 'in use',
             **{f'{what} from': source for what, source in self.sources.items()},
-            'planes': str(self.planes),
-            'reason for no planes': self.reason,
-            'sensor': self.sensor,
-            'work_budget': f'{self.work_budget:g}',
+            'input': str(found.verdict) if found else '',
+            'planes': str(len(found.planes)) if found else '0',
+            'reason for no planes': found.reason if found else '',
+            'sensor': str(found.sensor) if found else '',
+            'work_budget': f'{found.work_budget:g}' if found else '1',
             'ground': self.ground,
             'stairs': self.stairs,
         }
@@ -224,6 +215,9 @@ class FrameStatistics:
             return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
         if problem := source.problem or self.problem:
             return DiagnosticStatus.ERROR, problem
+        found = self.found
+        if found and found.verdict.invalid:
+            return DiagnosticStatus.ERROR, str(found.verdict)
         if (stalled := self.stalled()) > stall_timeout:
             return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {self.doing()}'
         if self.compiling:
@@ -232,8 +226,11 @@ class FrameStatistics:
             return DiagnosticStatus.WARN, lost
         if self.missing:
             return DiagnosticStatus.WARN, self.missing
-        if self.tilt:
-            return DiagnosticStatus.WARN, self.tilt
-        if self.published.total and not self.planes:
-            return DiagnosticStatus.WARN, f'no planes: {self.reason}'
-        return DiagnosticStatus.OK, f'{self.planes} planes at {self.published.rate():.1f} Hz'
+        if found and not found.verdict.ok:
+            return DiagnosticStatus.WARN, str(found.verdict)
+        if found and found.tilt:
+            return DiagnosticStatus.WARN, str(found.tilt)
+        if found and not found.planes:
+            return DiagnosticStatus.WARN, f'no planes: {found.reason}'
+        count = len(found.planes) if found else 0
+        return DiagnosticStatus.OK, f'{count} planes at {self.published.rate():.1f} Hz'

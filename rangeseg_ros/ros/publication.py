@@ -111,11 +111,7 @@ class Publication:
             publication=publication,
             stages=found.timings,
         )
-        statistics.planes = len(found.planes)
-        statistics.reason = found.reason
-        statistics.sensor = str(found.sensor)
-        statistics.work_budget = found.work_budget
-        statistics.tilt = str(found.tilt or '')
+        statistics.found = found
         # Only what was worked out for a listener.
         known = vars(found)
         statistics.ground = str(known.get('ground', ''))

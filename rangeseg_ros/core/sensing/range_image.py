@@ -22,8 +22,8 @@ class UnitWarning(UserWarning):
     """Ranges that look as if they were in another unit."""
 
 
-# The farthest that 16 bits of millimetres tell, metres.
-_FAR = 65.0
+FAR = 65.0
+"""The farthest that 16 bits of millimetres tell, metres."""
 NOT_MEASURED = 65535
 """What drivers and data sets write for it beside 0: the largest value of 16 bits."""
 
@@ -226,10 +226,10 @@ class RangeImage:
 
     def _doubt_unit(self, measured: str) -> None:
         """Warn where more than half of what was measured is beyond any depth camera's reach."""
-        far = self.valid & (self.inverse < 1 / _FAR)
+        far = self.valid & (self.inverse < 1 / FAR)
         if 2 * np.count_nonzero(far) > np.count_nonzero(self.valid):
             warnings.warn(
-                f'more than half of the {measured} are beyond {_FAR:.0f} m: are they in metres?',
+                f'more than half of the {measured} are beyond {FAR:.0f} m: are they in metres?',
                 UnitWarning,
                 stacklevel=3,
             )

@@ -1,0 +1,167 @@
+"""What is doubtful about an image is said, enlarged images are read as what they were."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
+from rangeseg_ros.core.sensing.verdict import filled_share, interpolation, replication
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+
+DATA = Path(__file__).parents[2] / 'shared/data'
+SENSOR_NAMES = ['kinect', 'realsense', 'tof']
+FACTORS = [2, 3, 4, 6, 8]
+
+
+@pytest.fixture(scope='module')
+def seen():
+    return simulate(kinect_room(3), SENSORS['kinect'](1), seed=3)
+
+
+def enlarged(depth, camera, factor, crop, interpolation=cv2.INTER_NEAREST):
+    """A depth image and its camera enlarged, without some pixels of each side."""
+    size = depth.shape[1] * factor, depth.shape[0] * factor
+    top, left, bottom, right = crop
+    wide = cv2.resize(depth, size, interpolation=interpolation)
+    wide = wide[top : size[1] - bottom, left : size[0] - right]
+    centre = (camera.cx + 0.5) * factor - 0.5 - left, (camera.cy + 0.5) * factor - 0.5 - top
+    focal = camera.fx * factor, camera.fy * factor
+    return np.ascontiguousarray(wide), Camera(*wide.shape[::-1], *focal, *centre)
+
+
+@pytest.mark.parametrize('factor', FACTORS)
+def test_replicated_pixels_are_undone_whatever_is_cropped(seen, factor):
+    original = RangeImage.from_depth(seen.depth, seen.camera)
+    rng = np.random.default_rng(factor)
+    for _ in range(5):
+        crop = rng.integers(0, factor, 4)
+        image = RangeImage.from_depth(*enlarged(seen.depth, seen.camera, factor, crop))
+        cells = replication(image)
+        assert cells == (factor, crop[0], crop[1])
+        reduced = cells.reduced(image)
+        np.testing.assert_array_equal(reduced.inverse, original.inverse)
+        np.testing.assert_allclose(reduced.rays, original.rays, atol=1e-5)
+        np.testing.assert_array_equal(cells.enlarged(reduced.inverse, image.shape), image.inverse)
+
+
+@pytest.mark.parametrize('method', ['planes', 'normals'])
+def test_an_enlarged_image_gives_what_the_original_gives(seen, method):
+    depth, camera = enlarged(seen.depth, seen.camera, 3, (1, 2, 0, 1))
+    small, large = (
+        SequenceSegmenter(Config(method=method)).segment(RangeImage.from_depth(*frame), 0)
+        for frame in ((seen.depth, seen.camera), (depth, camera))
+    )
+    whole = np.ones((3, 3), np.uint8)
+    for name in ('labels', 'normals', 'edges', 'terrain', 'height'):
+        wanted = np.kron(getattr(small, name).T, whole).T if name != 'normals' else None
+        if name == 'normals':
+            wanted = small.normals.repeat(3, axis=0).repeat(3, axis=1)
+        np.testing.assert_array_equal(getattr(large, name), wanted[1:, 2:-1])
+    for one, other in zip(small.planes, large.planes, strict=True):
+        np.testing.assert_allclose(one.normal, other.normal, atol=1e-4)
+        np.testing.assert_allclose(one.hull.mean(axis=0), other.hull.mean(axis=0), atol=0.01)
+    assert large.verdict.reasons[:1] == ('enlarged x 3',)
+
+
+def test_clouds_and_their_own_body_are_reduced_as_well(seen):
+    points = RangeImage.from_depth(seen.depth, seen.camera).points
+    turned = points + np.float32(0.001) * np.sin(np.arange(640))[:, None]  # of no pinhole camera
+    image = RangeImage.from_points(turned.repeat(2, axis=0).repeat(2, axis=1))
+    cells = replication(image)
+    assert image.camera is None and cells == (2, 0, 0)
+    body = np.zeros(image.shape, bool)
+    body[:100] = True
+    reduced = cells.reduced(image.without(body))
+    np.testing.assert_array_equal(reduced.body, body[::2, ::2])
+    np.testing.assert_array_equal(
+        reduced.inverse, RangeImage.from_points(turned).without(body[::2, ::2]).inverse
+    )
+
+
+@pytest.mark.parametrize('factor', FACTORS)
+def test_linear_enlargement_is_found(seen, factor):
+    depth = seen.depth.astype(np.float32) / 1000
+    frame = enlarged(depth, seen.camera, factor, (1, 1, 0, 0), cv2.INTER_LINEAR)
+    assert interpolation(RangeImage.from_depth(*frame)).factor == factor
+
+
+def test_levels_of_exact_scenes_are_not_replication():
+    for left, right, top, bottom in ((200, 440, 120, 360), (160, 480, 160, 320)):
+        depth = np.full((480, 640), 2.1)
+        depth[top:bottom, left:right] = 2.0
+        result = segment(depth, Camera.from_fov(640, 480, 57))
+        assert result.cells is None and result.verdict.ok
+
+
+@pytest.mark.parametrize('sensor', SENSOR_NAMES)
+def test_simulated_images_are_trusted(sensor):
+    for seed in (1, 2):
+        seen = simulate(kinect_room(seed), SENSORS[sensor](seed), seed=seed)
+        verdict = segment(seen.depth, seen.camera).verdict
+        assert verdict.ok and str(verdict) == 'trusted'
+
+
+def test_range_in_place_of_depth_is_told(seen):
+    image = RangeImage.from_depth(seen.depth, seen.camera)
+    distances = np.where(image.valid, np.linalg.norm(image.points, axis=2), 0)
+    verdict = segment(distances, seen.camera).verdict
+    assert verdict.reasons == ('range instead of z',) and verdict.invalid
+
+
+@pytest.mark.parametrize('unit', [0.005, 0.0002, 0.01])
+def test_a_kinect_in_the_wrong_unit_is_told(seen, unit):
+    verdict = segment(seen.depth, seen.camera, unit).verdict
+    assert verdict.reasons == ('scale improbable',) and verdict.invalid
+    factor = max(unit / 0.001, 0.001 / unit)
+    assert f'{factor:g} times' in str(verdict)
+
+
+def test_millimetres_in_floats_are_told(seen):
+    with pytest.warns(UserWarning, match='65 m'):
+        image = RangeImage.from_depth(seen.depth.astype(float), seen.camera)
+    assert Segmenter().segment(image).verdict.reasons == ('millimetres in floats',)
+
+
+@pytest.mark.parametrize('axis', [0, 1])
+def test_filled_holes_are_told_with_their_share(seen, axis):
+    depth = seen.depth.copy()
+    rng = np.random.default_rng(0)
+    for u, v in rng.integers(20, 400, (60, 2)):
+        depth[v : v + 30, u : u + 30] = 0
+    holes = np.count_nonzero(depth == 0) / depth.size
+    image = RangeImage.from_depth(depth, seen.camera)
+    assert filled_share(image) < 0.01
+    filled = np.swapaxes(depth, 0, axis).copy()
+    for k in range(1, len(filled)):
+        filled[k] = np.where(filled[k] == 0, filled[k - 1], filled[k])
+    image = RangeImage.from_depth(np.swapaxes(filled, 0, axis), seen.camera)
+    assert 0.01 < filled_share(image) <= holes
+
+
+def test_real_frames_are_trusted():
+    folders = [path for name in ('annotated', 'annotated_2', 'realsense', 'new_sensors')
+               for path in sorted((DATA / name).glob('*/camera.txt'))]  # fmt: skip
+    if not folders:
+        pytest.skip('no real frames here')
+    for camera_file in folders:
+        file = camera_file.with_name('depth.png')
+        if not file.exists():
+            continue
+        depth = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        camera = Camera(*depth.shape[::-1], *map(float, camera_file.read_text().split()))
+        verdict = segment(depth, camera).verdict
+        assert verdict.ok, (camera_file, verdict)
+
+
+def test_a_pickled_result_keeps_its_verdict(seen):
+    import pickle
+
+    result = segment(*enlarged(seen.depth, seen.camera, 2, (0, 0, 0, 0)))
+    again = pickle.loads(pickle.dumps(result))
+    assert again.image is None and again.verdict == result.verdict
+    assert replace(again, reason='x').verdict.ok  # what is not known is not doubted
