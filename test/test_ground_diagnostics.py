@@ -9,6 +9,7 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
+from rangeseg_ros.core.sensing.verdict import Verdict
 from rangeseg_ros.ros.diagnostics import FrameStatistics
 
 
@@ -30,7 +31,24 @@ def test_ground_and_stairs_are_told():
     assert found.level == DiagnosticStatus.OK
 
 
+def result(tilt='', verdict=Verdict()):  # noqa: B008
+    return SimpleNamespace(
+        planes=[1, 2, 3], reason='', sensor='', work_budget=1.0, tilt=tilt, verdict=verdict
+    )
+
+
+def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
+    for reason, level in (
+        ('millimetres in floats', DiagnosticStatus.ERROR),
+        ('range instead of z', DiagnosticStatus.ERROR),
+        ('enlarged x 4', DiagnosticStatus.WARN),
+    ):
+        found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
+        assert found.level == level and found.message == 'What it is.'
+        assert {value.key: value.value for value in found.values}['input'] == 'What it is.'
+
+
 def test_a_tilt_is_a_warning():
-    found = status(tilt='the camera looks tilted by 20 degrees')
+    found = status(found=result(tilt='the camera looks tilted by 20 degrees'))
     assert found.level == DiagnosticStatus.WARN
     assert found.message == 'the camera looks tilted by 20 degrees'

@@ -248,5 +248,5 @@ class Segmentation:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
         found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt, 'image': None}
-        found['verdict'] = self.verdict
-        return {**self.__dict__, 'labelling': kept, **found}
+        judged = {'verdict': self.verdict}
+        return {**self.__dict__, 'labelling': kept, **found, **judged}

@@ -75,9 +75,9 @@ class Segmenter:
                 'RangeImage.from_depth(depth, camera) or RangeImage.from_points(points)'
             )
         if cells := replication(image):
-            found = self.segment(cells.reduced(image))
-            labels = cells.enlarged(found.labels, image.shape)
-            return replace(found, labels=labels, image=image, cells=cells)
+            result = self.segment(cells.reduced(image))
+            labels = cells.enlarged(result.labels, image.shape)
+            return replace(result, labels=labels, image=image, cells=cells)
         config = self.config
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
