@@ -18,9 +18,6 @@ from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
 _STEEPEST = 1000.0
-# Share of an image that rays reach, at least: the circle of a fisheye, 180 degrees from top to
-# bottom, is 44 % of an image of 16:9.
-_LEAST_SHOWN = 0.1
 # By which the square of a unit quaternion may be off: decimals of files.
 _UNIT = 1e-6
 OPTICAL = (0.0, 0.0, 0.0, 1.0)
@@ -140,13 +137,11 @@ class Camera:
 
     def _check_lens(self) -> None:
         shown = _shown(self)
-        if shown < _LEAST_SHOWN:
-            raise CameraError(
-                f'lens distortion D fits no lens: rays reach {shown:.0%} of the image'
-            )
-        if shown < 1 and self.distortion_model != 'equidistant':
+        if shown.sum() < 3:  # that a plane could be seen in
+            raise CameraError('lens distortion D fits no lens: hardly any pixel has a ray')
+        if not shown.all() and self.distortion_model != 'equidistant':
             warnings.warn(
-                f'lens distortion D folds the image: {1 - shown:.0%} of it is left out',
+                f'lens distortion D folds the image: {1 - shown.mean():.0%} of it is left out',
                 CameraWarning,
                 stacklevel=4,
             )
@@ -247,10 +242,10 @@ def _finite(name: str, value: Any) -> float:
 
 
 @lru_cache(maxsize=64)
-def _shown(camera: Camera) -> float:
-    """Share of the image that rays reach, by a grid of places."""
+def _shown(camera: Camera) -> NDArray[np.bool_]:
+    """Which places of a grid over the image have a ray."""
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
-    return float(np.isfinite(camera.rays_at(u, v)[..., 0]).mean())
+    return np.isfinite(camera.rays_at(u, v)[..., 0])
 
 
 @lru_cache(maxsize=4)
