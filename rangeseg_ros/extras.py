@@ -14,6 +14,7 @@ EXTRAS = {
     'pandas': 'notebook',
     'trimesh': 'notebook',
     'open3d': 'open3d',
+    'OpenEXR': 'exr',
     'rerun': 'view',
     'rclpy': 'jazzy',
 }

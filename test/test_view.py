@@ -100,7 +100,8 @@ def test_without_rerun_view_says_what_is_missing(tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    assert capsys.readouterr().err == ('rangeseg: view needs rerun-sdk: install the extra view\n')
+    told = "rangeseg: rerun is not installed: pip install 'rangeseg_ros[view]'\n"
+    assert capsys.readouterr().err == told
 
 
 def test_view_shows_the_map(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import sys
 import warnings
@@ -12,6 +13,7 @@ import click
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.extras import MissingExtraError, missing
 
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
@@ -38,9 +40,17 @@ class _LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
-            return None
+            similar = difflib.get_close_matches(cmd_name, COMMANDS, 1, 0.4)
+            hint = f': is {similar[0]!r} meant?' if similar else ' (rangeseg --help lists them)'
+            if ctx.resilient_parsing:
+                return None
+            raise click.UsageError(f'no command {cmd_name!r}{hint}')
         command: click.Command = import_module(f'rangeseg_ros.cli.{cmd_name}').command
         return command
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        # Without a command what there is, and no error.
+        return super().parse_args(ctx, args or ['--help'])
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section('Commands'):
@@ -77,6 +87,10 @@ def main() -> None:
         sys.exit(rangeseg.main(prog_name='rangeseg', standalone_mode=False))
     except click.ClickException as error:
         _fail(error.format_message())
+    except MissingExtraError as error:
+        _fail(str(error))
+    except ModuleNotFoundError as error:
+        _fail(missing(error) or f'{error}: is the installation complete?')
     except (ValueError, OSError, MemoryError, RecursionError) as error:
         _fail(in_words(error))
     except SystemExit as end:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +14,8 @@ from tqdm import tqdm
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.depth_files import Intrinsics
 from rangeseg_ros.io.files import (
     NotReplacedError,
     check_regular,
@@ -56,6 +58,42 @@ camera: Callable[..., Any] = click.option(
     required=True,
     help='Intrinsics: a ROS camera-calibration YAML file.',
 )
+_NUMBERS = (
+    ('--fx', 'Focal length in x, pixels, in place of a file.'),
+    ('--fy', 'Focal length in y.  [default: as in x]'),
+    ('--cx', 'Column of the principal point.  [default: the middle]'),
+    ('--cy', 'Row of the principal point.  [default: the middle]'),
+    ('--fov', 'Horizontal field of view, degrees, in place of focal lengths.'),
+)
+
+
+def intrinsics(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options for `--camera` or for numbers in its place: `camera_file`, `fx` ... `fov`."""
+    for name, told in reversed(_NUMBERS):
+        command = click.option(name, type=Finite(), help=told)(command)
+    file = click.option(
+        '--camera',
+        'camera_file',
+        type=FILE,
+        help='Intrinsics: a ROS camera-calibration YAML file, or the JSON of Open3D.',
+    )
+    decorated: Callable[..., Any] = file(command)
+    return decorated
+
+
+def read_intrinsics(
+    camera_file: Path | None, raw: bool, numbers: Sequence[float | None], fov: float | None
+) -> Intrinsics:
+    """Intrinsics of the options `intrinsics`; `numbers` are fx, fy, cx, cy."""
+    given = any(number is not None for number in numbers)
+    if (camera_file is not None) + given + (fov is not None) > 1:
+        raise click.UsageError('give one of --camera, --fx ... --cy and --fov')
+    if given and not (numbers[0] or numbers[1]):
+        raise click.UsageError('--cx and --cy need --fx')
+    camera = read_camera(camera_file, raw) if camera_file else None
+    return Intrinsics(camera, numbers if given else (), fov)
+
+
 raw: Callable[..., Any] = click.option(
     '--raw',
     is_flag=True,

@@ -12,20 +12,20 @@ from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.core.sensing.distortion import DistortionError
-from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
+from rangeseg_ros.core.sensing.range_image import RangeImageError
 from rangeseg_ros.core.sequence import with_roles
-from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.images import read_depth
+from rangeseg_ros.io.depth_files import CLOUDS, files_in, read_frame, scale_of
 
 # Outputs of the node that show what the files hold, so that they need the same kernels.
 _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 
 
 @click.command()
-@click.argument('depth', nargs=-1, required=True, type=options.FILE)
-@options.camera
+@click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@options.intrinsics
 @options.raw
 @click.option(
     '--output',
@@ -50,7 +50,12 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 )
 def command(
     depth: tuple[Path, ...],
-    camera_file: Path,
+    camera_file: Path | None,
+    fx: float | None,
+    fy: float | None,
+    cx: float | None,
+    cy: float | None,
+    fov: float | None,
     raw: bool,
     output: Path,
     depth_scale: float | None,
@@ -60,28 +65,33 @@ def command(
     normals: bool,
     sensor: bool,
 ) -> None:
-    """Segment DEPTH images (16-bit PNG or TIFF, float TIFF) into planes.
+    """Segment DEPTH images or organised clouds into planes.
+
+    Files or folders of them: PNG, TIFF, EXR, .npy, .npz (integers in millimetres, floats in
+    metres), PCD and PLY, and folders as the benchmark of TUM has them (1/5000 m).
 
     Writes for each image <stem>_labels.png (16 bits, 0 = no plane), <stem>_planes.csv (a row for
     each plane, metres, x right, y down, z forward), <stem>_overlay.png, <stem>_terrain.png (0
     unknown, 1 ground, 2 obstacle, 3 drop), <stem>_height.tiff (metres above the ground) and
     <stem>_stairs.csv. Nothing that is there already is replaced, unless --overwrite says so.
     """
-    name, count = Counter(path.stem for path in depth).most_common(1)[0]
+    frames = [(file, depth_scale or scale_of(path)) for path in depth for file in files_in(path)]
+    name, count = Counter(path.stem for path, _ in frames).most_common(1)[0]
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
-    camera = read_camera(camera_file, raw)
+    intrinsics = options.read_intrinsics(camera_file, raw, (fx, fy, cx, cy), fov)
     segmenter = Segmenter(options.read_parameters(params_file, exact))
     files = [name for name in FRAME_FILES if name != 'normals' or normals]
-    outputs = [frame_path(output, path.stem, kind) for path in depth for kind in files]
-    inputs = [*depth, camera_file, *filter(None, [params_file])]
+    outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
+    inputs = [path for path, _ in frames] + [*filter(None, [camera_file, params_file])]
     options.check_new(outputs, inputs, overwrite)
-    prepare(segmenter.config, ('image',), options.show_compilation, _SHOWN)
-    for path in options.progress(depth, len(depth), 'image'):
+    clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
+    kinds = ('image', 'points') if clouds else ('image',)
+    prepare(segmenter.config, kinds, options.show_compilation, _SHOWN)
+    for path, scale in options.progress(frames, len(frames), 'image'):
         try:
-            image = RangeImage.from_depth(read_depth(path, camera.shape), camera, depth_scale)
-            image = corrected(image, segmenter.config)
-        except (RangeImageError, DistortionError) as error:
+            image = corrected(read_frame(path, intrinsics, scale), segmenter.config)
+        except (RangeImageError, CameraError, DistortionError) as error:
             raise click.ClickException(f'{path}: {error}') from None
         result = segmenter.segment(image)
         result = replace(result, planes=with_roles(result.planes, segmenter.config, result.up))

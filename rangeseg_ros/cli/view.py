@@ -20,6 +20,7 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.drawing import colours, grey
+from rangeseg_ros.extras import load
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.files import replacing
 
@@ -104,11 +105,7 @@ def command(
 def _rerun() -> Any:
     # Read when the library is loaded.
     os.environ['TELEMETRY_ENABLED'] = 'false'
-    try:
-        import rerun
-    except ImportError:
-        raise click.ClickException('view needs rerun-sdk: install the extra view') from None
-    return rerun
+    return load('rerun')
 
 
 def _log_frame(rerun: Any, log: Any, image: RangeImage, result: Segmentation) -> None:

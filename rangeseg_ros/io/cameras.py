@@ -1,4 +1,4 @@
-"""Camera intrinsics in ROS camera-calibration YAML files."""
+"""Camera intrinsics in files: ROS camera calibrations and the JSON of Open3D."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
 
 def read_camera(path: Path, raw: bool = False) -> Camera:
-    """Read the intrinsics of a ROS camera-calibration YAML file.
+    """Read the intrinsics of a ROS camera-calibration YAML file, or of the JSON of Open3D.
 
     Parameters
     ----------
@@ -34,6 +34,14 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
         raise CameraError(str(error)) from None
     if not isinstance(calibration, dict):
         raise CameraError(f'{path}: not a camera calibration')
+    # JSON is YAML. Open3D writes K by columns, with the poses of cameras inside `intrinsic`.
+    inner = calibration.get('intrinsic', calibration)
+    if isinstance(inner, dict) and 'intrinsic_matrix' in inner:
+        try:
+            k = np.array(inner['intrinsic_matrix'], float).reshape(3, 3).T
+            return Camera(inner['width'], inner['height'], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+        except (KeyError, TypeError, ValueError) as error:
+            raise CameraError(f'{path}: not intrinsics of Open3D: {error}') from None
     try:
         return camera_from_calibration(calibration, raw or None)
     except ValueError as error:

@@ -47,7 +47,7 @@ def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
         raise ImageFileError(
             f'{path}: depth image must have one channel, not {image.shape[2]} (colour?)'
         )
-    if image.dtype != np.uint16 and image.dtype.kind != 'f':
+    if image.dtype.kind != 'f' and image.dtype.itemsize < 2:
         raise ImageFileError(f'{path}: depth image must be 16-bit or float, not {image.dtype}')
     return image
 

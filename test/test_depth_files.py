@@ -1,0 +1,208 @@
+"""Depth in the files, folders and with the intrinsics that people have."""
+
+import json
+import shutil
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from rangeseg_ros import Camera, RangeImage
+from rangeseg_ros.cli.main import main, rangeseg
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.depth_files import Intrinsics, files_in, read_frame, scale_of
+
+CAMERA = Camera(64, 48, 60, 60, 31.5, 23.5)
+
+
+@pytest.fixture
+def depth():
+    """Millimetres of a slanted wall with a hole."""
+    v, u = np.indices(CAMERA.shape)
+    depth = (1500 + 3 * u + 2 * v).astype(np.uint16)
+    depth[:4, :4] = 0
+    return depth
+
+
+def write_ply(path, points, binary=True, size=True):
+    height, width = points.shape[:2]
+    info = [f'obj_info num_cols {width}', f'obj_info num_rows {height}'] if size else []
+    axes = [f'property float {axis}' for axis in 'xyz']
+    kind = 'binary_little_endian' if binary else 'ascii'
+    head = ['ply', f'format {kind} 1.0', *info, f'element vertex {width * height}', *axes]
+    head += ['property uchar red', 'element face 0', 'property list uchar int vertex_indices']
+    body = b''
+    for x, y, z in points.reshape(-1, 3):
+        row = np.array([x, y, z], '<f4').tobytes() + b'\x07'
+        body += row if binary else f'{x:.9g} {y:.9g} {z:.9g} 7\n'.encode()
+    path.write_bytes('\n'.join([*head, 'end_header', '']).encode() + body)
+
+
+@pytest.mark.parametrize('kind', ['png', 'tiff', 'float.tiff', 'npy', 'int32.npy', 'npz', 'exr'])
+def test_images(kind, depth, tmp_path):
+    path = tmp_path / f'frame.{kind}'
+    metres = depth.astype(np.float32) / 1000
+    if kind == 'exr':
+        exr = pytest.importorskip('OpenEXR')
+        header = {'compression': exr.ZIP_COMPRESSION, 'type': exr.scanlineimage}
+        with exr.File(header, {'Z': metres}) as file:
+            file.write(str(path))
+    elif kind == 'npz':
+        np.savez_compressed(path, colour=np.zeros((48, 64, 3)), depth=metres)
+    elif kind.endswith('npy'):
+        np.save(path, depth.astype(np.int32) if 'int32' in kind else depth)
+    else:
+        assert cv2.imwrite(str(path), metres if 'float' in kind else depth)
+    image = read_frame(path, Intrinsics(CAMERA))
+    np.testing.assert_allclose(
+        image.inverse, RangeImage.from_depth(depth, CAMERA).inverse, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize('kind', ['pcd', 'binary.ply', 'ascii.ply', 'unsized.ply'])
+def test_organised_clouds(kind, depth, tmp_path):
+    points = RangeImage.from_depth(depth, CAMERA).points
+    path = tmp_path / f'cloud.{kind}'
+    if kind == 'pcd':
+        head = 'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 64\nHEIGHT 48\nDATA binary\n'
+        path.write_bytes(head.encode() + points.tobytes())
+    else:
+        write_ply(path, points, binary='ascii' not in kind, size='unsized' not in kind)
+    image = read_frame(path, Intrinsics(CAMERA if 'unsized' in kind else None))
+    np.testing.assert_allclose(image.points, points, atol=1e-5)
+    halved = read_frame(path, Intrinsics(CAMERA), 0.5)
+    np.testing.assert_allclose(halved.points, points / 2, atol=1e-5)
+
+
+def test_ply_of_another_library(depth, tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    points = RangeImage.from_depth(depth, CAMERA).points
+    rows = np.array([tuple(p) for p in points.reshape(-1, 3)], [(a, 'f4') for a in 'xyz'])
+    element = plyfile.PlyElement.describe(rows, 'vertex')
+    told = ['width 64', 'height 48']
+    plyfile.PlyData([element], obj_info=told).write(str(tmp_path / 'cloud.ply'))
+    image = read_frame(tmp_path / 'cloud.ply', Intrinsics())
+    np.testing.assert_allclose(image.points, points, atol=1e-5)
+
+
+def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
+    points = RangeImage.from_depth(depth, CAMERA).points
+    write_ply(tmp_path / 'unsized.ply', points, size=False)
+    (tmp_path / 'cut.ply').write_bytes((tmp_path / 'unsized.ply').read_bytes()[:5000])
+    (tmp_path / 'text.ply').write_text('hello')
+    (tmp_path / 'text.npy').write_text('hello')
+    (tmp_path / 'text.npz').write_text('hello')
+    (tmp_path / 'record.bag').write_text('hello')
+    np.savez(tmp_path / 'empty.npz')
+    np.save(tmp_path / 'text2.npy', np.array([['a']]))
+    for name, words in (
+        ('unsized.ply', 'not an organised cloud'),
+        ('cut.ply', 'truncated'),
+        ('text.ply', 'not a PLY file'),
+        ('text.npy', 'not a readable file of NumPy'),
+        ('text.npz', 'not a readable file of NumPy'),
+        ('empty.npz', 'not a readable file of NumPy'),
+        ('record.bag', 'rangeseg replay'),
+        ('missing.ply', 'No such file'),
+        ('text2.npy', 'must be uint16'),
+    ):
+        with pytest.raises(ValueError, match=words):
+            read_frame(tmp_path / name, Intrinsics(fov=60))
+
+
+def test_folders(depth, tmp_path):
+    tum, mixed, empty = (tmp_path / name for name in ('tum', 'mixed', 'empty'))
+    for folder in (tum / 'rgb', tum / 'depth', mixed, empty):
+        folder.mkdir(parents=True)
+    for name in ('2.png', '1.png'):
+        cv2.imwrite(str(tum / 'depth' / name), depth)
+        cv2.imwrite(str(tum / 'rgb' / name), np.zeros((48, 64, 3), np.uint8))
+    (tum / 'depth.txt').write_text('# timestamp filename\n')
+    assert files_in(tum) == [tum / 'depth/1.png', tum / 'depth/2.png']
+    assert scale_of(tum) == pytest.approx(0.0002) and scale_of(mixed) is None
+    for name in ('frame-0.depth.png', 'frame-0.color.png'):
+        cv2.imwrite(str(mixed / name), depth)
+    assert files_in(mixed) == [mixed / 'frame-0.depth.png']
+    assert files_in(mixed / 'frame-0.color.png') == [mixed / 'frame-0.color.png']
+    with pytest.raises(ValueError, match='no depth images'):
+        files_in(empty)
+
+
+def test_intrinsics_of_open3d(tmp_path):
+    k = [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]  # by columns
+    flat = {'width': 64, 'height': 48, 'intrinsic_matrix': k}
+    for content in (flat, {'class_name': 'PinholeCameraParameters', 'intrinsic': flat}):
+        (tmp_path / 'camera.json').write_text(json.dumps(content))
+        assert read_camera(tmp_path / 'camera.json') == Camera(64, 48, 60, 61, 31.5, 23.5)
+    (tmp_path / 'camera.json').write_text(json.dumps({'intrinsic_matrix': k}))
+    with pytest.raises(ValueError, match=r'Open3D: .*width'):
+        read_camera(tmp_path / 'camera.json')
+
+
+def test_intrinsics_of_numbers():
+    assert Intrinsics(focal=(60, None, None, None)).of((48, 64)) == CAMERA
+    assert Intrinsics(focal=(60, 61, 0.0, 1)).of((48, 64)) == Camera(64, 48, 60, 61, 0, 1)
+    assert Intrinsics(fov=90).of((48, 64)).fx == pytest.approx(32)
+    with pytest.raises(ValueError, match='--camera FILE, --fov DEGREES'):
+        Intrinsics().of((48, 64))
+
+
+def run(*words):
+    return CliRunner().invoke(rangeseg, list(map(str, words)))
+
+
+def test_the_command_takes_folders_and_numbers(depth, tmp_path):
+    (tmp_path / 'in').mkdir()
+    np.save(tmp_path / 'in/a.npy', depth)
+    points = RangeImage.from_depth(depth, CAMERA).points
+    write_ply(tmp_path / 'in/b.ply', points)
+    out = tmp_path / 'out'
+    done = run('segment', tmp_path / 'in', '--fx', 60, '--output', out)
+    assert done.exit_code == 0, done.output
+    assert {path.name for path in out.glob('*_planes.csv')} == {'a_planes.csv', 'b_planes.csv'}
+    tum = tmp_path / 'tum/depth'
+    tum.mkdir(parents=True)
+    shutil.copy(tmp_path / 'in/a.npy', tum)
+    (tmp_path / 'tum/associations.txt').touch()
+    assert run('segment', tmp_path / 'tum', '--fov', 56, '--output', out / 'tum').exit_code == 0
+    distance = [
+        float((folder / 'a_planes.csv').read_text().splitlines()[1].split(',')[6])
+        for folder in (out, out / 'tum')
+    ]
+    assert distance[0] == pytest.approx(5 * distance[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ('words', 'told'),
+    [
+        ([], 'Segment depth images into planes'),
+        (['segmnt'], "no command 'segmnt': is 'segment' meant?"),
+        (['xyzzy'], 'rangeseg --help'),
+        (['segment', __file__, '--camra', 'x', '--output', 'y'], "'--camera'"),
+        (['segment', __file__, '--fov', '50', '--fx', '3', '--output', 'y'], 'one of --camera'),
+        (['segment', __file__, '--cx', '3', '--output', 'y'], 'need --fx'),
+        (['segment', __file__, '--fov', 'nan', '--output', 'y'], 'not finite'),
+    ],
+)
+def test_help_and_suggestions(words, told, monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', *words])
+    with pytest.raises(SystemExit) as end:
+        main()
+    said = capsys.readouterr()
+    assert told in (said.err if words else said.out)
+    assert end.value.code == (2 if words else 0)
+    assert said.err.count('\n') == bool(words)
+
+
+def test_a_missing_extra_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['rangeseg', 'replay', 'x', '--output', 'y'])
+    for name in [name for name in sys.modules if name.startswith('rangeseg_ros.')]:
+        if 'replay' in name or 'recordings' in name or name.endswith(('bags', 'result_bag')):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, 'rosbags', None)
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    assert "pip install 'rangeseg_ros[bags]'" in capsys.readouterr().err
