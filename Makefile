@@ -10,7 +10,7 @@ SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-s
 # Most tests keep one core busy. All tests of a file run in the same process.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 
-.PHONY: test quick demo demo-ros lint docs release-check clean
+.PHONY: test quick mutants demo demo-ros lint docs release-check clean
 
 test: $(VENV)/installed
 	$(PYTEST)
@@ -18,6 +18,12 @@ test: $(VENV)/installed
 # Without the tests that take long or need ROS 2.
 quick: $(VENV)/installed
 	$(PYTEST) -m 'not slow and not ros'
+
+# Single changes of the package, and whether tests notice: about a minute each.
+COUNT ?= 300
+SEED ?= 0
+mutants: $(VENV)/installed
+	$(BIN)/python .ci/mutants.py --count $(COUNT) --seed $(SEED)
 
 demo: $(VENV)/installed
 	rm -rf demo

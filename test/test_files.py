@@ -2,6 +2,7 @@
 
 import csv
 import resource
+import struct
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,13 +13,21 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from rosbags.typesys import Stores
 
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
 from rangeseg_ros.cli.errors import in_words
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.files import natural_order, replacing
-from rangeseg_ros.io.images import ImageFileError, read_depth, read_labels, write_image
+from rangeseg_ros.io.images import (
+    ImageFileError,
+    read_depth,
+    read_labels,
+    tiff_shape,
+    write_image,
+)
+from rangeseg_ros.io.message_types import message_types
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.planes import PlaneTable, columns
 
@@ -272,3 +281,27 @@ def test_plane_table(tmp_path):
     assert all(None not in row and None not in row.values() for row in rows)
     # No array is written as numpy prints it.
     assert not any('[' in value for row in rows for value in row.values())
+
+
+@pytest.mark.parametrize('shape, kind', [((4, 5, 3), np.uint8), ((4, 5), np.float32)])
+def test_labels_of_another_kind_are_refused(tmp_path, shape, kind):
+    path = tmp_path / 'labels.tiff'
+    write_image(path, np.ones(shape, kind))
+    with pytest.raises(ImageFileError, match='one channel of 8 or 16 bits'):
+        read_labels(path)
+
+
+@pytest.mark.parametrize('order', ['<', '>'])
+def test_the_size_of_a_tiff_is_told_by_its_front(order):
+    entries = [(256, 3, 1, 5), (257, 3, 1, 4)]
+    data = {'<': b'II', '>': b'MM'}[order] + struct.pack(f'{order}HI', 42, 8)
+    data += struct.pack(f'{order}H', len(entries))
+    for tag, kind, count, value in entries:
+        data += struct.pack(f'{order}HHIHH', tag, kind, count, value, 0)
+    assert tiff_shape(data + bytes(4)) == ((4, 5), 1)
+    assert tiff_shape(b'\x89PNG\r\n\x1a\n' + bytes(40)) == (None, 0)
+
+
+def test_bags_of_ros_1_may_have_transforms_of_either_time():
+    types = message_types(Stores.ROS1_NOETIC).types
+    assert {'tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage'} <= types.keys()

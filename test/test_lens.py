@@ -185,7 +185,7 @@ def test_unknown_lenses_are_refused(model, d, message):
 
 
 @pytest.mark.parametrize('model', ['plumb_bob', 'rational_polynomial', 'equidistant'])
-@pytest.mark.parametrize('value', [1e300, -1e300, -1e3])
+@pytest.mark.parametrize('value', [1e300, -1e300, -1e6])
 def test_coefficients_that_no_lens_has_are_refused(model, value):
     with pytest.raises(CameraError, match='fits no lens'):
         lens(model, value, 0.0, 0.0, 0.0)

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import Plane, RangeImage, Segmentation, planes_from_message
+from rangeseg_ros import Camera, Plane, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
+from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.marker_bytes import markers_bytes
@@ -59,6 +60,21 @@ def test_label_image_reads_back_as_it_was():
     message = image_message(make_rosbags, header(), labels[:, ::-1], 'mono16')
     assert (message.height, message.width, message.step) == (2, 3, 6)
     np.testing.assert_array_equal(depth_from_message(message), labels[:, ::-1])
+
+
+@pytest.mark.parametrize(
+    ('model', 'd', 'said'),
+    [
+        ('', (), 'plumb_bob'),
+        ('equidistant', (0.1, 0.0, 0.0, 0.0), 'equidistant'),
+        ('rational_polynomial', (0.1,) * 8, 'rational_polynomial'),
+    ],
+)
+def test_a_camera_info_names_the_lens(model, d, said):
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5, distortion_model=model, d=d)
+    message = camera_info_message(make_rosbags, header(), camera)
+    assert message.distortion_model == said and tuple(message.d) == (d or (0.0,) * 5)
+    assert camera_from_message(message) == camera
 
 
 def test_planes_read_back_as_they_were():

@@ -1,5 +1,7 @@
 """Where a camera is: frames first, then the accelerometer, then the parameters."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planes_of_labels import fit_planes
@@ -51,6 +53,24 @@ def test_the_accelerometer_takes_its_place_and_then_the_parameters():
     found = find_placement(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
     assert found.up is None and not found.may_come
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
+
+
+def test_planes_of_a_camera_elsewhere_are_those_planes_moved():
+    """Also their covariance, that of the distance by the lever of the move."""
+    labels = np.ones(CAMERA.shape, np.uint16)
+    inverse = (-CAMERA.rays @ np.array([0.2, -0.3, -0.9])).astype(np.float32)
+    there = replace(CAMERA, place=(3.0, -2.0, 0.5))
+    sensor = SensorModel.from_config(Config())
+    here, moved = (
+        fit_planes(labels, RangeImage(camera.rays, inverse, camera), sensor)
+        for camera in (CAMERA, there)
+    )
+    (expected,) = moved_planes(here, Transform(np.eye(3), np.array(there.place)))
+    (plane,) = moved
+    np.testing.assert_allclose(plane.normal, expected.normal, atol=1e-12)
+    assert plane.distance == pytest.approx(expected.distance, abs=1e-9)
+    np.testing.assert_allclose(plane.covariance, expected.covariance, rtol=1e-6)
+    np.testing.assert_allclose(plane.hull, expected.hull, atol=1e-5)
 
 
 def test_planes_of_another_frame_are_the_same_planes():

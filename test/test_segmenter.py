@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
@@ -210,8 +211,20 @@ def test_warm_start_begins_anew_with_the_first_frame_a_reset_and_another_camera(
     segmenter.reset()
     assert segmenter.segment(image(1)).energy == cold
     other = Camera(64, 48, 61.0, 61.0, 31.5, 23.5)
+    assert segmenter._labels_before(image(1)) is not None
+    assert segmenter._labels_before(image(1, other)) is None
     cold = Segmenter(NORMALS).segment(image(1, other)).energy
     assert segmenter.segment(image(1, other)).energy == cold
+
+
+def test_warm_start_begins_anew_with_a_cloud_of_another_size():
+    """Clouds have no camera that could tell."""
+    whole = cloud_of(image(1).points)
+    part = cloud_of(image(1).points[:40, :50])
+    cold = Segmenter(NORMALS).segment(part).labels
+    segmenter = Segmenter(WARM)
+    segmenter.segment(whole)
+    assert np.array_equal(segmenter.segment(part).labels, cold)
 
 
 @pytest.mark.parametrize('options', [{'method': 'planes'}, {'method': 'normals', 'exact': True}])

@@ -57,6 +57,33 @@ def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
     used.close()
 
 
+def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
+    """Also when what was asked for before it is compiled later."""
+    first, normals, last = NodeConfig(), NodeConfig(method='normals'), NodeConfig(min_pixels=500)
+    begun, release, changed = Event(), Event(), Event()
+
+    def prepare(config, kinds, report, outputs):
+        if config.method == 'normals':
+            begun.set()
+            release.wait()
+
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    used = Settings(first, lambda progress: None, changed.set)
+    assert used.in_use() is first and used.ready_for('terrain')
+    used.want(normals)
+    begun.wait()
+    assert used.in_use() is first
+    used.want(last)
+    release.set()
+    assert used.in_use() is last
+    exact = NodeConfig(method='normals', exact=True)
+    changed.clear()
+    used.want(exact)
+    changed.wait()
+    assert used.in_use() is exact and not used.pending
+    used.close()
+
+
 def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     release = Event()
     monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())

@@ -1,0 +1,250 @@
+"""Mutation testing: single changes of meaning, and whether any test notices them.
+
+Each mutant is a copy of the package with one operator, condition or number changed, drawn with a
+seed; the tests are those that import the changed module, directly or over the fewest steps. One
+that no test kills says what nothing tests (DeMillo, Lipton and Sayward: Hints on test data
+selection, Computer 1978). Mutants that change no result are listed in equivalent_mutants.txt
+beside this file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import copy
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / 'rangeseg_ros'
+EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
+# What a test kills in less time than this lets nobody wait for it.
+_TIMEOUT = 600
+_SWAPS = {
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
+
+
+class Mutant(NamedTuple):
+    """A change of the lines `first` to `last` of a file to `text`."""
+
+    path: Path
+    first: int
+    last: int
+    before: str
+    after: str
+    text: str
+
+    @property
+    def name(self) -> str:
+        """Tells it from others, wherever it moves in its file."""
+        return f'{self.path.relative_to(ROOT)}: {self.before} -> {self.after}'
+
+
+def mutants(path: Path) -> Iterator[Mutant]:
+    """All mutants of a module."""
+    source = path.read_text()
+    lines = source.splitlines(keepends=True)
+    for node in _expressions(ast.parse(source)):
+        for changed in _changes(node):
+            # Columns count bytes.
+            first, last = lines[node.lineno - 1].encode(), lines[node.end_lineno - 1].encode()
+            text = first[: node.col_offset].decode() + f'({ast.unparse(changed)})'
+            text += last[node.end_col_offset :].decode()
+            before = ast.unparse(node)
+            yield Mutant(path, node.lineno, node.end_lineno, before, ast.unparse(changed), text)
+
+
+def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
+    """Expressions that are run: no annotation, decorator, part of a string or docstring."""
+    for name, value in ast.iter_fields(tree):
+        if name in ('annotation', 'returns', 'decorator_list'):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
+                continue
+            if isinstance(child, ast.expr):
+                yield child
+            yield from _expressions(child)
+
+
+def _changes(node: ast.expr) -> Iterator[ast.expr]:
+    if isinstance(node, ast.Compare):
+        for place, operator in enumerate(node.ops):
+            if type(operator) in _SWAPS:
+                changed = copy.deepcopy(node)
+                changed.ops[place] = _SWAPS[type(operator)]()
+                yield changed
+    elif isinstance(node, ast.BinOp | ast.BoolOp) and type(node.op) in _SWAPS:
+        changed = copy.deepcopy(node)
+        changed.op = _SWAPS[type(node.op)]()
+        yield changed
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        yield node.operand
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+        yield ast.Constant(not node.value)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, int | float):
+        yield ast.Constant(node.value + 1)
+
+
+def imports(path: Path) -> set[str]:
+    """Names of modules that a file imports."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module)
+            found |= {f'{node.module}.{item.name}' for item in node.names}
+        elif isinstance(node, ast.Import):
+            found |= {item.name for item in node.names}
+    return found
+
+
+class Selection:
+    """Which tests to run for a module."""
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        modules = {self._name(path): path for path in PACKAGE.rglob('*.py')}
+        self._users: dict[str, set[str]] = defaultdict(set)
+        for name, path in modules.items():
+            for other in imports(path) & modules.keys():
+                self._users[other].add(name)
+        helpers = {path.stem: path for path in (ROOT / 'test').glob('*.py')}
+        self._tests = {}
+        for path in sorted((ROOT / 'test').glob('test_*.py')):
+            found = imports(path)
+            for helper in found & helpers.keys():
+                found |= imports(helpers[helper])
+            self._tests[path] = found & modules.keys()
+
+    @staticmethod
+    def _name(path: Path) -> str:
+        parts = path.relative_to(ROOT).with_suffix('').parts
+        return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
+
+    def tests(self, path: Path) -> list[Path]:
+        """Those at the fewest imports from the module, the smaller ones first."""
+        ring, seen, chosen = {self._name(path)}, set(), []
+        while ring and len(chosen) < self._most:
+            near = [test for test, used in self._tests.items() if used & ring]
+            near = sorted(set(near) - set(chosen), key=lambda test: test.stat().st_size)
+            # Those named alike are about it.
+            near.sort(key=lambda test: path.stem not in test.stem)
+            chosen += near[: self._most - len(chosen)]
+            seen |= ring
+            ring = {user for module in ring for user in self._users[module]} - seen
+        # Tests of the node start processes of it.
+        return chosen or sorted((ROOT / 'test').glob('test_node_[fs]*.py'))
+
+
+def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
+    """What tests say of a copy of the package, perhaps changed, and which failed first."""
+    with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
+        for name in ('rangeseg_ros', 'test', 'params', 'launch', 'examples', 'docs'):
+            shutil.copytree(ROOT / name, Path(folder, name))
+        for name in ('pyproject.toml', 'README.md', 'setup.py', 'package.xml', 'CHANGELOG.rst'):
+            shutil.copy(ROOT / name, folder)
+        if mutant:
+            target = Path(folder, mutant.path.relative_to(ROOT))
+            lines = target.read_text().splitlines(keepends=True)
+            lines[mutant.first - 1 : mutant.last] = [mutant.text]
+            target.write_text(''.join(lines))
+        command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
+        marks = 'not slow' if mutant and '/ros/' in str(mutant.path) else 'not slow and not ros'
+        environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
+        environment.pop('NUMBA_CACHE_DIR', None)
+        with tempfile.TemporaryFile('w+') as output:
+            process = subprocess.Popen(
+                [*command, '-m', marks],
+                cwd=folder,
+                env=environment,
+                stdout=output,
+                stderr=output,
+                start_new_session=True,
+            )
+            try:
+                code = process.wait(_TIMEOUT)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.pid, 9)
+                process.wait()
+                return 'timeout', ''
+            output.seek(0)
+            failed = re.search(r'^(?:FAILED|ERROR) (\S+)', output.read(), re.MULTILINE)
+    if code < 0 or code >= 128:
+        return 'crashed', ''
+    kinds = {0: 'survived', 5: 'untested'}
+    return kinds.get(code, 'killed'), failed[1] if failed else ''
+
+
+def main() -> int:
+    """Draw mutants, run their tests, and print what became of them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--count', type=int, default=300, help='mutants to draw')
+    parser.add_argument('--seed', type=int, default=0)
+    parser.add_argument('--files', type=int, default=6, help='files of tests for each, at most')
+    parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
+    parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
+    chosen = parser.parse_args()
+    known = {
+        line.partition(' # ')[0] for line in EQUIVALENT.read_text().splitlines() if line[:1] != '#'
+    }
+    every = [
+        mutant
+        for path in sorted(PACKAGE.rglob('*.py'))
+        for mutant in mutants(path)
+        if mutant.name not in known and re.search(chosen.name, mutant.name)
+    ]
+    drawn = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
+    selection = Selection(chosen.files)
+    table: dict[str, Counter[str]] = defaultdict(Counter)
+    sound: dict[str, bool] = {}
+    for mutant in drawn:
+        tests = [str(test.relative_to(ROOT)) for test in selection.tests(mutant.path)]
+        outcome, failed = run(tests, mutant) if tests else ('untested', '')
+        if outcome == 'killed' and failed:
+            if failed not in sound:
+                sound[failed] = run([failed])[0] == 'survived'
+            outcome = outcome if sound[failed] else 'unsound'
+        table[mutant.path.relative_to(PACKAGE).parts[0]][outcome] += 1
+        print(f'{outcome:9}{mutant.name}  (line {mutant.first}) {failed}', flush=True)
+    total: Counter[str] = Counter()
+    outcomes = ('killed', 'crashed', 'timeout', 'survived', 'untested', 'unsound')
+    print(f'\n{"":20}' + ''.join(f'{outcome:>10}' for outcome in outcomes))
+    for part, counts in sorted(table.items()):
+        print(f'{part:20}' + ''.join(f'{counts[outcome]:10}' for outcome in outcomes))
+        total += counts
+    share = sum(total[outcome] for outcome in ('killed', 'crashed', 'timeout')) / len(drawn)
+    print(f'{share:.0%} of {len(drawn)} mutants die (seed {chosen.seed}, of {len(every)})')
+    return share < chosen.least
+
+
+if __name__ == '__main__':
+    sys.exit(main())
