@@ -80,7 +80,6 @@ def test_interrupted_during_a_computation(presses):
         (['--ros-args', '-p', f'{QOS}.relaibility:=reliable'], f"is '{QOS}.reliability' meant?"),
         (['--ros-args', '-p', f'{QOS}.durability:=volatile'], 'unknown parameter'),
         (['--ros-args', '-p', f'{QOS[:-1]}.depth:=1'], f"is '{QOS}.depth' meant?"),
-        (['--ros-args', '-p', f'qos_overrides.{DEPTH}x.subscription.depth:=1'], 'unknown'),
         (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
         (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
         (['--ros-args', '--magic'], '--magic'),

@@ -63,10 +63,8 @@ def check_arguments(arguments: list[str]) -> None:
 def check_parameters(node: Node, arguments: list[str]) -> None:
     """Refuse parameters that the node does not have, so that none is misspelt in silence.
 
-    Nor is a topic or policy of `qos_overrides`, which rclpy looks up when it needs them.
-
-    Those of the wildcard section of a parameter file may be meant for other nodes: they are
-    warned of.
+    Those of the wildcard section of a parameter file may be meant for other nodes, and
+    `qos_overrides` for other topics: they are warned of.
 
     Raises
     ------
@@ -81,11 +79,15 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
     given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
     unknown = sorted(set(given) - known)
     shared = _shared(arguments)
+    topics = {name.split('.')[1] for name in quality}
     for name in unknown:
         problem = unknown_parameter(name, known)
-        if name not in shared:
+        # `ros2 param dump` writes those of the topics that a node had, maybe under other names.
+        foreign = name.startswith('qos_overrides.') and name.split('.')[1] not in topics
+        if name not in shared and not foreign:
             raise ConfigError(problem)
-        node.get_logger().warning(f'{problem} (of /**, ignored)')
+        where = 'of another topic' if foreign else 'of /**'
+        node.get_logger().warning(f'{problem} ({where}, ignored)')
 
 
 def logging_arguments() -> list[str]:

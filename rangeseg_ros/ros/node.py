@@ -7,7 +7,7 @@ import signal
 import sys
 import warnings
 from operator import attrgetter
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,7 +19,7 @@ from rclpy.exceptions import (
     ParameterException,
 )
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
@@ -49,20 +49,27 @@ _places = attrgetter('use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
 _EVENT_INTERVAL = 0.1
 
 
-class SegmentPlanes(Node):
+class SegmentPlanes(LifecycleNode):
     """Segments the newest depth message whenever it is free, while any output is subscribed.
 
     The executor's thread receives, answers parameter requests and reports; the threads of
     `Pipeline` compute and publish, and that of `Settings` has kernels compiled.
+
+    A managed node with the parameter `managed`; else it is configured and active at once.
+
+    Parameters
+    ----------
+    **node_kwargs
+        Of `rclpy.node.Node`, such as `namespace`: several fit into one process.
     """
 
-    def __init__(self) -> None:
-        super().__init__('segment_planes')
+    def __init__(self, node_name: str = 'segment_planes', **node_kwargs: Any) -> None:
+        super().__init__(node_name, **node_kwargs)
         check_parameters(self, sys.argv)
         config = bind(self, lambda config: self._settings.want(config))
         self._config = config
         self._input: DepthInput | None = None
-        self._silent = False
+        self._silent = self._active = False
         self._statistics = FrameStatistics()
         self._seldom = SeldomCallbackGroup(_EVENT_INTERVAL)
         events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
@@ -112,7 +119,24 @@ class SegmentPlanes(Node):
             self._outputs, self._maps, self._odometry, self._settings, self._statistics
         )
         self._pipeline = Pipeline(self, publication, self._settings, self._statistics)
+        if config.managed:
+            self.get_logger().info('waits for a lifecycle manager')
+        else:
+            self.trigger_configure()
+            self.trigger_activate()
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Follow the listeners from now on."""
+        self._active = True
         self.get_logger().info(self._waits_for())
+        self._follow_demand()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Unsubscribe; the frame in hand is still published."""
+        self._active = False
+        self._follow_demand()
+        return TransitionCallbackReturn.SUCCESS
 
     def stop(self, patience: float) -> bool:
         """Let the frame in hand be finished; False when it takes more seconds than that."""
@@ -120,7 +144,8 @@ class SegmentPlanes(Node):
         return self._pipeline.stop(patience) and not self._settings.busy
 
     def _waits_for(self) -> str:
-        outputs = ', '.join(f'~/{name}' for name in OUTPUTS)
+        names = (*OUTPUTS, *self._maps, 'odometry')
+        outputs = ', '.join(f'~/{name}' for name in names)
         topics = ' and '.join(input_topics(self, self._config.input))
         if self._config.use_imu:
             topics += f', up from {self.resolve_topic_name(IMU_TOPIC)}'
@@ -150,7 +175,7 @@ class SegmentPlanes(Node):
     def _follow_demand(self) -> None:
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
         publishers = [*self._outputs.values(), *self._maps.values(), self._odometry]
-        listeners = sum(publisher.get_subscription_count() for publisher in publishers)
+        listeners = sum(p.get_subscription_count() for p in publishers) if self._active else 0
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses
             self._input = DepthInput(self, config.input, config.raw, self._accept, losses)

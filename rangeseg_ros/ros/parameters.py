@@ -40,6 +40,10 @@ class NodeConfig(Config):
         'take up from the accelerometer on the topic imu, in the frame of the images or one that '
         'tf leads from, where gravity_frame does not tell, instead of up_x, up_y, up_z',
     )
+    managed: bool = option(
+        False,
+        'wait for a lifecycle manager: publish and subscribe only while active; read at the start',
+    )
     target_rate: float = option(
         0.0,
         'method planes: frames per second to be held by doing less of the work, down from '
