@@ -62,6 +62,10 @@ with suppress(ImportError):
     commands['develop'] = Develop
 
 
+# What only some commands and functions need; rangeseg_ros/extras.py names them where missing.
+bags = ['lz4', 'rosbags>=0.11', 'zstandard>=0.15']
+report = ['jinja2>=3.0', 'matplotlib>=3.6']
+
 setup(
     name=package_name,
     version=version,
@@ -76,7 +80,7 @@ setup(
     license='GPL-3.0-or-later',
     keywords=['ROS', 'depth image', 'range image', 'plane segmentation', 'graph cuts'],
     classifiers=[
-        'Development Status :: 5 - Production/Stable',
+        'Development Status :: 4 - Beta',
         'Environment :: Console',
         'Intended Audience :: Developers',
         'Intended Audience :: Science/Research',
@@ -105,24 +109,21 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'click>=8.0',
-        'jinja2>=3.0',
-        'lz4',
         'mapbox-earcut>=1.0,<3',
-        'matplotlib>=3.6',
         'numba>=0.58.1',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',
         'PyYAML>=5.4',
-        'rosbags>=0.11',
         'scipy>=1.11',
         'shapely>=2.0',
         'tqdm>=4.60',
-        'zstandard>=0.15',
     ],
     extras_require={
         # PyMaxflow is what the minimum cuts are compared with, mcap what the bags are read by.
         'test': [
+            *bags,
+            *report,
             'PyMaxflow>=1.3',
             'hypothesis>=6.90',
             'mcap>=1.2.1',
@@ -130,6 +131,11 @@ setup(
             'pytest-timeout>=2.2',
             'pytest-xdist>=3.3',
         ],
+        'bags': bags,
+        'report': [*bags, *report],
+        'notebook': ['matplotlib>=3.6', 'pandas>=2.0', 'trimesh>=4.0'],
+        'open3d': ['open3d>=0.18'],
+        'exr': ['OpenEXR>=3.3'],
         'dask': ['distributed>=2023.1'],
         'view': ['rerun-sdk>=0.23'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],
@@ -139,6 +145,7 @@ setup(
         'jazzy': [
             'ros-jazzy-rclpy',
             'ros-jazzy-builtin-interfaces',
+            'ros-jazzy-lifecycle-msgs',
             'ros-jazzy-rmw-fastrtps-cpp',
             'ros-jazzy-sensor-msgs',
             'ros-jazzy-geometry-msgs',

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from rangeseg_ros import __version__
+from rangeseg_ros.extras import EXTRAS
 
 ROOT = Path(__file__).parents[1]
 
@@ -37,7 +38,6 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
     for tag in ('name', 'version', 'license'):
         assert package.findtext(tag) == setup_arguments[tag]
     assert package.findtext('export/build_type') == 'ament_python'
-    (wheel_only,) = re.findall(r'pip install ([\w -]+?) -->', (ROOT / 'package.xml').read_text())
     keys = {
         element.text.removeprefix('python3-').removesuffix('-pip').lower()
         for element in package.iter('exec_depend')
@@ -45,7 +45,24 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
     aliases = {'pyyaml': 'yaml', 'pillow': 'pil', 'opencv-python-headless': 'opencv'}
     for requirement in setup_arguments['install_requires']:
         name = re.match(r'[\w-]+', requirement)[0].lower()
-        assert aliases.get(name, name) in keys | set(wheel_only.lower().split())
+        assert aliases.get(name, name) in keys
+
+
+def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
+    extras = setup_arguments['extras_require']
+    packages = {'rerun': 'rerun-sdk', 'rclpy': 'ros-jazzy-rclpy'}
+    for name, extra in EXTRAS.items():
+        wanted = packages.get(name, name)
+        assert any(re.match(rf'{wanted}\b', requirement) for requirement in extras[extra]), name
+        assert not any(re.match(wanted, asked) for asked in setup_arguments['install_requires'])
+
+
+def test_segmenting_needs_no_library_of_an_extra():
+    modules = 'cli.segment', 'cli.compile', 'notebook', 'core.sequence'
+    code = ''.join(f'import rangeseg_ros.{name}\n' for name in modules)
+    code += f'import sys; print(*set(sys.modules) & {set(EXTRAS)!r})'
+    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
+    assert not done.stdout.split()
 
 
 def test_package_xml_names_the_messages_that_are_used():
