@@ -17,6 +17,7 @@ def on_files(files, config):
     for source, page in PAGES.items():
         text = (ROOT / source).read_text(encoding='utf-8')
         text = re.sub(r'\]\((?:docs/)?', '](', text)
+        text = re.sub(r'\[([^]]+)\]\((?:LICENSE|CITATION.cff|CHANGELOG.rst)\)', r'\1', text)
         for other, name in PAGES.items():
             text = text.replace(f']({other}', f']({name}')
         files.append(File.generated(config, page, content=text))
