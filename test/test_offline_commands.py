@@ -116,7 +116,7 @@ def test_degenerate_images_give_no_exception(folder, run, shape, value):
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
-        (['none.png'], "File 'none.png' does not exist"),
+        (['none.png'], "Path 'none.png' does not exist"),
         (['depth/2.png', '--depth-scale', '0'], '--depth-scale'),
         (['depth/2.png', '--camera', 'none.yaml'], "File 'none.yaml' does not exist"),
         (['depth/2.png', '--camera', 'bad.yaml'], 'bad.yaml: focal length fy'),

@@ -92,3 +92,21 @@ def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
     assert used.in_use() is None
     assert not used.ready_for('labels')
     release.set()
+
+
+def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypatch):
+    came, release = Event(), Event()
+
+    def prepare(config, kinds, report, outputs):
+        if outputs != FIRST:
+            release.wait()
+
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    used = Settings(NodeConfig(), lambda progress: None, came.set)
+    assert used.in_use()
+    names = ['labels', 'normals', 'drops']
+    assert used.in_order(names, ['drops']) == names
+    release.set()
+    assert used.ready_for('drops')
+    assert used.in_order(names, ['drops']) == ['drops', 'labels', 'normals']
+    used.close()

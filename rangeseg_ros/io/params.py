@@ -15,7 +15,8 @@ from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 NODE = 'segment_planes'
 # Parameters that the node has beyond those of the segmenter; nested ones by their first part.
 NODE_ONLY = frozenset(
-    {'input', 'raw', 'use_imu', 'target_rate', 'stall_timeout', 'qos_overrides', 'use_sim_time'}
+    {'input', 'raw', 'use_imu', 'managed', 'target_rate', 'stall_timeout', 'qos_overrides'}
+    | {'use_sim_time'}
 )
 
 

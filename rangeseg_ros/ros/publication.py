@@ -26,6 +26,10 @@ _MAP_INTERVAL = 1.0
 """Seconds between messages of the map: it changes with every frame, and is not for control."""
 
 
+_FIRST = ('drops', 'obstacles', 'ground')
+"""Outputs that a robot stops for: published before those that people look at."""
+
+
 class Result(NamedTuple):
     """A segmented frame; `ticks` are the times at which its parts began and ended, seconds."""
 
@@ -82,7 +86,8 @@ class Publication:
         doing = self._statistics.activity.now
         here = frame.message.header, found
         there = in_target(make_rclpy, *here, *result.target) if result.target else here
-        for name, output in OUTPUTS.items():
+        for name in self._settings.in_order(OUTPUTS, _FIRST):
+            output = OUTPUTS[name]
             publisher = self._publishers[name]
             if publisher.get_subscription_count():
                 doing(f'publishing {name}')

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from threading import Condition, Thread
 
@@ -85,6 +85,10 @@ class Settings:
         with self._came:
             self._came.wait_for(lambda: self._closed or output in self._ready)
             return not self._closed
+
+    def in_order(self, outputs: Iterable[str], first: Sequence[str]) -> list[str]:
+        """`outputs`, those of `first` before the others as soon as their kernels are there."""
+        return sorted(outputs, key=lambda name: name not in first or name not in self._ready)
 
     def close(self) -> None:
         """Let those who wait go."""
