@@ -1,10 +1,16 @@
 """The fast minimiser against the full expansion on the same energy."""
 
+import json
+import os
+import subprocess
+import sys
+
+import cv2
 import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_normals import coarse_to_fine, exact
-from rangeseg_ros.core.by_normals.angles import angle, angles
+from rangeseg_ros.core.by_normals.angles import angle, degrees
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.graphcut.energy import energy
 from rangeseg_ros.core.sensing.grid import Grid
@@ -72,15 +78,11 @@ def test_no_normal_at_all():
 
 
 def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
-    random = np.random.default_rng(0)
-    normals = random.normal(size=(500, 3))
-    normals = (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32)
-    normals[::7] = np.nan
-    direction = DIRECTIONS[4].astype(np.float32)
-    found = angles(np.arange(0, 500, 3, dtype=np.int32), normals, direction)
-    cosine = normals.astype(float) @ direction.astype(float)
-    expected = np.nan_to_num(np.degrees(np.arccos(np.clip(cosine, -1, 1))))[::3]
-    np.testing.assert_allclose(found, expected, atol=0.02)
+    cosines = np.append(np.linspace(-1, 1, 501), [1 + 1e-7, -1 - 1e-7]).astype(np.float32)
+    found = [degrees(cosine) for cosine in cosines]
+    expected = np.degrees(np.arccos(np.clip(cosines.astype(float), -1, 1)))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert degrees(np.float32(np.nan)) == 0
 
 
 def test_pixels_without_normal_belong_to_their_side_of_a_jump():
@@ -124,3 +126,31 @@ def test_warm_start_from_another_scene_does_no_harm(seed):
     other = coarse_to_fine.minimise(*problem(seed + 20)[0])
     warm = coarse_to_fine.minimise(*arguments, other)
     assert np.array_equal(warm, coarse_to_fine.minimise(*arguments))
+
+
+def labels_of_a_small_problem():
+    arguments, _ = problem(3, 60, 60)
+    return coarse_to_fine.minimise(*arguments).ravel().tolist()
+
+
+def test_compiled_code_gives_the_labels_of_the_plain_python():
+    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), 'NUMBA_DISABLE_JIT': '1'}
+    text = subprocess.check_output([sys.executable, __file__], env=environment, text=True)
+    assert json.loads(text) == labels_of_a_small_problem()
+
+
+def test_number_of_threads_does_not_matter():
+    arguments, _ = problem(5, 120, 90)
+    before = cv2.getNumThreads()
+    try:
+        found = []
+        for threads in (1, 2):
+            cv2.setNumThreads(threads)
+            found.append(coarse_to_fine.minimise(*arguments))
+    finally:
+        cv2.setNumThreads(before)
+    assert np.array_equal(*found)
+
+
+if __name__ == '__main__':
+    print(json.dumps(labels_of_a_small_problem()))

@@ -6,9 +6,6 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
-from rangeseg_ros.core.graphcut.elimination import best_choice
-
-CUTS = pytest.mark.parametrize('cut', [minimum_cut, best_choice])
 
 
 def grid_graph(random, height, width, whole):
@@ -36,12 +33,11 @@ def value(chosen, excess, neighbour, link):
     return total
 
 
-@CUTS
 @pytest.mark.parametrize('whole', [True, False])
 @pytest.mark.parametrize('seed', range(8))
-def test_no_choice_is_better_and_of_equal_ones_the_smallest_is_taken(seed, whole, cut):
+def test_no_choice_is_better_and_of_equal_ones_the_smallest_is_taken(seed, whole):
     graph = grid_graph(np.random.default_rng(seed), 3, 4, whole)
-    found = cut(*graph)
+    found = minimum_cut(*graph)
     choices = [np.array(choice) for choice in product([False, True], repeat=len(found))]
     values = np.array([value(choice, *graph) for choice in choices])
     assert value(found, *graph) == pytest.approx(values.min(), abs=1e-9)
@@ -49,10 +45,9 @@ def test_no_choice_is_better_and_of_equal_ones_the_smallest_is_taken(seed, whole
     np.testing.assert_array_equal(found, np.logical_and.reduce(best))
 
 
-@CUTS
 @pytest.mark.parametrize('whole', [True, False])
 @pytest.mark.parametrize('seed', range(10))
-def test_larger_graphs_as_another_implementation(seed, whole, cut):
+def test_larger_graphs_as_another_implementation(seed, whole):
     maxflow = pytest.importorskip('maxflow')
     random = np.random.default_rng(100 + seed)
     excess, neighbour, link = grid_graph(random, *random.integers(5, 60, 2), whole)
@@ -62,12 +57,13 @@ def test_larger_graphs_as_another_implementation(seed, whole, cut):
     p, k = np.nonzero(neighbour[:, :2] >= 0)
     graph.add_edges(p, neighbour[p, k], link[p, k], link[p, k])
     graph.maxflow()
-    np.testing.assert_array_equal(cut(excess, neighbour, link), graph.get_grid_segments(nodes))
+    np.testing.assert_array_equal(
+        minimum_cut(excess, neighbour, link), graph.get_grid_segments(nodes)
+    )
 
 
-@CUTS
-def test_graphs_without_edges_or_nodes(cut):
+def test_graphs_without_edges_or_nodes():
     excess = np.array([-1.0, 0.0, 2.0])
     neighbour, link = np.full((3, 4), -1, np.int32), np.zeros((3, 4))
-    np.testing.assert_array_equal(cut(excess, neighbour, link), [True, False, False])
-    assert cut(excess[:0], neighbour[:0], link[:0]).shape == (0,)
+    np.testing.assert_array_equal(minimum_cut(excess, neighbour, link), [True, False, False])
+    assert minimum_cut(excess[:0], neighbour[:0], link[:0]).shape == (0,)

@@ -1,7 +1,7 @@
 """Data cost of method normals: the angle between a normal and a direction (thesis eq. 5.5).
 
 Three arc cosines, each where it is quickest: NumPy's over whole images, a polynomial over the
-sites of an expansion, and a table over all directions at once, for superpixels.
+sites of an expansion, and a table where the costs of all directions are summed.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 # Cells of the octahedral map (Meyer et al., "On floating-point normal vectors", EGSR 2010) along
 # each axis: normals of a cell count as its centre, within two degrees.
 _CELLS = 128
-# Degrees in a unit of the data costs: 180 degrees at every pixel of a tile fit in 16 bits.
 UNIT = np.float32(0.25)
+"""Degrees in a unit of the table: 64 angles of 180 degrees fit in 16 bits."""
 
 
 def angle(normals: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -95,43 +95,6 @@ def degrees(cosine: np.float32) -> np.float32:
     p = p * np.sqrt(np.float32(1) - x) * np.float32(180 / np.pi)
     p = p if cosine >= 0 else np.float32(180) - p
     return p if cosine == cosine else np.float32(0)
-
-
-@njit(cache=True)
-def angles(
-    sites: NDArray[np.int32], normals: NDArray[np.float32], direction: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """Angles of a direction (3,) to the normals (n, 3) at sites (s,): (s,) float32, degrees.
-
-    0 where a normal is NaN.
-    """
-    a, b, c = direction[0], direction[1], direction[2]
-    result = np.empty(len(sites), np.float32)
-    for s in range(len(sites)):
-        p = sites[s]
-        result[s] = normals[p, 0] * a + normals[p, 1] * b + normals[p, 2] * c
-    _to_degrees(result)
-    return result
-
-
-@njit(cache=True)
-def chosen_angles(
-    labels: NDArray[np.int32], normals: NDArray[np.float32], directions: NDArray[np.float32]
-) -> NDArray[np.float32]:
-    """As `angles` at all sites (n,), each with the direction (K, 3) of its label."""
-    result = np.empty(len(labels), np.float32)
-    for p in range(len(labels)):
-        a, b, c = directions[labels[p], 0], directions[labels[p], 1], directions[labels[p], 2]
-        result[p] = normals[p, 0] * a + normals[p, 1] * b + normals[p, 2] * c
-    _to_degrees(result)
-    return result
-
-
-@njit(cache=True)
-def _to_degrees(cosine: NDArray[np.float32]) -> None:
-    # A loop of its own, for the compiler to take eight at a time.
-    for k in range(len(cosine)):
-        cosine[k] = degrees(cosine[k])
 
 
 @lru_cache(maxsize=4)

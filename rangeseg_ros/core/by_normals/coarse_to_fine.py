@@ -1,34 +1,66 @@
-"""Fast minimiser: superpixels of the image first, then pixels around the boundaries.
+"""Alpha-expansion on a pyramid: of all labels where it is coarse, then along borders only.
 
-The energy of labellings that are constant on pieces is lowered by giving every connected region of
-pieces its best label, under a prior that grows to its full weight. Then every label is expanded
-once over the pixels around its boundaries.
+The energy is that of the pixels at every level (`pyramid`). At the two coarsest levels labels are
+expanded over all of the image, at the others from the borders of their regions and from sites
+that they suit much better than the labels there.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals.angles import UNIT, angles, chosen_angles, degrees
-from rangeseg_ros.core.by_normals.piece_moves import relabel_regions
-from rangeseg_ros.core.by_normals.pieces import Pieces, pieces
+from rangeseg_ros.core.by_normals.angles import UNIT, angle_table, cell_of, degrees, find_cells
+from rangeseg_ros.core.by_normals.pyramid import Pyramid
 from rangeseg_ros.core.graphcut.cut import ROUNDING
-from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.expansion import expand
-from rangeseg_ros.core.graphcut.sites import GridLabelling, Sites, band, fronts
+from rangeseg_ros.core.graphcut.sites import (
+    GridLabelling,
+    Sites,
+    band,
+    beyond,
+    fronts,
+    group_sites,
+)
+from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 
-# Shares of the smoothness under which regions grow, one after the other: under all of it at once,
-# those that come first swallow what would have grown together beside them.
-_PRIOR_SHARES = 0.4, 0.6, 0.8, 1.0
-# Pixels from a boundary that a label is expanded to: half a tile, as far as a boundary of pieces
-# may lie beside that of pixels.
-_BAND_PIXELS = 4
-# A label reaches farther where it gains more than this, two steps of the 305 directions: there the
-# pixels beyond a boundary are another surface, not noise of this one.
-_OUTLIER_DEGREES = 15.0
+# Sites of the coarsest level are 16 pixels wide: 1200 in VGA, of which every label is expanded in
+# about as much time as all levels below take together. At the second, 64 angles fit in 16 bits.
+_LEVELS = 4
+_SECOND = 3
+# The prior at the coarsest level, in those of the others: under the plain one, two directions
+# often share a plane that is not quite flat.
+_FIRST_PRIOR = 3
+# A site may take a label that costs it no more than its share of the border around a region of so
+# many sites across.
+_REGION = 6
+# Sites from a border that a label is expanded to: two of the level above.
+_REACH = 4
+
+
+class _Observed(NamedTuple):
+    """What is observed, and what it is compared with.
+
+    Attributes
+    ----------
+    normals : (H, W, 3) float32
+        NaN where undefined.
+    top : (H, W) uint8
+        See `Pyramid`.
+    vectors : (K, 3) float32
+        Directions of the labels.
+    nearest : (cells,) int32
+        Label nearest to each cell of `angles.cell_of`.
+    """
+
+    normals: NDArray[np.float32]
+    top: NDArray[np.uint8]
+    vectors: NDArray[np.float32]
+    nearest: NDArray[np.int32]
 
 
 def minimise(
@@ -58,117 +90,285 @@ def minimise(
     (H, W) int32
         Index into `directions`.
     """
-    parts = pieces(normals, directions, grid, smoothness)
-    warm = None if before is None else _warm(parts, before)
-    labels, costs, graph = parts.votes.copy() if warm is None else warm, parts.costs, parts.graph
-    for share in _PRIOR_SHARES if warm is None else _PRIOR_SHARES[-1:]:
-        relabel_regions(labels, costs, graph._replace(links=np.float32(share) * graph.links))
-    # Any label will do where neither an edge nor a normal is.
-    result = np.append(labels, np.int32(0))[parts.image]
-    _expand(result, normals, directions, grid, smoothness)
+    vectors = np.ascontiguousarray(directions, np.float32)
+    table, nearest = angle_table(vectors.tobytes(), len(vectors))
+    pyramid = Pyramid.of(grid, smoothness, _LEVELS)
+    normals = np.ascontiguousarray(normals, np.float32)
+    observed = _Observed(normals, pyramid.top, vectors, nearest)
+    costs = _label_costs(observed, pyramid, table)
+    labels = None if before is None else _warm(before, costs, observed, pyramid)
+    if labels is None:
+        coarsest = _sum_members(costs, pyramid.members[_SECOND])
+        labels = coarsest.argmin(axis=2).astype(np.int32)
+        labelling = _labelling(labels, _LEVELS, observed, pyramid)
+        labelling = labelling._replace(links=np.float32(_FIRST_PRIOR) * labelling.links)
+        _expand_all(coarsest, labelling)
+        labels = _handed_down(labels, _SECOND, observed, pyramid)
+    _expand_all(costs, _labelling(labels, _SECOND, observed, pyramid))
+    for level in range(_SECOND - 1, -1, -1):
+        labels = _handed_down(labels, level, observed, pyramid)
+        labelling = _labelling(labels, level, observed, pyramid)
+        run_halves(_expand_near, len(labels), level, observed, labelling)
+    return labels
+
+
+def _label_costs(
+    observed: _Observed, pyramid: Pyramid, table: NDArray[np.uint16]
+) -> NDArray[np.uint16]:
+    """Data costs (h, w, K) of every label at the second coarsest level, in `UNIT`."""
+    cells = np.empty(observed.top.shape, np.int32)
+    run_rows(find_cells, len(cells), observed.normals, cells)
+    shape = pyramid.links[_SECOND].shape[1:]
+    costs = np.zeros((*shape, len(observed.vectors)), np.uint16)
+    run_rows(_sum_pixels, len(costs), cells, pyramid.top, table, costs)
+    return costs
+
+
+@njit(cache=True, nogil=True)
+def _sum_pixels(
+    first: int,
+    after: int,
+    cells: NDArray[np.int32],
+    top: NDArray[np.uint8],
+    table: NDArray[np.uint16],
+    costs: NDArray[np.uint16],
+) -> None:
+    """Add what the pixels of some rows of sites cost."""
+    for i in range(first << _SECOND, min(after << _SECOND, len(cells))):
+        for j in range(cells.shape[1]):
+            if top[i, j] >= _SECOND and cells[i, j] >= 0:
+                row, sums = table[cells[i, j]], costs[i >> _SECOND, j >> _SECOND]
+                for k in range(len(row)):
+                    sums[k] += row[k]
+
+
+@njit(cache=True, nogil=True)
+def _sum_members(costs: NDArray[np.uint16], member: NDArray[np.bool_]) -> NDArray[np.uint32]:
+    """Data costs (h, w, K) at the next level: those of its members together."""
+    height, width, count = costs.shape
+    result = np.zeros(((height + 1) // 2, (width + 1) // 2, count), np.uint32)
+    for i in range(height):
+        for j in range(width):
+            if member[i, j]:
+                row, sums = costs[i, j], result[i // 2, j // 2]
+                for k in range(count):
+                    sums[k] += row[k]
     return result
 
 
-def _warm(parts: Pieces, before: NDArray[np.integer]) -> NDArray[np.int32] | None:
-    """Labels before (n,) of the pieces, but for those whose data speak against them.
+def _labelling(
+    labels: NDArray[np.int32], level: int, observed: _Observed, pyramid: Pyramid
+) -> GridLabelling:
+    """Labels (h, w) of a level, which change in place, with what they cost."""
+    data = np.empty(labels.shape, np.float32)
+    run_rows(_sum_chosen, len(labels), labels, level, observed, data)
+    links = pyramid.links[level].reshape(2, -1)
+    return GridLabelling.of(labels.reshape(-1), data.ravel(), links, labels.shape[1])
 
-    Those are where the vote saves more than half of the links of the piece, as where something
-    moved. None if the scene looks like another one.
+
+def _warm(
+    before: NDArray[np.integer],
+    costs: NDArray[np.uint16],
+    observed: _Observed,
+    pyramid: Pyramid,
+) -> NDArray[np.int32] | None:
+    """Labels before (h, w) of the second coarsest level, where the data do not speak against them.
+
+    That is where the best label saves more than half of the links of the site, as where something
+    moved, and takes its place. None if the scene looks like another one.
     """
-    labels, every = parts.votes.copy(), np.arange(len(parts.votes))
-    inside = parts.image >= 0
-    labels[parts.image[inside]] = before[inside]
-    links = np.concatenate([[0.0], np.cumsum(parts.graph.links, dtype=float)])
-    bound = (links[parts.graph.start[1:]] - links[parts.graph.start[:-1]]) / 2
-    lost = UNIT * (parts.costs[every, labels].astype(float) - parts.costs[every, parts.votes])
-    against = lost > bound
-    if 2 * against[parts.image[inside]].sum() > inside.sum():
+    best = costs.argmin(axis=2).astype(np.int32)
+    rows, columns = (
+        np.minimum((np.arange(count) << _SECOND) + (1 << _SECOND - 1), size - 1)
+        for count, size in zip(best.shape, before.shape, strict=True)
+    )
+    labels = before[np.ix_(rows, columns)].astype(np.int32)
+    labelling = _labelling(labels, _SECOND, observed, pyramid)
+    lost = labelling.data - UNIT * costs.min(axis=2).ravel()
+    half = _link_sums(labelling.links, labelling.width) / 2
+    against = (lost > half).reshape(best.shape)
+    if 2 * np.count_nonzero(against) > against.size:
         return None
-    return np.where(against, parts.votes, labels)
+    return np.where(against, best, labels)
 
 
-def _expand(
-    image: NDArray[np.int32],
-    normals: NDArray[np.float32],
-    directions: NDArray[np.floating],
-    grid: Grid,
-    smoothness: float,
+def _handed_down(
+    labels: NDArray[np.int32],
+    level: int,
+    observed: _Observed,
+    pyramid: Pyramid,
+) -> NDArray[np.int32]:
+    """Labels (h, w) of a level from those of the next one.
+
+    Sites that are no member of one there take the label of what they are linked to, or the one
+    nearest to their normal where that has none either; any will do where neither is.
+    """
+    member = pyramid.members[level]
+    height, width = member.shape
+    finer = labels.repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    result = np.where(member, finer, np.int32(-1))
+    links = pyramid.links[level].reshape(2, -1)
+    _spread(result.reshape(-1), links, width)
+    _observe(result, level, observed)
+    _spread(result.reshape(-1), links, width)
+    return np.maximum(result, 0)
+
+
+@njit(cache=True, nogil=True)
+def _spread(labels: NDArray[np.int32], links: NDArray[np.float32], width: int) -> None:
+    """Give sites (n,) of -1 the label of the nearest site that is linked to them; in place."""
+    offsets = np.array([1, width, -1, -width])
+    queue = np.empty(len(labels), np.int32)
+    last = done = 0
+    for p in range(len(labels)):
+        for k in range(4):
+            q = p + offsets[k]
+            if labels[p] >= 0 and links[k % 2, min(p, q)] > 0 and labels[q] < 0:
+                queue[last] = p
+                last += 1
+                break
+    while done < last:
+        p = queue[done]
+        done += 1
+        for k in range(4):
+            q = p + offsets[k]
+            if links[k % 2, min(p, q)] > 0 and labels[q] < 0:
+                labels[q] = labels[p]
+                queue[last] = q
+                last += 1
+
+
+@njit(cache=True, nogil=True)
+def _observe(labels: NDArray[np.int32], level: int, observed: _Observed) -> None:
+    """Give sites (h, w) of -1 the label nearest to their normal; in place."""
+    for a in range(labels.shape[0]):
+        for b in range(labels.shape[1]):
+            if labels[a, b] < 0:
+                labels[a, b] = _nearest(a, b, level, observed)
+
+
+@njit(cache=True, nogil=True)
+def _nearest(a: int, b: int, level: int, observed: _Observed) -> int:
+    """Label nearest to the mean normal of a site, -1 for none."""
+    normals, top = observed.normals, observed.top
+    x = y = z = np.float32(0)
+    for i in range(a << level, min((a + 1) << level, len(top))):
+        for j in range(b << level, min((b + 1) << level, top.shape[1])):
+            if top[i, j] >= level and normals[i, j, 0] == normals[i, j, 0]:
+                x += normals[i, j, 0]
+                y += normals[i, j, 1]
+                z += normals[i, j, 2]
+    cell = cell_of(x, y, z)
+    return observed.nearest[cell] if cell >= 0 else -1
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _cost(a: int, b: int, label: int, level: int, observed: _Observed) -> np.float32:
+    """Data cost of a label at a site: the sum over its pixels."""
+    normals, top, vector = observed.normals, observed.top, observed.vectors[label]
+    x, y, z = vector[0], vector[1], vector[2]
+    total = np.float32(0)
+    for i in range(a << level, min((a + 1) << level, len(top))):
+        for j in range(b << level, min((b + 1) << level, top.shape[1])):
+            if top[i, j] >= level:
+                normal = normals[i, j]
+                total += degrees(normal[0] * x + normal[1] * y + normal[2] * z)
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _sum_chosen(
+    first: int,
+    after: int,
+    labels: NDArray[np.int32],
+    level: int,
+    observed: _Observed,
+    data: NDArray[np.float32],
 ) -> None:
-    """Expand the labels of an image around their boundaries, in place."""
-    width, labels = image.shape[1], image.reshape(-1)
-    sites = np.ascontiguousarray(normals, np.float32).reshape(-1, 3)
-    vectors = directions.astype(np.float32)
-    links = link_costs(grid, smoothness)
-    labelling = GridLabelling.of(labels, chosen_angles(labels, sites, vectors), links, width)
-    near = fronts(labels, links, width, len(vectors), (0, len(image)))
-    _expand_each(sites, vectors, labelling, near)
+    """Data costs of the labels of some rows of sites."""
+    for a in range(first, after):
+        for b in range(labels.shape[1]):
+            data[a, b] = _cost(a, b, labels[a, b], level, observed)
+
+
+@njit(cache=True, nogil=True)
+def _link_sums(links: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Sum (n,) over the links of each site."""
+    total = links[0] + links[1]
+    total[1:] += links[0, :-1]
+    total[width:] += links[1, :-width]
+    return total
+
+
+def _expand_all(costs: NDArray[np.unsignedinteger], labelling: GridLabelling) -> None:
+    """Expand the best label of every site over all of a level, given all costs (h, w, K)."""
+    tried = np.unique(costs.argmin(axis=2))
+    _expand_each(
+        tried, np.ascontiguousarray(costs[..., tried].reshape(-1, len(tried)).T), labelling
+    )
 
 
 @njit(cache=True, nogil=True)
 def _expand_each(
-    normals: NDArray[np.float32],
-    vectors: NDArray[np.float32],
-    labelling: GridLabelling,
-    near: Sites,
+    tried: NDArray[np.intp], costs: NDArray[np.unsignedinteger], labelling: GridLabelling
 ) -> None:
-    """Expand each label once, to the pixels about its front; in place."""
-    start, beside = near
-    rows = 0, len(labelling.labels) // labelling.width
-    for alpha in range(len(vectors)):
-        front = beside[start[alpha] : start[alpha + 1]]
-        if len(front):
-            front = _onward(alpha, front, normals, vectors[alpha], labelling)
-            sites = band(alpha, front, _BAND_PIXELS, labelling, rows)
-            new = angles(sites, normals, vectors[alpha])
-            expand(alpha, sites, new, labelling, ROUNDING)
+    """Expand labels (t,) once, given what they cost (t, n); in place."""
+    labels, data, position = labelling.labels, labelling.data, labelling.position
+    bearable = _link_sums(labelling.links, labelling.width) / np.float32(_REGION)
+    sites, new = np.empty(len(labels), np.int32), np.empty(len(labels), np.float32)
+    for t in range(len(tried)):
+        count = 0
+        for p in range(len(labels)):
+            cost = UNIT * np.float32(costs[t, p])
+            if labels[p] != tried[t] and cost - data[p] < bearable[p]:
+                sites[count], new[count], position[p] = p, cost, count
+                count += 1
+        if count > 0:
+            expand(int(tried[t]), sites[:count], new[:count], labelling, ROUNDING)
 
 
 @njit(cache=True, nogil=True)
-def _onward(
-    alpha: int,
-    front: NDArray[np.int32],
-    normals: NDArray[np.float32],
-    direction: NDArray[np.float32],
-    labelling: GridLabelling,
-) -> NDArray[np.int32]:
-    """Sites of a front, and on from there those that gain much by the label.
+def _expand_near(
+    rows: tuple[int, int], level: int, observed: _Observed, labelling: GridLabelling
+) -> None:
+    """Expand every label in some rows, as far as it gains; in place.
 
-    `labelling.position` is -1 and becomes so again.
+    From the borders of its regions, and from the sites that it suits much better than theirs.
     """
-    labels, data = labelling.labels, labelling.data
-    links, position = labelling.links, labelling.position
-    offsets = np.array([1, labelling.width, -1, -labelling.width])
-    sites = np.empty(2 * len(front) + 64, np.int32)
-    count = 0
-    for p in front:
-        if labels[p] != alpha and position[p] < 0:
-            position[p] = count
-            sites[count] = p
-            count += 1
-    done = 0
-    while done < count:
-        p = sites[done]
-        done += 1
-        for k in range(4):
-            q = p + offsets[k]
-            if (
-                links[k % 2, min(p, q)] == 0
-                or labels[q] == alpha
-                or position[q] >= 0
-                or data[q] <= np.float32(_OUTLIER_DEGREES)
-            ):
-                continue
-            cost = degrees(
-                normals[q, 0] * direction[0]
-                + normals[q, 1] * direction[1]
-                + normals[q, 2] * direction[2]
-            )
-            if data[q] - cost > np.float32(_OUTLIER_DEGREES):
-                if count == len(sites):
-                    sites = np.concatenate((sites, np.empty_like(sites)))
-                position[q] = count
-                sites[count] = q
-                count += 1
-    for p in sites[:count]:
-        position[p] = -1
-    return sites[:count]
+    width, count = labelling.width, len(observed.vectors)
+    start, beside = fronts(labelling.labels, labelling.links, width, count, rows)
+    begin, suited = _suited(rows, level, observed, labelling)
+    for alpha in range(count):
+        borders = beside[start[alpha] : start[alpha + 1]]
+        front = np.concatenate((borders, suited[begin[alpha] : begin[alpha + 1]]))
+        while len(front) > 0:
+            sites = band(alpha, front, _REACH, labelling, rows)
+            new = np.empty(len(sites), np.float32)
+            for s in range(len(sites)):
+                new[s] = _cost(sites[s] // width, sites[s] % width, alpha, level, observed)
+            if not expand(alpha, sites, new, labelling, ROUNDING):
+                break
+            front = beyond(alpha, sites, labelling, rows)
+
+
+@njit(cache=True, nogil=True)
+def _suited(
+    rows: tuple[int, int], level: int, observed: _Observed, labelling: GridLabelling
+) -> Sites:
+    """Sites in some rows of which another label would save more than their share of a border.
+
+    Not of single pixels, whose normals are mostly noise.
+    """
+    width, data = labelling.width, labelling.data
+    first, after = rows[0] * width, rows[1] * width
+    sites, suits = np.empty(after - first, np.int32), np.empty(after - first, np.int32)
+    share = _link_sums(labelling.links, width) / np.float32(_REGION)
+    found = 0
+    for p in range(first, after):
+        if level > 0 and data[p] > share[p]:
+            label = _nearest(p // width, p % width, level, observed)
+            cost = _cost(p // width, p % width, label, level, observed)
+            if data[p] - cost > share[p]:
+                sites[found], suits[found] = p, label
+                found += 1
+    return group_sites(suits[:found], sites[:found], len(observed.vectors))

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.graphcut.elimination import best_choice
+from rangeseg_ros.core.graphcut.cut import minimum_cut
 from rangeseg_ros.core.graphcut.sites import GridLabelling
 
 
@@ -37,7 +37,7 @@ def expand(
         Whether that lowered the energy.
     """
     excess, neighbour, link = _problem(alpha, sites, new, labelling)
-    switch = best_choice(excess, neighbour, link)
+    switch = minimum_cut(excess, neighbour, link)
     count, value = len(sites), 0.0
     for s in range(count):
         if not switch[s]:
