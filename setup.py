@@ -137,7 +137,7 @@ setup(
         'open3d': ['open3d>=0.18'],
         'exr': ['OpenEXR>=3.3'],
         'dask': ['distributed>=2023.1'],
-        'view': ['rerun-sdk>=0.23'],
+        'view': [*bags, 'rerun-sdk>=0.23'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],
         'lint': ['import-linter>=2.1', 'mypy>=1.8', 'ruff>=0.4', 'types-PyYAML'],
         # The node where no ROS 2 is installed: rclpy over Fast DDS as wheels. A sourced ROS 2 has

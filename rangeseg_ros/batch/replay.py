@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
@@ -62,6 +63,8 @@ class Outcome:
         Number of frames whose planes say that up is elsewhere.
     tilt : str
         What is said of the one that is tilted most.
+    doubts : dict
+        What is doubtful about images -> number of these frames.
     """
 
     frames: int
@@ -73,6 +76,7 @@ class Outcome:
     unlocated: dict[str, int] = field(default_factory=dict)
     tilted: int = 0
     tilt: str = ''
+    doubts: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -152,6 +156,7 @@ class Replay:
             ground: list[list[str]] = []
             stairs: list[list[str]] = []
             tilts: list[Tilt] = []
+            doubts: Counter[str] = Counter()
 
             def results() -> Iterator[Timed]:
                 found = segment_frames(source, sequence, located.place, progress)
@@ -161,6 +166,7 @@ class Replay:
                     files = write_frame(self.folder, stem, image, result, kinds)
                     table.write(result.planes, index, stamp)
                     report.add(frame.stamp, result, files['overlay'])
+                    doubts.update(result.verdict.details)
                     if result.tilt:
                         tilts.append(result.tilt)
                     if self.terrain:
@@ -201,6 +207,7 @@ class Replay:
                 unlocated=dict(located.problems),
                 tilted=len(tilts),
                 tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
+                doubts=dict(doubts),
             )
             report.write(self.folder / 'report.html', outcome.damage, planes)
             kept = {

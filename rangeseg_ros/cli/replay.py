@@ -174,6 +174,8 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():
         click.echo(f'{count} frames without the {problem}')
+    for doubt, count in outcome.doubts.items():
+        click.echo(f'rangeseg: {count} frames: {doubt}', err=True)
     if outcome.tilted:
         click.echo(f'rangeseg: {outcome.tilted} frames: {outcome.tilt}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''

@@ -60,7 +60,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 def resolved(path: Path) -> Path:
     """What a path leads to; OSError where its links lead in a circle."""
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError, NotADirectoryError):
         path.stat()
     return path.resolve()
 

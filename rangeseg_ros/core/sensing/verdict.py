@@ -87,8 +87,7 @@ def judge(
         )
     elif (share := filled_share(image)) > 0.01:
         found[f'filled {share:.0%}'.replace('%', ' %')] = (
-            f'At least {share:.1%} of the depth are copies of the pixels beside holes: switch '
-            'hole filling off.'
+            'Pixels beside edges copy their neighbours: holes were filled; switch that off.'
         )
     if shows_range(image, labels, planes):
         found['range instead of z'] = (
