@@ -263,3 +263,17 @@ def test_terrain_of_every_frame_is_that_of_the_messages(done):
     # Without terrain, none of it stays behind.
     replay(done / 'recording', folder)
     assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
+
+
+def test_doubtful_images_are_counted(tmp_path):
+    recording = Recording()
+    rng = np.random.default_rng(0)
+    for index, image in enumerate(walls(2)):
+        stamp = 10**18 + index * 33_333_333
+        noisy = image + rng.integers(0, 5, image.shape, np.uint16)
+        recording.add_camera(stamp)
+        recording.add_image(stamp, noisy[::2, ::2].repeat(2, axis=0).repeat(2, axis=1))
+    recording.write(tmp_path / 'enlarged')
+    outcome = replay(tmp_path / 'enlarged', tmp_path / 'out')
+    ((doubt, count),) = outcome.doubts.items()
+    assert 'fills 2 x 2 pixels' in doubt and count == 2
