@@ -65,6 +65,8 @@ class Outcome:
         What is said of the one that is tilted most.
     doubts : dict
         What is doubtful about images -> number of these frames.
+    contradicted : list of str
+        What the planes say against the poses.
     """
 
     frames: int
@@ -77,6 +79,7 @@ class Outcome:
     tilted: int = 0
     tilt: str = ''
     doubts: dict[str, int] = field(default_factory=dict)
+    contradicted: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -208,8 +211,9 @@ class Replay:
                 tilted=len(tilts),
                 tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
                 doubts=dict(doubts),
+                contradicted=sequence.map.doubts if self.config.map_frame else [],
             )
-            report.write(self.folder / 'report.html', outcome.damage, planes)
+            report.write(self.folder / 'report.html', outcome.damage, planes, outcome.contradicted)
             kept = {
                 name: value for name, value in asdict(outcome).items() if name != 'already_done'
             }

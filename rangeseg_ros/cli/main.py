@@ -21,6 +21,7 @@ COMMANDS = {
     'pack': 'Pack depth images into a rosbag2.',
     'mount': 'Find how a camera is mounted above the floor.',
     'replay': 'Segment the depth images of recordings.',
+    'plan': 'Make floor plans and maps of recordings.',
     'simulate': 'Simulate range images with ground truth.',
     'calibrate': "Learn a sensor's distortion from the planes it sees.",
     'evaluate': 'Segment images and compare the results with their truth.',

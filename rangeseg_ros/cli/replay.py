@@ -102,7 +102,7 @@ def command(
     config = options.read_parameters(params_file, exact)
     if fixed_frame is not None:
         config = replace(config, fixed_frame=fixed_frame)
-    folders = _folders(bags, output)
+    folders = result_folders(bags, output)
     if scheduler:
         check_scheduler(scheduler)
         if find_spec('distributed') is None:
@@ -133,7 +133,7 @@ def command(
         ctx.exit(max(codes))
 
 
-def _folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
+def result_folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
     """Where the results of each recording go."""
     if len(bags) == 1:
         return [output]
@@ -178,6 +178,8 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
         click.echo(f'rangeseg: {count} frames: {doubt}', err=True)
     if outcome.tilted:
         click.echo(f'rangeseg: {outcome.tilted} frames: {outcome.tilt}', err=True)
+    for doubt in outcome.contradicted:
+        click.echo(f'rangeseg: poses: {doubt}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
     already = ', done before' if outcome.already_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')

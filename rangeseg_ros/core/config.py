@@ -309,6 +309,12 @@ class Config:
         low=0.001,
         high=10.0,
     )
+    map_area: float = option(
+        0.05,
+        'smallest area of a plane that the map tells, square metres; 0 for clutter as well',
+        low=0.0,
+        high=1000.0,
+    )
     map_planes: int = option(
         1000,
         'planes that the map keeps at most: those out of sight the longest are forgotten',

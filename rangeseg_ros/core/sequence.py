@@ -129,16 +129,13 @@ class SequenceSegmenter:
         planes = self._tracker.track(result.labels, planes, stamp, motion)
         up = result.up if up is None else unit(up)
         planes = with_roles(planes, self.config, up)
-        if self._tracker.contradicted:
-            # The fixed frame has jumped: the map would have everything twice.
-            self.map.clear('the fixed frame has jumped')
         if self.config.odometry:
             self._follow(result.labels, planes, stamp, up, image)
             if not self.config.fixed_frame and self.motion:
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:
-            self.map.add(result.labels, planes, image, pose, stamp)
+            self.map.add(result.labels, planes, image, pose, stamp, self._tracker.jump)
         survey = result.survey
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=up)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,8 @@ from rangeseg_ros.messages.transforms import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'
 TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
+# Messages at the beginning that tell which frames there are.
+_LOOKED_AT = 10_000
 
 
 class RecordedTransforms:
@@ -73,3 +77,27 @@ class RecordedTransforms:
             for name, time, message in self._recording.messages([topic]):
                 if not isinstance(message, Lost):
                     yield name, time, message
+
+
+def fixed_frame_of(path: Path) -> str:
+    """Frame in which the tf of a recording moves: above all others, and not only statically.
+
+    Of several `map` counts before `odom` and `world`; empty where nothing moves.
+    """
+    parents: dict[str, str] = {}
+    moving: set[str] = set()
+    with closing(open_recording(path)) as recording:
+        topics = [t for t in (MOVING, STATIC) if recording.types.get(t) in TYPES]
+        for topic, _, message in islice(recording.messages(topics) if topics else (), _LOOKED_AT):
+            for one in getattr(message, 'transforms', ()):
+                child = one.child_frame_id.removeprefix('/')
+                parents[child] = one.header.frame_id.removeprefix('/')
+                moving |= {child} if topic == MOVING else set()
+    found = set()
+    for frame in moving:
+        above = [frame]
+        while above[-1] in parents and parents[above[-1]] not in above:
+            above.append(parents[above[-1]])
+        found.add(above[-1])
+    named = [name for name in ('map', 'odom', 'world') if name in found]
+    return (named or sorted(found) or [''])[0]

@@ -84,7 +84,13 @@ class ReplayReport:
             'ids': len(np.unique(sightings['id'])),
         }
 
-    def write(self, path: Path, damage: str = '', planes: Sequence[MapPlane] = ()) -> None:
+    def write(
+        self,
+        path: Path,
+        damage: str = '',
+        planes: Sequence[MapPlane] = (),
+        doubts: Sequence[str] = (),
+    ) -> None:
         """Write the page.
 
         Parameters
@@ -94,6 +100,8 @@ class ReplayReport:
             What of the recording could not be read.
         planes : sequence of MapPlane
             The map.
+        doubts : sequence of str
+            What the planes say against the poses.
         """
         sightings = np.concatenate(self._sightings)
         times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
@@ -103,6 +111,7 @@ class ReplayReport:
             'replay.html',
             name=self.name,
             damage=damage,
+            doubts=doubts,
             frames=self.frames,
             sensor=str(SensorModel(*np.median(self._sensors, axis=0).tolist()))
             if self._sensors

@@ -90,6 +90,7 @@ class Pipeline:
         self._segmenter = Segmenter()
         # Of the frame that was done last.
         self._sequence: SequenceSegmenter | None = None
+        self._jumps = 0
         self._ended = 0.0
         self._size = 0
         self._threads = [
@@ -227,6 +228,11 @@ class Pipeline:
             count = len(sequence.map)
             anew = f', begun anew: {why}' if (why := sequence.map.begun_anew) else ''
             statistics.sources['map'] = f'{count} planes in {config.map_frame}{anew}'
+            if doubts := sequence.map.doubts:
+                statistics.sources['poses'] = doubts[-1]
+            if len(sequence.map.jumps) > self._jumps:
+                self._node.get_logger().warning(str(sequence.map.jumps[-1][1]))
+            self._jumps = len(sequence.map.jumps)
         if sequence.motion:
             statistics.sources['odometry'] = f'{sequence.motion.held} planes'
         if statistics.missing:

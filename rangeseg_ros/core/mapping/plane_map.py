@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.drift import DriftEstimate
 from rangeseg_ros.core.mapping.evidence import see
 from rangeseg_ros.core.mapping.map_outlines import (
     polygon_of,
@@ -32,7 +33,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import chi2_quantile
-from rangeseg_ros.core.tracking.tracker import NOMINAL
+from rangeseg_ros.core.tracking.tracker import NOMINAL, Jump
 from rangeseg_ros.core.tracking.tracks import FARTHEST, SURE_TURN
 
 # Chi-squared with the three degrees of freedom of a plane.
@@ -40,6 +41,8 @@ _GATE = chi2_quantile(3)
 # Share of the planes in sight whose outlines a frame adds to: at 30 Hz each has its turn four
 # times a second, and the work in a frame is bounded.
 _LOOKED_AT = 1 / 8
+# Jumps of the poses that are told one by one.
+_TOLD = 10
 
 
 class PlaneMap:
@@ -49,6 +52,14 @@ class PlaneMap:
     ----------
     begun_anew : str
         Why the map was begun anew; empty when it was not.
+    epoch : int
+        How often it was begun, the first time included.
+    planes_before : list of MapPlane
+        What was known when it was begun anew.
+    jumps : list of (int, Jump)
+        Stamps of frames whose poses the planes contradict, and by how much.
+    drift : DriftEstimate
+        Of the poses, since the map was begun.
 
     Examples
     --------
@@ -60,18 +71,22 @@ class PlaneMap:
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
         self._next = 1
-        self.begun_anew = ''
+        self.epoch = 0
+        self.jumps: list[tuple[int, Jump]] = []
         self.clear()
 
     def clear(self, why: str = '') -> None:
         """Begin anew; ids are not given twice."""
         self.begun_anew = why
+        self.planes_before = self.planes if self.epoch else []
+        self.epoch += 1
+        self.drift = DriftEstimate(self.config.pose_noise)
         self._records: list[Record] = []
         self._filters: PlaneFilters | None = None
         self._stamp = self._time = 0
 
     def __len__(self) -> int:
-        return sum(record.confirmed for record in self._records)
+        return sum(map(self._told, self._records))
 
     def add(
         self,
@@ -80,6 +95,7 @@ class PlaneMap:
         image: RangeImage,
         pose: Transform,
         stamp: int,
+        jump: Jump | None = None,
     ) -> None:
         """Take in a frame.
 
@@ -94,26 +110,48 @@ class PlaneMap:
             Fixed frame from the frame of the image.
         stamp : int
             Nanoseconds.
+        jump : Jump, optional
+            Of the pose, by the tracker. It is noted; the map begins anew where planes are farther
+            off now than the same plane may be.
         """
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
         self._stamp = stamp
+        self.drift.move(pose.shift)
         if planes:
             view = views(labels, planes, config.distortion_length)
             if self._filters is not None:
                 self._filters.follow_views(view.shape[1])
             seen = observations(planes, view, pose, noise)
             match, step = self._associate(planes, seen)
+            if jump:
+                self.jumps.append((stamp, jump))
+                # Beyond what may be one plane everything would be twice in the map.
+                if jump.shift > FARTHEST * seen.range.min() or jump.turn > SURE_TURN:
+                    now = self._stamp, self._time
+                    self.clear('the fixed frame has jumped')
+                    self._stamp, self._time = now
+                    match, step = np.full(len(planes), -1), None
             if step:
-                self._update(planes, seen, step)
+                self._update(planes, seen, step, pose.shift)
+            for k in match[match >= 0].tolist():
+                self._records[k].way += self.drift.way
             self._fuse(planes, seen, match, pose, stamp)
             self._merge(pose.shift)
         self._contradict(image, pose, noise)
 
     @property
+    def doubts(self) -> list[str]:
+        """What is to be said of the poses: jumps by the stamps of their frames, and drift."""
+        found = [f'{stamp * 1e-9:.3f} s: {jump}' for stamp, jump in self.jumps[:_TOLD]]
+        if (more := len(self.jumps) - _TOLD) > 0:
+            found.append(f'{more} more frames whose poses the planes contradict')
+        return found + ([str(self.drift)] if self.drift.significant else [])
+
+    @property
     def planes(self) -> list[MapPlane]:
-        """The planes that were seen often enough, in the order of their ids."""
+        """The planes that were seen often enough and are no clutter, in the order of their ids."""
         if self._filters is None:
             return []
         filters = self._filters
@@ -121,9 +159,13 @@ class PlaneMap:
         found = [
             describe(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
             for k, record in enumerate(self._records)
-            if record.confirmed and not record.outline.is_empty
+            if self._told(record)
         ]
         return sorted(found, key=lambda plane: plane.id)
+
+    def _told(self, record: Record) -> bool:
+        """Whether there is enough of a plane to tell it: no clutter."""
+        return record.confirmed and record.outline.area > self.config.map_area
 
     def _associate(
         self, planes: Sequence[Plane], seen: Observations
@@ -167,13 +209,24 @@ class PlaneMap:
                 taken.append(n)
         return match, step.where(fits[taken]) if taken else None
 
-    def _update(self, planes: Sequence[Plane], seen: Observations, step: Step) -> None:
+    def _update(
+        self,
+        planes: Sequence[Plane],
+        seen: Observations,
+        step: Step,
+        place: NDArray[np.float64],
+    ) -> None:
         """Take in planes that are known: of parts of one plane, the largest decides on it."""
         assert self._filters is not None
         count = np.array([planes[m].count for m in step.observation.tolist()])
         order = np.lexsort([step.observation, -count, step.plane])
         largest = order[np.unique(step.plane[order], return_index=True)[1]]
-        self._filters.update(step.where(largest), seen)
+        step = step.where(largest)
+        records = [self._records[k] for k in step.plane.tolist()]
+        since = np.array([record.way / record.observations for record in records])
+        noise = np.radians(self.config.pose_turn_noise)
+        self.drift.add(self._filters, step, since, place, noise)
+        self._filters.update(step, seen)
 
     def _fuse(
         self,
@@ -192,7 +245,7 @@ class PlaneMap:
             first = PlaneFilters.of(Observations(*(part[new] for part in seen)))
             self._filters = self._filters.joined(first) if self._filters else first
             for _ in new:
-                self._records.append(Record(self._next, stamp, stamp))
+                self._records.append(Record(self._next, stamp, stamp, way=self.drift.way))
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp, self._time)

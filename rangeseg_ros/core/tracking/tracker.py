@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.rotations import cross_products
+from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.tracks import (
     SURE_TURN,
     Tracks,
@@ -45,6 +47,32 @@ _TRIAL, _ON_TRIAL = 0.32, _UNSEEN_OVERLAP / 2
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
 # The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
+# Chi-squared with the six degrees of freedom of a motion.
+_JUMP = chi2_quantile(6)
+
+
+class Jump(NamedTuple):
+    """What a motion that was told differs by from that of the planes: metres and radians."""
+
+    shift: float
+    turn: float
+
+    @classmethod
+    def between(
+        cls,
+        told: tuple[NDArray[np.float64], NDArray[np.float64]],
+        own: tuple[NDArray[np.float64], NDArray[np.float64]],
+    ) -> Jump:
+        """Of two motions, rotation (3, 3) and shift (3,)."""
+        turn = told[0] @ own[0].T
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+        return cls(float(np.linalg.norm(told[1] - turn @ own[1])), float(angle))
+
+    def __str__(self) -> str:
+        return (
+            f'the planes contradict the pose by {1e3 * self.shift:.0f} mm and '
+            f'{np.degrees(self.turn):.1f} degrees'
+        )
 
 
 class Tracker:
@@ -70,8 +98,9 @@ class Tracker:
 
     Attributes
     ----------
-    contradicted : bool
-        Whether the motion that was told of the last frame is not that of the planes.
+    jump : Jump or None
+        How far the motion that was told of the last frame is from that of the planes, where they
+        contradict it.
 
     Examples
     --------
@@ -81,7 +110,7 @@ class Tracker:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self.contradicted = False
+        self.jump: Jump | None = None
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
@@ -118,7 +147,7 @@ class Tracker:
         list of Plane
             In the order given, `id` and `surface` set.
         """
-        self.contradicted = False
+        self.jump = None
         if labels.shape != self._shape:
             self.reset()
         elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
@@ -127,17 +156,15 @@ class Tracker:
         seen, known = Tracks.of(planes, samples, elapsed), self._tracks
         shared = shared_samples(known, samples, len(planes))
         speed = np.array([np.radians(self.config.camera_turn), self.config.camera_speed])
-        if motion:
-            # Where the frames that tell the motion jump, the planes know better: most of those
-            # that stay where they were without it.
-            moved = known.moved(*motion)
-            sure = [
-                int(_sure_pairs(tracks, seen, shared, speed).sum()) for tracks in (moved, known)
-            ]
-            self.contradicted = 2 * sure[0] < sure[1]
-            if not self.contradicted:
-                known = moved
         reach = min(max(elapsed, NOMINAL), PERSISTENCE)
+        if motion:
+            # Where the frames that tell the motion jump, the planes know better.
+            noise = np.radians(self.config.pose_turn_noise), self.config.pose_noise
+            own = _camera_motion(known, seen, shared, speed, reach)
+            if _contradiction(known, seen, shared, speed, motion, own, noise) > _JUMP:
+                self.jump = Jump.between(motion, own)
+            else:
+                known = known.moved(*motion)
         known = known.moved(*_camera_motion(known, seen, shared, speed, reach))
         distance = distances(known, seen)
         match = _assign(known, seen, shared, distance)
@@ -229,6 +256,36 @@ def _camera_motion(
         twist = cv2.Rodrigues(step[:3])[0]
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
     return rotation, shift
+
+
+def _contradiction(
+    known: Tracks,
+    seen: Tracks,
+    shared: NDArray[np.intp],
+    speed: NDArray[np.float64],
+    told: tuple[NDArray[np.float64], NDArray[np.float64]],
+    own: tuple[NDArray[np.float64], NDArray[np.float64]],
+    noise: tuple[float, float],
+) -> float:
+    """How much better, in chi-squared, the planes are explained by another motion than told.
+
+    That of the plane for which it is most does not count: it may be one that moves by itself.
+    `noise` is that of the poses that tell the motion, radians and metres.
+    """
+    t, s = np.nonzero(_sure_pairs(known, seen, shared, speed))
+    if not len(t):
+        return 0.0
+    angle, offset = (variance[t, s] for variance in variances(known, seen))
+    lever = np.einsum('ni,ni->n', seen.centroid[s], seen.centroid[s])
+    gains = np.zeros(len(t))
+    for sign, (rotation, shift), (turn, place) in ((1, told, noise), (-1, own, (0.0, 0.0))):
+        n, c = known.normal[t] @ rotation.T, seen.centroid[s]
+        gap = np.einsum('ni,ni->n', n, c - shift) + known.distance[t]
+        across = cross_products(n, seen.normal[s])
+        square = np.einsum('ni,ni->n', across, across) / (angle + 2 * turn**2)
+        square += gap**2 / (offset + 2 * place**2 + 2 * turn**2 * lever)
+        gains += sign * square
+    return float(gains.sum() - gains.max())
 
 
 def _sure_pairs(

@@ -1,0 +1,246 @@
+"""From a recording to a plan: every file is opened by what its users would open it with."""
+
+import json
+import xml.etree.ElementTree as ET
+
+import cv2
+import ezdxf
+import numpy as np
+import pytest
+import shapely
+import trimesh
+import yaml
+from click.testing import CliRunner
+from recordings import Recording
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.cli.main import rangeseg
+from rangeseg_ros.core.description.shapes import Shape
+from rangeseg_ros.core.mapping.floor_plan import estimate_up
+from rangeseg_ros.core.mapping.map_outlines import MapOutline
+from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.right_angles import square_up
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
+from rangeseg_ros.simulation.solids import box, cast, half_space
+
+LEFT, AHEAD, FRAMES = 1.2, 3.0, 12
+CAMERA = Camera(160, 120, 110.0, 110.0, 79.5, 59.5)
+DOOR = (-1.3, -0.4)
+TILT = Rotation.from_euler('xyz', [100, 15, 40], degrees=True)
+
+
+def room():
+    """A floor, a wall ahead with a door in it, a wall on the left, and a box on the floor."""
+    middle = AHEAD + 0.1
+    return [
+        half_space((0, 0, 1), (0, 0, 0)),
+        half_space((0, -1, 0), (0, LEFT, 0)),
+        box((0.2, 1.6, 2.5), np.eye(3), (middle, 0.4, 1.25)),
+        box((0.2, 3.0, 2.5), np.eye(3), (middle, -2.8, 1.25)),
+        box((0.3, 0.3, 0.4), np.eye(3), (2.0, 0.5, 0.2)),
+    ]
+
+
+def record(path, tilt):
+    """A robot that turns before the door, with the tf of a frame turned by `tilt`."""
+    recording, random = Recording(), np.random.default_rng(3)
+    matrix = np.array([CAMERA.fx, 0, CAMERA.cx, 0, CAMERA.fy, CAMERA.cy, 0, 0, 1])
+    for k in range(FRAMES):
+        stamp = 10**18 + k * 100_000_000
+        body = Rotation.from_euler('zy', [30 - 70 * k / (FRAMES - 1), 15], degrees=True)
+        turn = body * Rotation.from_matrix(OPTICAL_IN_BODY)
+        place = np.array([0.02 * k, 0.0, 1.1])
+        rays = CAMERA.rays.reshape(-1, 3).astype(float)
+        depth, _ = cast(room(), place, rays @ turn.as_matrix().T)
+        depth = depth.reshape(CAMERA.shape)
+        inverse = 1 / depth + random.normal(0, 5e-4, depth.shape)
+        depth = np.where(inverse > 1 / 6, 1 / np.maximum(inverse, 1 / 6), 0)
+        camera = {'k': matrix, 'p': np.insert(matrix, (3, 6, 9), 0.0)}
+        recording.add_camera(stamp, CAMERA.width, CAMERA.height, **camera)
+        recording.add_image(stamp, np.round(1000 * depth).astype(np.uint16))
+        told, at = tilt * turn, tilt.apply(place)
+        for after in (-20_000_000, 20_000_000):
+            recording.add_transform(stamp + after, 'odom', 'optical', told.as_quat(), at)
+    recording.messages.sort(key=lambda message: message[0])
+    recording.write(path)
+
+
+def run(*words):
+    return CliRunner().invoke(rangeseg, list(map(str, words)))
+
+
+@pytest.fixture(scope='module')
+def folders(tmp_path_factory):
+    """Plans with up told, and in a frame in which nobody says where up is."""
+    root = tmp_path_factory.mktemp('plan')
+    (root / 'level.yaml').write_text('min_pixels: 150\ngravity_frame: odom\n')
+    (root / 'tilted.yaml').write_text('min_pixels: 150\n')
+    for name, tilt in (('level', Rotation.identity()), ('tilted', TILT)):
+        record(root / f'{name}_bag', tilt)
+        words = '--params', root / f'{name}.yaml', '--output', root / name
+        result = run('plan', root / f'{name}_bag', *words)
+        assert result.exit_code == 0, result.output
+    return root
+
+
+def of_role(folder, role):
+    collection = json.loads((folder / 'plan.geojson').read_text())
+    return [f for f in collection['features'] if f['properties']['role'] == role]
+
+
+@pytest.mark.parametrize('name', ['level', 'tilted'])
+def test_the_plan_is_that_of_the_room(folders, name):
+    folder = folders / name
+    (floor,) = of_role(folder, 'floor')
+    assert shapely.from_geojson(json.dumps(floor['geometry'])).is_valid
+    height = floor['properties']['distance']
+    assert floor['properties']['exact'] == 'level'
+    if name == 'level':
+        assert height == pytest.approx(0, abs=0.01)
+    walls = of_role(folder, 'wall')
+    assert len(walls) >= 2 and all(wall['properties']['exact'] == 'square' for wall in walls)
+    lines = [shapely.from_geojson(json.dumps(wall['geometry'])) for wall in walls]
+    ahead = max(lines, key=lambda line: len(shapely.get_parts(line)))
+    (opening,) = of_role(folder, 'opening')
+    assert opening['properties']['width'] == pytest.approx(DOOR[1] - DOOR[0], abs=0.1)
+    gap = shapely.from_geojson(json.dumps(opening['geometry']))
+    assert gap.distance(ahead) < 0.01
+    if name == 'level':
+        (x1, y1), (x2, y2) = opening['geometry']['coordinates']
+        assert [x1, x2] == pytest.approx([AHEAD, AHEAD], abs=0.02)
+        assert sorted([y1, y2]) == pytest.approx(DOOR, abs=0.06)
+
+
+def test_up_that_nobody_states_is_found(folders):
+    collection = json.loads((folders / 'tilted' / 'plan.geojson').read_text())
+    found, truth = np.array(collection['up']['direction']), TILT.apply([0, 0, 1])
+    assert np.degrees(np.arccos(found @ truth)) < 0.5
+    matrix = np.array(collection['plan_from_frame'])
+    assert np.allclose(matrix[:3, :3] @ found, [0, 0, 1], atol=1e-5)
+
+
+def test_nav2_reads_the_map(folders):
+    folder = folders / 'level'
+    about = yaml.safe_load((folder / 'map.yaml').read_text())
+    shades = cv2.imread(str(folder / about['image']), cv2.IMREAD_UNCHANGED)
+    # As map_server does it.
+    share = (255 - shades[::-1].astype(float)) / 255
+    occupied, free = share > about['occupied_thresh'], share < about['free_thresh']
+    assert set(np.unique(shades)) == {0, 205, 254}
+
+    def at(x, y):
+        column, row = ((np.array([x, y]) - about['origin'][:2]) / about['resolution']).astype(int)
+        return 'occupied' if occupied[row, column] else 'free' if free[row, column] else 'unknown'
+
+    assert at(AHEAD, 0.1) == at(AHEAD, -1.8) == at(2.0, 0.5) == 'occupied'
+    assert at(2.0, -0.8) == at(AHEAD, -0.85) == at(AHEAD + 0.4, -0.9) == 'free'
+    assert at(AHEAD + 1, 0.3) == 'unknown'
+
+
+def test_other_programs_open_the_files(folders):
+    folder = folders / 'level'
+    document = ezdxf.readfile(folder / 'plan.dxf')
+    assert not document.audit().errors and document.units == ezdxf.units.M
+    layers = {entity.dxf.layer for entity in document.modelspace()}
+    assert {'WALLS', 'OPENINGS', 'FLOOR', 'PLANES'} <= layers
+    walls = document.modelspace().query('LINE[layer=="WALLS"]')
+    assert any(abs(w.dxf.start.x - AHEAD) < 0.02 > abs(w.dxf.end.x - AHEAD) for w in walls)
+    features = json.loads((folder / 'plan.geojson').read_text())['features']
+    planes = [f['properties'] for f in features if 'parts' in f['properties']]
+    parts = sum(len(part) for plane in planes for part in plane['parts'])
+    assert len(document.modelspace().query('POLYLINE[layer=="PLANES"]')) == parts
+    area = sum(plane['area'] for plane in planes)
+    for name in ('map.ply', 'map.glb'):
+        scene = trimesh.load_scene(folder / name)
+        assert scene.area == pytest.approx(area, rel=0.02)
+        low, high = scene.bounds
+        assert (high - low)[1 if name == 'map.glb' else 2] < 3
+    picture = ET.parse(folder / 'plan.svg').getroot()
+    titles = [e.text for e in picture.iter('{http://www.w3.org/2000/svg}title')]
+    assert sum('standard deviation' in title for title in titles) >= len(walls)
+    page = (folder / 'plan.html').read_text()
+    assert 'src="http' not in page and '<svg' in page and 'square' in page
+
+
+def test_files_of_others_are_kept_and_what_lacks_is_said(folders, tmp_path):
+    result = run('plan', folders / 'level_bag', '--output', folders / 'level')
+    assert result.exit_code and 'plan.svg' in str(result.exception) + result.output
+    (tmp_path / 'p.yaml').write_text('min_pixels: 150\n')
+    words = '--fixed-frame', 'nowhere', '--params', tmp_path / 'p.yaml'
+    result = run('plan', folders / 'level_bag', '--output', tmp_path / 'out', *words)
+    assert 'nowhere' in str(result.exception) and not (tmp_path / 'out').exists()
+
+
+def plane(number, normal, at, sigma, size=2.0):
+    """A square of a plane around a point, whose direction is known to `sigma` radians."""
+    normal = np.array(normal, float) / np.linalg.norm(normal)
+    along = np.cross(normal, np.eye(3)[np.argmin(abs(normal))])
+    along /= np.linalg.norm(along)
+    axes = np.stack([along, np.cross(normal, along)])
+    corners = at + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ axes
+    jacobian = np.zeros((4, 3))
+    jacobian[:3, :2], jacobian[3, :2], jacobian[3, 2] = axes.T, -axes @ at, 1
+    covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T
+    shape = Shape(size**2, np.array([size, size]), np.array(at), np.array([0, 0, 0, 1.0]))
+    return MapPlane(
+        label=number,
+        id=number,
+        surface=number,
+        normal=normal,
+        distance=float(-normal @ at),
+        covariance=covariance,
+        centroid=np.array(at, float),
+        count=1000,
+        rms=0.002,
+        confidence=1.0,
+        shape=shape,
+        outline=MapOutline([[corners]]),
+        observations=9,
+        age=1.0,
+        first_stamp=0,
+        last_stamp=10**9,
+    )
+
+
+def turned(degrees):
+    return np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.002
+
+
+def test_right_angles_are_exact_only_where_the_covariance_allows_it():
+    one = np.radians(0.3)
+    walls = [
+        plane(1, turned(20.1), (3, 1, 1), one, 3.0),
+        plane(2, turned(109.7), (0, 3, 1), one),
+        plane(3, turned(25.0), (-2, 0, 1), one),
+        plane(4, turned(24.0), (-3, 0, 1), 10 * one),
+    ]
+    squared = square_up(walls, np.radians(10))
+    assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
+    assert abs(squared[0].plane.normal @ squared[1].plane.normal) < 1e-12
+    assert abs(np.cross(squared[0].plane.normal, squared[3].plane.normal)).max() < 1e-12
+    for before, after in zip(walls, squared, strict=True):
+        # It turns about where it is known best, and the outline lies on it.
+        assert after.plane.normal @ before.centroid + after.plane.distance == pytest.approx(
+            0, abs=1e-3
+        )
+        corners = after.plane.outline.hull
+        assert np.allclose(corners @ after.plane.normal + after.plane.distance, 0, atol=1e-9)
+
+
+def test_up_is_known_as_well_as_its_deviation_says():
+    random, gaps = np.random.default_rng(5), []
+    sigma = np.radians(0.5)
+    for _ in range(60):
+        turn = Rotation.random(random_state=random.integers(10**6))
+        planes = []
+        for k, normal in enumerate([(0, 0, 1), (1, 0, 0), (0, 1, 0), (-1, 0, 0)], 1):
+            axis = np.cross(normal, random.normal(size=3))
+            axis *= random.normal(0, sigma) * np.sqrt(2) / np.linalg.norm(axis)
+            off = Rotation.from_rotvec(axis).apply(normal)
+            planes.append(plane(k, turn.apply(off), turn.apply([0.5, k, 1]), sigma))
+        looked = turn.apply([0.3, 0.2, 1])
+        up = estimate_up(planes, looked, np.radians(10))
+        gaps.append(np.arccos(np.clip(up.direction @ turn.apply([0, 0, 1]), -1, 1)) / up.deviation)
+    # Of two directions.
+    assert 0.3 < np.mean(np.square(gaps)) / 2 < 2
