@@ -99,5 +99,5 @@ def fixed_frame_of(path: Path) -> str:
         while above[-1] in parents and parents[above[-1]] not in above:
             above.append(parents[above[-1]])
         found.add(above[-1])
-    named = [name for name in ('map', 'odom', 'world') if name in found]
-    return (named or sorted(found) or [''])[0]
+    order = ['map', 'odom', 'world', *sorted(found)]
+    return next((name for name in order if name in found), '')

@@ -126,7 +126,7 @@ class DriftEstimate:
             return f'the poses drift by an unknown amount: {self.way:.1f} m are too short a way'
         drift, covariance = found
         size = float(np.linalg.norm(drift))
-        deviation = np.sqrt(max(drift @ covariance @ drift, 0)) / max(size, 1e-12)
+        deviation = np.sqrt(max(float(drift @ covariance @ drift), 0.0)) / max(size, 1e-12)
         return (
             f'the poses drift by {100 * size:.1f} +- {100 * deviation:.1f} % of the way '
             f'({self.way:.1f} m)'
