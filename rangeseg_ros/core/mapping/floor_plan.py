@@ -204,10 +204,9 @@ def make_plan(
         if abs(s.plane.normal[2]) < np.sin(tolerance)
         and (wall := _wall(k, s.plane, reach, resolution)) is not None
     ]
+    grid = _drawn(grid, squared, walls)
     openings = [o for wall in walls for o in _openings(wall, grid)]
-    return FloorPlan(
-        frame, motion, up, ground, squared, walls, openings, _drawn(grid, squared, walls)
-    )
+    return FloorPlan(frame, motion, up, ground, squared, walls, openings, grid)
 
 
 def _plane(plane: object) -> MapPlane:

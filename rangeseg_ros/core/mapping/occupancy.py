@@ -19,8 +19,9 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, syste
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, as in nav_msgs/OccupancyGrid."""
 
-# Every so many rows and columns of an image count, and voxels are united after so many points.
-_STEP, _PENDING = 4, 2**20
+# So many rows or columns of an image count, whichever are fewer, and voxels are united after so many
+# points.
+_SAMPLES, _PENDING = 120, 2**20
 _BITS = 21
 
 
@@ -71,7 +72,8 @@ class VoxelCounts:
 
     def add(self, image: RangeImage, pose: Transform) -> None:
         """Count the points of an image taken at `pose`."""
-        sample = np.s_[::_STEP, ::_STEP]
+        step = max(min(image.shape) // _SAMPLES, 1)
+        sample = np.s_[::step, ::step]
         inverse = image.inverse[sample].astype(np.float64)
         squared = np.where(inverse > 0, inverse, 1) ** 2
         variance = random_variance(self._sensor, squared)
