@@ -19,7 +19,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, syste
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 """Values of cells, as in nav_msgs/OccupancyGrid."""
 
-# So many rows or columns of an image count, whichever are fewer, and voxels are united after so many
+# So many rows or columns of an image count, whichever are fewer; voxels are united after so many
 # points.
 _SAMPLES, _PENDING = 120, 2**20
 _BITS = 21
