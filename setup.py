@@ -63,7 +63,7 @@ with suppress(ImportError):
 
 
 # What only some commands and functions need; rangeseg_ros/extras.py names them where missing.
-bags = ['lz4', 'rosbags>=0.11', 'zstandard>=0.15']
+bags = ['lz4', 'rosbags>=0.11,<0.12', 'zstandard>=0.15']
 report = ['jinja2>=3.0', 'matplotlib>=3.6']
 
 setup(
@@ -110,7 +110,8 @@ setup(
     install_requires=[
         'click>=8.0',
         'mapbox-earcut>=1.0,<3',
-        'numba>=0.58.1',
+        # core/runtime/loading.py and compilation/worker.py use what it keeps to itself.
+        'numba>=0.58.1,<0.69',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',

@@ -151,11 +151,11 @@ class Selection:
         return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
 
     def tests(self, path: Path) -> list[Path]:
-        """Those at the fewest imports from the module, the smaller ones first."""
+        """Those at the fewest imports from the module, those of few other modules first."""
         ring, seen, chosen = {self._name(path)}, set(), []
         while ring and len(chosen) < self._most:
             near = [test for test, used in self._tests.items() if used & ring]
-            near = sorted(set(near) - set(chosen), key=lambda test: test.stat().st_size)
+            near = sorted(set(near) - set(chosen), key=lambda test: len(self._tests[test]))
             # Those named alike are about it.
             near.sort(key=lambda test: path.stem not in test.stem)
             chosen += near[: self._most - len(chosen)]
@@ -197,7 +197,7 @@ def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
                 process.wait()
                 return 'timeout', ''
             output.seek(0)
-            failed = re.search(r'^(?:FAILED|ERROR) (\S+)', output.read(), re.MULTILINE)
+            failed = re.search(r'^(?:FAILED|ERROR) (.+?)(?: - |$)', output.read(), re.MULTILINE)
     if code < 0 or code >= 128:
         return 'crashed', ''
     kinds = {0: 'survived', 5: 'untested'}
@@ -209,7 +209,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--count', type=int, default=300, help='mutants to draw')
     parser.add_argument('--seed', type=int, default=0)
-    parser.add_argument('--files', type=int, default=6, help='files of tests for each, at most')
+    parser.add_argument('--files', type=int, default=8, help='files of tests for each, at most')
     parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
     parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
     chosen = parser.parse_args()

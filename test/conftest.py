@@ -21,6 +21,8 @@ if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
 
 # The same examples on every run, and no timed tests: machines are busy.
 settings.register_profile('rangeseg', deadline=None, derandomize=True)
+# New examples in every run, those that fail printed: pytest --hypothesis-profile nightly.
+settings.register_profile('nightly', deadline=None, max_examples=500, print_blob=True)
 settings.load_profile('rangeseg')
 
 

@@ -85,7 +85,10 @@ def _find_components(
     for i in range(first, after):
         # Views of the rows, of which the compiler takes many pixels at a time.
         above = max(i - 1, first)
-        here, over, below = labels[i], labels[above], grid.below[min(above, len(grid.below) - 1)]
+        here, over = labels[i], labels[above]
+        # An image of one row has no edges below, and none are asked for.
+        between = min(above, len(grid.below) - 1)
+        below = grid.below[between] if between >= 0 else grid.right[i]
         own, upper, right, measured = found[i], found[above], grid.right[i], valid[i]
         # What was last found equivalent: most pixels tell what the one before has told.
         known = -1
