@@ -108,12 +108,13 @@ def _polynomial_inverse(
         for _ in range(_ITERATIONS):
             du, dv, (uu, uv, vu, vv) = _polynomial(u, v, d)
             determinant = uu * vv - uv * vu
-            unique &= determinant > 0
+            # Both eigenvalues are positive: a branch that turned twice is another one.
+            unique &= (determinant > 0) & (uu + vv > 0)
             du, dv = step / _STEPS * x - du, step / _STEPS * y - dv
             u = u + (vv * du - uv * dv) / determinant
             v = v + (uu * dv - vu * du) / determinant
     du, dv, (uu, uv, vu, vv) = _polynomial(u, v, d)
-    unique &= (np.hypot(du - x, dv - y) < _TOLERANCE) & (uu * vv > uv * vu)
+    unique &= (np.hypot(du - x, dv - y) < _TOLERANCE) & (uu * vv > uv * vu) & (uu + vv > 0)
     return np.where(unique, u, np.nan), np.where(unique, v, np.nan)
 
 
