@@ -269,7 +269,8 @@ def _contradiction(
 ) -> float:
     """How much better, in chi-squared, the planes are explained by another motion than told.
 
-    That of the plane for which it is most does not count: it may be one that moves by itself.
+    That of the plane for which it is most does not count where there are others: it may be one
+    that moves by itself.
     `noise` is that of the poses that tell the motion, radians and metres.
     """
     t, s = np.nonzero(_sure_pairs(known, seen, shared, speed))
@@ -285,7 +286,7 @@ def _contradiction(
         square = np.einsum('ni,ni->n', across, across) / (angle + 2 * turn**2)
         square += gap**2 / (offset + 2 * place**2 + 2 * turn**2 * lever)
         gains += sign * square
-    return float(gains.sum() - gains.max())
+    return float(gains.sum() - (gains.max() if len(gains) > 1 else 0.0))
 
 
 def _sure_pairs(
