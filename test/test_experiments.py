@@ -64,10 +64,22 @@ def picture(path):
     return image
 
 
-def test_lambda(folder, tmp_path, monkeypatch, measured):
+def test_lambda_resumes_where_it_was_interrupted(folder, tmp_path, monkeypatch, measured):
     output, params = tmp_path / 'out', tmp_path / 'params.yaml'
     args = ('lambda', folder, '--output', output, '--step', '65', '--train', params)
+    original = Task._measure
+
+    def interrupted(task):
+        if len(measured) == 4:
+            raise KeyboardInterrupt
+        return original(task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Task, '_measure', interrupted)
+        assert run(patch, *args) == 130
+    assert len(list((output / 'cache').iterdir())) == len(measured) == 4
     assert run(monkeypatch, *args) == 0
+    assert len(measured) == 2 * 9
     table = rows(output / 'lambda.csv')
     assert [(r['series'], r['lambda']) for r in table] == [
         (series, value)
@@ -76,10 +88,14 @@ def test_lambda(folder, tmp_path, monkeypatch, measured):
     ]
     assert all(r['regions'] == '2' for r in table)
     picture(output / 'lambda.png')
-    assert len(measured) == 2 * 9
     config = read_config(params)
     assert config.method == 'normals' and config.normal_baseline == 1
     assert config.smoothness in (20.0, 85.0, 150.0)
+    # What was measured of a file that has changed counts no more.
+    assert cv2.imwrite(str(folder / 'truth' / 'a.png'), np.ones(CAMERA.shape, np.uint16))
+    measured.clear()
+    assert run(monkeypatch, *args) == 0
+    assert measured == ['a'] * 9
 
 
 def test_trained_parameters_leave_open_what_the_given_ones_do(folder, tmp_path, monkeypatch):
@@ -91,73 +107,26 @@ def test_trained_parameters_leave_open_what_the_given_ones_do(folder, tmp_path, 
     assert read_params(params)['normal_baseline'] == 2
 
 
-def test_resumes(folder, tmp_path, monkeypatch, measured):
-    output = tmp_path / 'out'
-    args = ('lambda', folder, '--output', output, '--step', '130')
+@pytest.mark.parametrize(
+    ('name', 'more', 'series'),
+    [
+        ('directions', ('--limit', '25'), {'17 platonic', '25 regular'}),
+        ('postprocessing', ('--step', '130'), set(experiments.POSTPROCESSING)),
+        ('weights', ('--step', '130'), set(experiments.WEIGHTS)),
+        ('comparison', ('--step', '130', '--real'), set(experiments.compared(''))),
+    ],
+)
+def test_tables_by_tolerance(folder, tmp_path, monkeypatch, name, more, series):
+    args = (name, folder, '--output', tmp_path, '--images', '1', *more)
     assert run(monkeypatch, *args) == 0
-    first = (output / 'lambda.csv').read_text()
-    finished = sorted((output / 'cache').iterdir())
-    assert len(measured) == len(finished) == 12
-    finished[0].unlink()
-    finished[7].unlink()
-    assert run(monkeypatch, *args) == 0
-    assert len(measured) == 14
-    assert (output / 'lambda.csv').read_text() == first
-
-
-def test_an_interrupted_run_keeps_what_is_done(folder, tmp_path, monkeypatch):
-    original, calls = Task._measure, []
-
-    def interrupted(task):
-        calls.append(task)
-        if len(calls) == 5:
-            raise KeyboardInterrupt
-        return original(task)
-
-    monkeypatch.setattr(Task, '_measure', interrupted)
-    args = ('lambda', folder, '--output', tmp_path / 'out', '--step', '130')
-    assert run(monkeypatch, *args) == 130
-    assert len(list((tmp_path / 'out' / 'cache').iterdir())) == 4
-    assert run(monkeypatch, *args) == 0
-    assert len(calls) == 5 + 8
-
-
-def test_changed_files_are_measured_again(folder, tmp_path, monkeypatch, measured):
-    args = ('lambda', folder, '--output', tmp_path / 'out', '--step', '130')
-    assert run(monkeypatch, *args) == 0
-    truth = np.ones(CAMERA.shape, np.uint16)
-    assert cv2.imwrite(str(folder / 'truth' / 'a.png'), truth)
-    measured.clear()
-    assert run(monkeypatch, *args) == 0
-    assert measured == ['a'] * 6
-
-
-def test_directions(folder, tmp_path, monkeypatch):
-    args = ('directions', folder, '--output', tmp_path, '--limit', '25', '--images', '1')
-    assert run(monkeypatch, *args) == 0
-    table = rows(tmp_path / 'directions.csv')
-    assert {r['series'] for r in table} == {'17 platonic', '25 regular'}
+    table = rows(tmp_path / f'{name}.csv')
+    assert {r['series'] for r in table} == series
     assert [r['tolerance'] for r in table[:6]] == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
-    picture(tmp_path / 'directions.png')
-
-
-def test_postprocessing(folder, tmp_path, monkeypatch):
-    args = ('postprocessing', folder, '--output', tmp_path, '--step', '130', '--images', '1')
-    assert run(monkeypatch, *args) == 0
-    assert len(rows(tmp_path / 'postprocessing.csv')) == 3 * 6
-    picture(tmp_path / 'postprocessing.png')
-
-
-def test_comparison(folder, tmp_path, monkeypatch):
-    args = ('comparison', folder, '--output', tmp_path, '--step', '130', '--images', '1')
-    assert run(monkeypatch, *args) == 0
-    table = rows(tmp_path / 'comparison.csv')
-    assert {r['source'] for r in table} == {'simulated set set'}
-    assert len(table) == 6 * len(experiments.variants(''))
-    assert {r['lambda'] for r in table if r['series'] == 'planes'} == {''}
-    picture(tmp_path / 'comparison.png')
-    assert run(monkeypatch, *args, '--real') == 0
-    assert {r['source'] for r in rows(tmp_path / 'comparison.csv')} == {'real set set'}
+    assert len(table) == 6 * len(series)
+    if name == 'comparison':
+        assert {r['source'] for r in table} == {'real set set'}
+        assert {r['lambda'] for r in table if r['series'] == 'planes'} == {''}
+    picture(tmp_path / f'{name}.png')
 
 
 def test_published_rows_are_named_and_drawn(tmp_path):
@@ -227,11 +196,3 @@ def test_each_image_is_left_out_of_its_own_training():
     results = {20.0: [measurement(9), measurement(5)], 50.0: [measurement(5), measurement(9)]}
     chosen = experiments.left_out(results)
     assert chosen == [results[50.0][0], results[20.0][1]]
-
-
-def test_weights(folder, tmp_path, monkeypatch):
-    args = ('weights', folder, '--output', tmp_path, '--step', '130', '--images', '1')
-    assert run(monkeypatch, *args) == 0
-    table = rows(tmp_path / 'weights.csv')
-    assert {row['series'] for row in table} == set(experiments.WEIGHTS)
-    picture(tmp_path / 'weights.png')

@@ -12,13 +12,11 @@ from typing import Any
 import click
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import scratch_folder
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.io.params import read_config
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -81,7 +79,7 @@ CACHE = Path(os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache') / 'rang
     multiple=True,
     help='Also with this `work_budget`; may be repeated.',
 )
-@measures.json_file
+@options.json_file
 def command(
     depth: tuple[Path, ...],
     camera_file: Path | None,
@@ -105,7 +103,7 @@ def command(
         raise click.UsageError('DEPTH images and --camera belong together')
     if depth and scaling:
         raise click.UsageError('--scaling is for simulated images, not for DEPTH')
-    config = read_config(params_file, **({'method': method} if method else {}))
+    config = options.read_parameters(params_file, method=method)
     within = {f'{budget:g}': replace(config, work_budget=budget) for budget in budgets}
     progress = partial(options.progress, unit='frame')
     with scratch_folder('rangeseg_bench') as folder:
@@ -129,8 +127,7 @@ def command(
             }
             click.echo()
             click.echo(benchmark.budget_table(figures['budgets']))
-    if json_file:
-        measures.write_json(json_file, figures)
+    options.write_json(json_file, figures)
 
 
 def _title(figures: dict[str, Any]) -> str:

@@ -56,19 +56,14 @@ _HEADER = '# Written by rangeseg calibrate.\n'
     help='Intrinsics of the images in folders: a ROS camera-calibration YAML file.',
 )
 @options.depth_scale
-@click.option('--depth-topic', help='Images or clouds of bags.  [default: found by type and name]')
-@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.topics
 @click.option(
     '--segment-with',
     'segment_with',
     type=options.FILE,
     help='Parameters of the segmenter, which --params repeats.  [default: those of the package]',
 )
-@click.option(
-    '--jobs',
-    type=click.IntRange(min=1),
-    help='Processes.  [default: as many as cores]',
-)
+@options.jobs
 def command(
     recordings: tuple[Path, ...],
     output: Path,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
-from rangeseg_ros.evaluation.figures import Compared, comparison_figures, table
+from rangeseg_ros.evaluation.figures import TOLERANCES, Compared, comparison_figures, table
 from rangeseg_ros.evaluation.label_files import (
     as_truth,
     pair_files,
@@ -16,13 +17,54 @@ from rangeseg_ros.evaluation.label_files import (
     read_label_image,
     read_normals_beside,
 )
-from rangeseg_ros.evaluation.overlap import ComparisonError
+from rangeseg_ros.evaluation.overlap import ComparisonError, check_tolerance
 
 
-@click.command(cls=measures.ToleranceCommand)
+class ToleranceCommand(click.Command):
+    """A command whose `--tolerance` takes all the numbers that follow it."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        spread: list[str] = []
+        taking = False
+        for arg in args:
+            number = _is_number(arg)
+            if taking and number and spread[-1] != '--tolerance':
+                spread.append('--tolerance')
+            taking = arg == '--tolerance' or (taking and number)
+            spread.append(arg)
+        return super().parse_args(ctx, spread)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _checked(
+    context: click.Context, parameter: click.Parameter, values: tuple[float, ...]
+) -> tuple[float, ...]:
+    return tuple(check_tolerance(value) for value in values or TOLERANCES)
+
+
+tolerance: Callable[..., Any] = click.option(
+    '--tolerance',
+    'tolerances',
+    type=float,
+    multiple=True,
+    callback=_checked,
+    metavar='T...',
+    help=f'Overlap from which regions match, in (0.5, 1]; several may follow.  '
+    f'[default: {" ".join(map(str, TOLERANCES))}]',
+)
+
+
+@click.command(cls=ToleranceCommand)
 @click.argument('truth', metavar='GT', type=click.Path(exists=True, path_type=Path))
 @click.argument('labels', metavar='MS', type=click.Path(exists=True, path_type=Path))
-@measures.tolerance
+@tolerance
 @click.option(
     '--min-pixels',
     type=click.IntRange(min=1),
@@ -30,7 +72,7 @@ from rangeseg_ros.evaluation.overlap import ComparisonError
     show_default=True,
     help='Regions of the ground truth that are smaller do not count as regions.',
 )
-@measures.json_file
+@options.json_file
 def command(
     truth: Path,
     labels: Path,
@@ -62,5 +104,4 @@ def command(
         images[name] = Compared(overlap, angles, normals)
     figures = comparison_figures(images, tolerances)
     click.echo(table(figures))
-    if json_file:
-        measures.write_json(json_file, figures)
+    options.write_json(json_file, figures)

@@ -7,22 +7,21 @@ from pathlib import Path
 import click
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
+from rangeseg_ros.cli.compare import ToleranceCommand, tolerance
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
-from rangeseg_ros.io.params import read_config
 from rangeseg_ros.report.evaluation import write_evaluation
 from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.tasks import run_all
 
 
-@click.command(cls=measures.ToleranceCommand)
+@click.command(cls=ToleranceCommand)
 @click.argument('folder', metavar='DIR', type=options.FOLDER)
 @options.params
 @options.method
-@measures.tolerance
+@tolerance
 @click.option(
     '--min-pixels',
     type=click.IntRange(min=1),
@@ -36,7 +35,7 @@ from rangeseg_ros.tasks import run_all
     is_flag=True,
     help='Terrains: the height of the sensor is not told.',
 )
-@measures.jobs
+@options.jobs
 @click.option(
     '--output',
     type=click.Path(file_okay=False, path_type=Path),
@@ -45,7 +44,7 @@ from rangeseg_ros.tasks import run_all
     'noise red.',
 )
 @options.overwrite
-@measures.json_file
+@options.json_file
 def command(
     folder: Path,
     params_file: Path | None,
@@ -72,15 +71,14 @@ def command(
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
     with errors of angles and planes where the truth knows them, and each image in `per_image`.
     """
-    config = read_config(params_file, **({'method': method} if method else {}))
+    config = options.read_parameters(params_file, method=method)
     if (folder / 'terrain.csv').exists():
         terrains = terrain_tasks(folder, config, not unknown_height, output)
         told = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
         figures = terrain_figures(told)
         click.echo(f'{folder}: {len(told)} images')
         click.echo(terrain_table(figures))
-        if json_file:
-            measures.write_json(json_file, figures)
+        options.write_json(json_file, figures)
         return
     cases = [
         case
@@ -102,5 +100,4 @@ def command(
     click.echo(table(figures))
     if output:
         write_evaluation(output, folder.resolve().name, config, found, figures)
-    if json_file:
-        measures.write_json(json_file, figures)
+    options.write_json(json_file, figures)

@@ -2,241 +2,148 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
-from typing import Any
 
 import click
 import yaml
 
-from rangeseg_ros.cli import options, sensitivity
-from rangeseg_ros.cli import tolerances as measures
+from rangeseg_ros.cli import options
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import experiments, plots, published
 from rangeseg_ros.evaluation.datasets import Case, find_cases
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.params import read_params
 
-
-@dataclass(frozen=True)
-class Setting:
-    """What the options common to all experiments come to."""
-
-    cases: list[Case]
-    base: Config
-    params: Config | None
-    names_method: bool
-    bench: experiments.Bench
-    output: Path
-    images: int | None
-    source: str
-
-    def has(self, name: str) -> bool:
-        """Whether the set has images that are said to be of that split."""
-        return any(getattr(case, 'split', '') == name for case in self.cases)
-
-    def split(self, name: str) -> list[Case]:
-        """Images of a split, or all of a set without splits; at most --images of them."""
-        cases = [case for case in self.cases if getattr(case, 'split', name) == name]
-        if not cases:
-            raise click.ClickException(f'the set has no {name} images')
-        return cases[: self.images]
-
-    def save(
-        self, name: str, rows: list[experiments.Row], plot: Callable[[Path, Any, str], None]
-    ) -> None:
-        """Write rows as CSV and plot."""
-        plots.write_csv(self.output / f'{name}.csv', rows)
-        plot(self.output / f'{name}.png', rows, f'{name}, measured on the {self.source}')
-        click.echo(f'{self.output / name}.csv, .png')
+NAMES = ('directions', 'lambda', 'postprocessing', 'weights', 'comparison', 'timing')
+PLOTS = {'lambda': plots.plot_lambdas, 'timing': plots.plot_timing}
 
 
-@click.group()
-def command() -> None:
-    """Repeat the experiments of the thesis on a set of images with ground truth.
-
-    DIR is a folder that `rangeseg evaluate` knows, such as a segcomp set. Each experiment writes
-    a plot (PNG) and a table (CSV), and keeps what it has measured in OUTPUT/cache: interrupted,
-    it resumes there. What the thesis leaves open comes from --params; without it, everything is
-    as in the thesis.
-    """
-
-
-def experiment(function: Callable[..., None]) -> Callable[..., None]:
-    """Give a function the common options, as a `Setting`, and make it a command."""
-
-    @wraps(function)
-    def run(
-        folder: Path,
-        output: Path,
-        params_file: Path | None,
-        images: int | None,
-        real: bool,
-        jobs: int | None,
-        **rest: Any,
-    ) -> None:
-        base, given, params = published.THESIS, {'method': 'normals'}, None
-        if params_file:
-            given = read_params(params_file)
-            base = params = Config.from_mapping({'method': 'normals', **given})
-        bench = experiments.Bench(
-            output / 'cache',
-            jobs,
-            lambda items, total: options.progress(items, total, 'image'),
-        )
-        source = f'{"real" if real else "simulated"} set {folder.resolve().name}'
-        function(
-            Setting(
-                find_cases(folder), base, params, 'method' in given, bench, output, images, source
-            ),
-            **rest,
-        )
-
-    for decorate in (
-        measures.jobs,
-        click.option('--real', is_flag=True, help='DIR is a real set: say so in the results.'),
-        click.option(
-            '--images', type=click.IntRange(min=1), help='Only so many images of each split.'
-        ),
-        options.params,
-        click.option(
-            '--output',
-            type=click.Path(file_okay=False, path_type=Path),
-            required=True,
-            help='Folder for the results; made when missing.',
-        ),
-        click.argument('folder', metavar='DIR', type=options.FOLDER),
-    ):
-        run = decorate(run)
-    return run
-
-
-limit = click.option(
+@click.command()
+@click.argument('name', metavar='EXPERIMENT', type=click.Choice(NAMES))
+@click.argument('folder', metavar='DIR', type=options.FOLDER)
+@options.folder_output()
+@options.params
+@click.option('--images', type=click.IntRange(min=1), help='Only so many images of each split.')
+@click.option('--real', is_flag=True, help='DIR is a real set: say so in the results.')
+@click.option(
     '--limit',
     type=click.IntRange(min=17),
     default=1249,
     show_default=True,
-    help='Leave out direction sets with more directions.',
+    help='directions, timing: leave out sets with more directions.',
 )
-step = click.option(
+@click.option(
     '--step',
     type=click.IntRange(min=1),
     default=10,
     show_default=True,
     help='Lambda runs from 20 to 150 in such steps; the thesis has 5.',
 )
-
-
-@command.command()
-@experiment
-@limit
-def directions(setting: Setting, limit: int) -> None:
-    """Direction sets, without post-processing (figure 6.2)."""
-    rows = experiments.directions(setting.bench, setting.split('train'), setting.base, limit)
-    setting.save('directions', rows, plots.plot_tolerances)
-
-
-@command.command('lambda')
-@experiment
-@step
 @click.option(
     '--train',
     'train_file',
     type=click.Path(dir_okay=False, path_type=Path),
-    help='Write the parameters, with the lambda that is best with identified noise regions, to '
-    'this YAML file.',
+    help='lambda: write the parameters, with the lambda that is best with identified noise '
+    'regions, to this YAML file.',
 )
-def lambda_(setting: Setting, step: int, train_file: Path | None) -> None:
-    """Lambda and the three post-processings, T = 0.8 (figure 6.3)."""
-    values = _lambdas(step)
-    rows = experiments.lambdas(setting.bench, setting.split('train'), setting.base, values)
-    setting.save('lambda', rows, plots.plot_lambdas)
-    if train_file:
-        _write_params(train_file, setting, rows)
+@options.jobs
+def command(
+    name: str,
+    folder: Path,
+    output: Path,
+    params_file: Path | None,
+    images: int | None,
+    real: bool,
+    limit: int,
+    step: int,
+    train_file: Path | None,
+    jobs: int | None,
+) -> None:
+    """Repeat an experiment of the thesis on a set of images with ground truth.
 
+    \b
+    directions      sets of directions, without post-processing (figure 6.2)
+    lambda          lambda and the three post-processings, T = 0.8 (figure 6.3)
+    postprocessing  post-processings against the tolerance (figure 6.4)
+    weights         neighbourhood weights of section 5.5 (figure 5.5)
+    comparison      ours on the test images, beside published results of a
+                    Perceptron or ABW set (figure 6.5, table B.1)
+    timing          time against the number of labels at full resolution
+                    (table 6.1): takes long; with --jobs 1, on an idle machine
 
-@command.command()
-@experiment
-@step
-def postprocessing(setting: Setting, step: int) -> None:
-    """Post-processings against the tolerance, each at its best lambda (figure 6.4)."""
-    values = _lambdas(step)
-    rows = experiments.postprocessing(setting.bench, setting.split('train'), setting.base, values)
-    setting.save('postprocessing', rows, plots.plot_tolerances)
-
-
-@command.command()
-@experiment
-@step
-def weights(setting: Setting, step: int) -> None:
-    """Neighbourhood weights of section 5.5, each at its best lambda (figure 5.5)."""
-    cases = setting.split('train' if setting.has('train') else 'test')
-    rows = experiments.weights(setting.bench, cases, setting.base, _lambdas(step))
-    setting.save('weights', rows, plots.plot_tolerances)
-
-
-@command.command()
-@experiment
-@step
-def comparison(setting: Setting, step: int) -> None:
-    """Ours on the test images (figure 6.5, table B.1).
-
-    Beside the published results of a Perceptron or ABW set. Lambda is trained on the training
-    images; without any, for each image on all others. --params adds rows with these parameters.
+    DIR is a folder that `rangeseg evaluate` knows, such as a segcomp set. Writes a plot (PNG) and
+    a table (CSV), and keeps what it has measured in OUTPUT/cache: interrupted, it resumes there.
+    Parameters that the experiment does not vary come from --params; without it, they are those of
+    the thesis. `comparison` adds rows with the parameters of --params.
     """
-    test = setting.split('test')
-    sensor = getattr(test[0], 'sensor', '')
-    rows = experiments.comparison(
-        setting.bench,
-        setting.split('train') if setting.has('train') else [],
-        test,
-        experiments.variants(sensor, setting.params),
-        setting.source,
-        _lambdas(step),
+    if train_file and name != 'lambda':
+        raise click.UsageError('--train is for the experiment lambda')
+    given = read_params(params_file) if params_file else None
+    params = None if given is None else Config.from_mapping({'method': 'normals', **given})
+    base = params or published.THESIS
+    lambdas = [float(value) for value in range(20, 151, step)]
+    source = f'{"real" if real else "simulated"} set {folder.resolve().name}'
+    bench = experiments.Bench(
+        output / 'cache', jobs, lambda items, total: options.progress(items, total, 'image')
     )
-    rows += published.published_rows(sensor)
-    setting.save('comparison', rows, plots.plot_tolerances)
+    cases = find_cases(folder)
+    training, test = _split(cases, 'train', images), _split(cases, 'test', images)
+    needed = {'comparison': test, 'weights': training or test}.get(name, training)
+    if not needed:
+        kind = 'test' if name == 'comparison' else 'train'
+        raise click.ClickException(f'the set has no {kind} images')
+    if name == 'comparison':
+        separate = training if any(hasattr(case, 'split') for case in cases) else []
+        sensor = getattr(test[0], 'sensor', '')
+        variants = experiments.compared(sensor, params)
+        rows = [
+            {'series': row['series'], 'source': source, **row}
+            for row in experiments.comparison(bench, separate, test, variants, lambdas)
+        ] + published.published_rows(sensor)
+    elif name == 'timing':
+        rows = experiments.timing(bench, training, base, limit)
+    elif name == 'directions':
+        leaving = Config.from_mapping({**vars(base), 'noise_regions': 'leave'})
+        sets = experiments.direction_sets(leaving, limit)
+        rows = experiments.by_tolerance(bench.train(sets, experiments.HIGH_LAMBDAS, training))
+    else:
+        changes = experiments.WEIGHTS if name == 'weights' else experiments.POSTPROCESSING
+        found = bench.train(experiments.vary(base, changes), lambdas, needed)
+        table = experiments.by_lambda if name == 'lambda' else experiments.by_tolerance
+        rows = table(found)
+    plots.write_csv(output / f'{name}.csv', rows)
+    plot = PLOTS.get(name, plots.plot_tolerances)
+    plot(output / f'{name}.png', rows, f'{name}, measured on the {source}')
+    click.echo(f'{output / name}.csv, .png')
+    if train_file:
+        about = f'{source}, {images or "all"} training images'
+        names_method = given is None or 'method' in given
+        _write_params(train_file, base, names_method, about, rows)
 
 
-@command.command()
-@experiment
-@limit
-def timing(setting: Setting, limit: int) -> None:
-    """Time against the number of labels, all at full resolution (table 6.1). Takes long.
-
-    For times that mean something, run it with --jobs 1 on an idle machine.
-    """
-    rows = experiments.timing(setting.bench, setting.split('train'), setting.base, limit)
-    setting.save('timing', rows, plots.plot_timing)
+def _split(cases: list[Case], name: str, images: int | None) -> list[Case]:
+    """Images of a split, or all of a set without splits; at most so many of them."""
+    return [case for case in cases if getattr(case, 'split', name) == name][:images]
 
 
-command.add_command(sensitivity.command, 'sensitivity')
-
-
-def _lambdas(step: int) -> list[float]:
-    return [float(value) for value in range(20, 151, step)]
-
-
-def _write_params(path: Path, setting: Setting, rows: list[experiments.Row]) -> None:
+def _write_params(
+    path: Path, base: Config, names_method: bool, about: str, rows: list[experiments.Row]
+) -> None:
     """Parameter file with the best lambda and whatever else differs from the defaults.
 
     Where --params names no method the file names none either: lambda is then there for whoever
     chooses `normals`.
     """
     best = max((r for r in rows if r['series'] == 'identified'), key=lambda row: row['correct'])
-    defaults = Config()
-    chosen = {
-        name: getattr(setting.base, name)
-        for name in Config.__dataclass_fields__
-        if getattr(setting.base, name) != getattr(defaults, name)
-        and (name != 'method' or setting.names_method)
+    params = {
+        name: value
+        for name, value in vars(base).items()
+        if value != getattr(Config(), name) and (name != 'method' or names_method)
     }
-    params = {**chosen, 'smoothness': best['lambda']}
+    params['smoothness'] = best['lambda']
     text = (
-        f'# smoothness trained on the {setting.source}, {setting.images or "all"} training '
-        f'images: {best["correct"]:.2f} of {best["regions"]:.2f} regions correct at T = 0.8\n'
+        f'# smoothness trained on the {about}: '
+        f'{best["correct"]:.2f} of {best["regions"]:.2f} regions correct at T = 0.8\n'
     )
     text += yaml.safe_dump({'/**': {'ros__parameters': params}}, sort_keys=False)
     with replacing(path) as part:

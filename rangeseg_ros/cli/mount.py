@@ -33,7 +33,7 @@ def command(
     a static_transform_publisher and the origin of a URDF joint. Yaw, and where the camera is over
     the floor, no floor tells. Where the floor is not sure, says why, and the exit code is 1.
     """
-    config = options.read_parameters(params_file, exact)
+    config = options.read_parameters(params_file, exact=exact)
     # The frame is the camera's own, and its place in that has no error.
     sequence = SequenceSegmenter(replace(config, pose_noise=0.0, pose_turn_noise=0.0))
     still = Placement(pose=Transform.identity())

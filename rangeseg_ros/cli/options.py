@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -123,6 +124,61 @@ depth_scale: Callable[..., Any] = click.option(
 overwrite: Callable[..., Any] = click.option(
     '--overwrite', is_flag=True, help='Replace files that are there already.'
 )
+jobs: Callable[..., Any] = click.option(
+    '--jobs', type=click.IntRange(min=1), help='Processes.  [default: one for each core]'
+)
+fixed_frame: Callable[..., Any] = click.option(
+    '--fixed-frame',
+    metavar='FRAME',
+    help='Frame in which planes stay put, such as odom: the map of planes is in it, where the '
+    'recording has tf.  [default: that of the parameters]',
+)
+
+
+def topics(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options `--depth-topic` and `--camera-topic` of commands that read recordings."""
+    depth = click.option('--depth-topic', help='Depth.  [default: found by type and name]')
+    camera = click.option('--camera-topic', help='Intrinsics.  [default: those beside depth]')
+    decorated: Callable[..., Any] = depth(camera(command))
+    return decorated
+
+
+def folder_output(text: str = 'Folder for the results; made when missing.') -> Callable[..., Any]:
+    """Option `--output` of commands that write a folder."""
+    kind = click.Path(file_okay=False, path_type=Path)
+    option: Callable[..., Any] = click.option('--output', type=kind, required=True, help=text)
+    return option
+
+
+def _checked_json(
+    context: click.Context, parameter: click.Parameter, path: Path | None
+) -> Path | None:
+    # Before the work that the figures are of.
+    if path:
+        check_replaceable(path, b'{')
+    return path
+
+
+json_file: Callable[..., Any] = click.option(
+    '--json',
+    'json_file',
+    type=click.Path(path_type=Path),
+    callback=_checked_json,
+    help='Write the figures to this file.',
+)
+
+
+def write_json(path: Path | None, figures: Mapping[str, Any]) -> None:
+    """Write figures as JSON where there is a file for them, NaN as null."""
+    if path:
+        with replacing(path) as partial:
+            partial.write_text(json.dumps(_as_json(figures), indent=2) + '\n')
+
+
+def _as_json(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _as_json(item) for key, item in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def check_replaceable(path: Path, beginning: bytes) -> None:
@@ -163,9 +219,10 @@ def show_compilation(progress: str) -> None:
         print(f'{progress:40}', end='\r', file=sys.stderr, flush=True)
 
 
-def read_parameters(params_file: Path | None, exact: bool) -> Config:
-    """Config of the options `params` and `exact`; the latter wins over the file."""
-    return read_config(params_file, **({'exact': True} if exact else {}))
+def read_parameters(params_file: Path | None, **given: Any) -> Config:
+    """Config of the option `params`; options of the command line win over the file."""
+    named = {name: value for name, value in given.items() if value not in (None, False)}
+    return read_config(params_file, **named)
 
 
 @contextmanager

@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
 import click
 
 from rangeseg_ros.batch.plan import PlanOutcome, PlanTask
-from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
-from rangeseg_ros.cli.errors import in_words
-from rangeseg_ros.cli.replay import result_folders
-from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
+from rangeseg_ros.cli import options, recordings
+from rangeseg_ros.tasks import Failure
 
 
 @click.command()
-@click.argument(
-    'recordings', metavar='RECORDING...', nargs=-1, required=True, type=click.Path(path_type=Path)
-)
-@click.option(
-    '--output',
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help='Folder for the files; made when missing.',
-)
+@recordings.argument
+@options.folder_output()
 @click.option(
     '--fixed-frame',
     metavar='FRAME',
@@ -46,17 +35,16 @@ from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_s
     show_default=True,
     help='Side of a cell of map.pgm, metres.',
 )
-@click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
-@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.topics
 @options.overwrite
-@measures.jobs
-@click.option('--scheduler', metavar='ADDRESS', help='As for replay: a Dask cluster.')
+@options.jobs
+@recordings.scheduler
 @options.params
 @options.exact
 @click.pass_context
 def command(
     ctx: click.Context,
-    recordings: tuple[Path, ...],
+    paths: tuple[Path, ...],
     output: Path,
     fixed_frame: str | None,
     headroom: float,
@@ -86,28 +74,14 @@ def command(
     missing = [name for name in ('ezdxf', 'trimesh') if find_spec(name) is None]
     if missing:
         raise click.ClickException(f'{" and ".join(missing)} missing: install the extra plan')
-    config = options.read_parameters(params_file, exact)
-    if fixed_frame is not None:
-        config = replace(config, fixed_frame=fixed_frame)
-    folders = result_folders(recordings, output)
-    if scheduler:
-        check_scheduler(scheduler)
-        if find_spec('distributed') is None:
-            raise click.ClickException('--scheduler needs distributed: install the extra dask')
-        recordings = tuple(path.absolute() for path in recordings)
-        folders = [folder.absolute() for folder in folders]
+    config = options.read_parameters(params_file, exact=exact, fixed_frame=fixed_frame)
     tasks = [
         PlanTask(path, folder, config, headroom, resolution, overwrite, depth_topic, camera_topic)
-        for path, folder in zip(recordings, folders, strict=True)
+        for path, folder in recordings.with_folders(paths, output, scheduler)
     ]
     for task in tasks:
         task.check()
-    if scheduler:
-        outcomes = options.progress(attempt_on_cluster(tasks, scheduler), len(tasks), 'bag')
-    elif len(tasks) == 1:
-        outcomes = [tasks[0].run(lambda frames, n: options.progress(frames, n, 'frame'))]
-    else:
-        outcomes = options.progress(attempt_all(tasks, jobs), len(tasks), 'bag')
+    outcomes = recordings.outcomes(tasks, jobs, scheduler)
     codes = [_report(task, outcome) for task, outcome in zip(tasks, outcomes, strict=True)]
     if any(codes):
         ctx.exit(max(codes))
@@ -116,8 +90,7 @@ def command(
 def _report(task: PlanTask, outcome: PlanOutcome | Failure) -> int:
     """Say what became of a recording; the exit code."""
     if isinstance(outcome, Failure):
-        click.echo(f'rangeseg: {task.recording}: {in_words(outcome.error)}', err=True)
-        return 2
+        return recordings.report_failure(task, outcome)
     for warning in outcome.warnings:
         click.echo(f'rangeseg: {task.recording}: {warning}', err=True)
     click.echo(

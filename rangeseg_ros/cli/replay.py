@@ -2,36 +2,26 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable
-from dataclasses import asdict, replace
-from importlib.util import find_spec
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
 
 from rangeseg_ros.batch.replay import Outcome, Replay
-from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
+from rangeseg_ros.cli import options, recordings
 from rangeseg_ros.cli.errors import in_words
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.report.replay import write_overview
-from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
+from rangeseg_ros.tasks import Failure
 
 
 @click.command()
-@click.argument('bags', metavar='BAG...', nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option(
-    '--output',
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help='Folder for the results; made when missing.',
-)
-@click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
-@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@recordings.argument
+@options.folder_output()
+@options.topics
 @options.raw
 @options.overwrite
 @click.option(
@@ -49,25 +39,15 @@ from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_s
     help='Also write <frame>_<stamp>_terrain.png and _height.tiff, ground.csv and stairs.csv.',
 )
 @click.option('--copy', is_flag=True, help='Copy the topics of the recording into the bag.')
-@measures.jobs
-@click.option(
-    '--scheduler',
-    metavar='ADDRESS',
-    help='Run on the workers of this Dask cluster, e.g. tcp://host:8786; needs the extra dask. '
-    'The workers see BAGs and output under the same names.',
-)
-@click.option(
-    '--fixed-frame',
-    metavar='FRAME',
-    help='Frame in which planes stay put, such as odom: writes the map of planes in it, where '
-    'the recording has tf.  [default: that of the parameters]',
-)
+@options.jobs
+@recordings.scheduler
+@options.fixed_frame
 @options.params
 @options.exact
 @click.pass_context
 def command(
     ctx: click.Context,
-    bags: tuple[Path, ...],
+    paths: tuple[Path, ...],
     output: Path,
     depth_topic: str | None,
     camera_topic: str | None,
@@ -99,23 +79,13 @@ def command(
     recording is damaged is left out, and the exit code is 1; a recording that fails costs no
     other, and the exit code is 2.
     """
-    config = options.read_parameters(params_file, exact)
-    if fixed_frame is not None:
-        config = replace(config, fixed_frame=fixed_frame)
-    folders = result_folders(bags, output)
-    if scheduler:
-        check_scheduler(scheduler)
-        if find_spec('distributed') is None:
-            raise click.ClickException('--scheduler needs distributed: install the extra dask')
-        # The workers have working directories of their own.
-        bags = tuple(bag.absolute() for bag in bags)
-        folders = [folder.absolute() for folder in folders]
+    config = options.read_parameters(params_file, exact=exact, fixed_frame=fixed_frame)
     topics = tuple(name for name in OUTPUTS if name in topics)
     tasks = [
         Replay(
             bag, folder, config, depth_topic, camera_topic, topics, copy, raw, overwrite, terrain
         )
-        for bag, folder in zip(bags, folders, strict=True)
+        for bag, folder in recordings.with_folders(paths, output, scheduler)
     ]
     # All are opened, and so checked, before anything is written.
     index = output / 'index.html'
@@ -123,7 +93,9 @@ def command(
         raise NotReplacedError(index)
     found = [task.check() for task in tasks]
     rows, codes = [], []
-    for task, read, outcome in zip(tasks, found, _outcomes(tasks, jobs, scheduler), strict=True):
+    for task, read, outcome in zip(
+        tasks, found, recordings.outcomes(tasks, jobs, scheduler), strict=True
+    ):
         click.echo(f'{task.recording}: {read}')
         codes.append(_report(task, outcome))
         rows.append(_row(task, outcome))
@@ -131,27 +103,6 @@ def command(
         write_overview(index, output.name, rows)
     if any(codes):
         ctx.exit(max(codes))
-
-
-def result_folders(bags: tuple[Path, ...], output: Path) -> list[Path]:
-    """Where the results of each recording go."""
-    if len(bags) == 1:
-        return [output]
-    names = [bag.stem if bag.suffix in ('.bag', '.mcap', '.db3') else bag.name for bag in bags]
-    name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise click.UsageError(f'{count} recordings named {name} would write the same results')
-    return [output / name for name in names]
-
-
-def _outcomes(
-    tasks: list[Replay], jobs: int | None, scheduler: str | None
-) -> Iterable[Outcome | Failure]:
-    if scheduler:
-        return options.progress(attempt_on_cluster(tasks, scheduler), len(tasks), 'bag')
-    if len(tasks) == 1:
-        return [tasks[0].run(lambda frames, total: options.progress(frames, total, 'frame'))]
-    return options.progress(attempt_all(tasks, jobs), len(tasks), 'bag')
 
 
 def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
@@ -168,8 +119,7 @@ def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
 def _report(task: Replay, outcome: Outcome | Failure) -> int:
     """Say what became of a recording; the exit code."""
     if isinstance(outcome, Failure):
-        click.echo(f'rangeseg: {task.recording}: {in_words(outcome.error)}', err=True)
-        return 2
+        return recordings.report_failure(task, outcome)
     for reason, count in outcome.reasons.items():
         click.echo(f'{count} frames without a plane: {reason}')
     for problem, count in outcome.unlocated.items():

@@ -27,12 +27,7 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 @click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @options.intrinsics
 @options.raw
-@click.option(
-    '--output',
-    type=click.Path(file_okay=False, path_type=Path),
-    required=True,
-    help='Folder for the results; made when missing.',
-)
+@options.folder_output()
 @options.depth_scale
 @options.params
 @options.overwrite
@@ -80,7 +75,7 @@ def command(
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
     intrinsics = options.read_intrinsics(camera_file, raw, (fx, fy, cx, cy), fov)
-    segmenter = Segmenter(options.read_parameters(params_file, exact))
+    segmenter = Segmenter(options.read_parameters(params_file, exact=exact))
     files = [name for name in FRAME_FILES if name != 'normals' or normals]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
     inputs = [path for path, _ in frames] + [*filter(None, [camera_file, params_file])]

@@ -9,9 +9,7 @@ import click
 import numpy as np
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli import tolerances as measures
 from rangeseg_ros.evaluation.tracks import track_figures, track_rooms
-from rangeseg_ros.io.params import read_config
 
 _ROWS = {
     'switches_per_100_frames': 'switches of id per 100 frames',
@@ -41,7 +39,7 @@ _ROWS = {
     help='Times the speed of a camera in the hand, which is up to 0.3 m/s and 15 degrees/s.',
 )
 @options.params
-@measures.json_file
+@options.json_file
 def command(
     rooms: int,
     frames: int,
@@ -56,7 +54,7 @@ def command(
     as long as a plane on it has that id, or lies on the surface of that id; the figures are given
     for both.
     """
-    config = read_config(params_file)
+    config = options.read_parameters(params_file)
     run = track_rooms(range(seed, seed + rooms), frames, speed, config)
     found = list(options.progress(run, rooms * frames, 'frame'))
     figures: dict[str, Any] = {
@@ -71,5 +69,4 @@ def command(
         values = ''.join(f'{figures[kind][key]:9.3g}' for kind in ('planes', 'surfaces'))
         click.echo(f'{text:38}{values}')
     click.echo(f'{"tracking, ms per frame (median)":38}{figures["median_ms"]:9.3g}')
-    if json_file:
-        measures.write_json(json_file, figures)
+    options.write_json(json_file, figures)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,15 +35,9 @@ ARROW_LENGTH = 0.2
     required=True,
     help='Rerun recording to write (.rrd); `rerun FILE` shows it.',
 )
-@click.option('--depth-topic', help='Depth images.  [default: found by type and name]')
-@click.option('--camera-topic', help='Intrinsics.  [default: camera_info beside the images]')
+@options.topics
 @options.raw
-@click.option(
-    '--fixed-frame',
-    metavar='FRAME',
-    help='Frame in which planes stay put, such as odom: shows camera and map of planes in it, '
-    'where the recording has tf.  [default: that of the parameters]',
-)
+@options.fixed_frame
 @options.params
 @options.exact
 @click.pass_context
@@ -66,9 +59,7 @@ def command(
     the extra view (rerun-sdk), whose telemetry is off. What is damaged is left out, and the exit
     code is then 1.
     """
-    config = options.read_parameters(params_file, exact)
-    if fixed_frame is not None:
-        config = replace(config, fixed_frame=fixed_frame)
+    config = options.read_parameters(params_file, exact=exact, fixed_frame=fixed_frame)
     options.check_replaceable(output, b'RRF')
     rerun = _rerun()
     sequence = SequenceSegmenter(config)

@@ -1,8 +1,8 @@
 """The experiments of chapter 6 of the thesis, as tables.
 
-Each experiment is a set of parameter variations, run over the images of one set and averaged.
-Training and selection use the training images only; where a set has none, every image is left out
-of its own training.
+Each experiment varies parameters over the images of one set and averages Hoover's counts. Lambda
+is trained on training images only; where a set has none, every image is left out of its own
+training.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from rangeseg_ros.tasks import run_all
 
 K = TypeVar('K')
 Row = dict[str, Any]
+ByLambda = Mapping[float, Sequence[Measurement]]
 
 DIRECTIONS: dict[str, dict[str, Any]] = {
     f'{count} {kind}': {'directions': kind, 'direction_count': count}
@@ -38,19 +39,14 @@ POSTPROCESSING = {
     'merged': {'noise_regions': 'merge'},
     'identified': {'noise_regions': 'identify'},
 }
-WEIGHTS = {
+WEIGHTS: dict[str, dict[str, Any]] = {
     '4-connectivity': {'jump_edges': 'none'},
     'jump edge disconnection': {},
     'distance weighting': {'jump_edges': 'none', 'weighting': 'distance'},
     'both': {'weighting': 'distance'},
 }
-LAMBDAS = tuple(float(value) for value in range(20, 151, 10))
 # Without post-processing the best lambda lies far higher (thesis 6.5).
 HIGH_LAMBDAS = (55.0, 100.0, 150.0, 200.0)
-
-
-def _silent(items: Iterable[Measurement], total: int) -> Iterable[Measurement]:
-    return items
 
 
 @dataclass(frozen=True)
@@ -68,8 +64,8 @@ class Bench:
     """
 
     cache: Path
-    jobs: int | None = None
-    progress: Callable[[Iterable[Measurement], int], Iterable[Measurement]] = _silent
+    jobs: int | None
+    progress: Callable[[Iterable[Measurement], int], Iterable[Measurement]]
 
     def run(
         self, configs: Mapping[K, Config], cases: Sequence[Case]
@@ -79,6 +75,18 @@ class Bench:
         done = iter(self.progress(run_all(tasks, self.jobs), len(tasks)))
         return {key: [next(done) for _ in cases] for key in configs}
 
+    def train(
+        self, variants: Mapping[str, Config], lambdas: Sequence[float], cases: Sequence[Case]
+    ) -> dict[str, dict[float, list[Measurement]]]:
+        """Measurements of each variant with each lambda."""
+        configs = {
+            (name, value): replace(config, smoothness=value)
+            for name, config in variants.items()
+            for value in lambdas
+        }
+        found = self.run(configs, cases)
+        return {name: {value: found[name, value] for value in lambdas} for name in variants}
+
 
 def averages(measurements: Sequence[Measurement], tolerance: float) -> Row:
     """Means over the images of Hoover's counts."""
@@ -86,121 +94,12 @@ def averages(measurements: Sequence[Measurement], tolerance: float) -> Row:
     return {key: float(np.mean([count[key] for count in counts])) for key in COUNTS}
 
 
-def best_lambda(results: Mapping[float, Sequence[Measurement]]) -> float:
+def best_lambda(results: ByLambda) -> float:
     """The lambda with most correct regions at T = 0.8; the lowest of equals."""
     return max(sorted(results), key=lambda value: averages(results[value], 0.8)['correct'])
 
 
-def train(
-    bench: Bench,
-    variants: Mapping[str, Config],
-    lambdas: Sequence[float],
-    cases: Sequence[Case],
-) -> dict[str, dict[float, list[Measurement]]]:
-    """Measurements of each variant with each lambda."""
-    configs = {
-        (name, value): replace(config, smoothness=value)
-        for name, config in variants.items()
-        for value in lambdas
-    }
-    results: dict[str, dict[float, list[Measurement]]] = {name: {} for name in variants}
-    for (name, value), measurements in bench.run(configs, cases).items():
-        results[name][value] = measurements
-    return results
-
-
-def _vary(base: Config, variations: Mapping[str, Mapping[str, Any]]) -> dict[str, Config]:
-    return {name: replace(base, **changes) for name, changes in variations.items()}
-
-
-def _by_tolerance(results: Mapping[str, Mapping[float, Sequence[Measurement]]]) -> list[Row]:
-    """A row for each series and tolerance, with each series' best lambda."""
-    best = {name: best_lambda(of_lambda) for name, of_lambda in results.items()}
-    return [
-        {'series': name, 'lambda': best[name], 'tolerance': tolerance}
-        | averages(of_lambda[best[name]], tolerance)
-        for name, of_lambda in results.items()
-        for tolerance in TOLERANCES
-    ]
-
-
-def directions(
-    bench: Bench, cases: Sequence[Case], base: Config = THESIS, limit: int = 1249
-) -> list[Row]:
-    """Figure 6.2: direction sets up to `limit`, no post-processing, each with its best lambda."""
-    sets = {k: v for k, v in DIRECTIONS.items() if v['direction_count'] <= limit}
-    variants = _vary(replace(base, noise_regions='leave'), sets)
-    return _by_tolerance(train(bench, variants, HIGH_LAMBDAS, cases))
-
-
-def lambdas(
-    bench: Bench, cases: Sequence[Case], base: Config = THESIS, values: Sequence[float] = LAMBDAS
-) -> list[Row]:
-    """Figure 6.3: the five metrics at T = 0.8 against lambda, for each post-processing."""
-    results = train(bench, _vary(base, POSTPROCESSING), values, cases)
-    return [
-        {'series': name, 'lambda': value} | averages(measurements, 0.8)
-        for name, of_lambda in results.items()
-        for value, measurements in of_lambda.items()
-    ]
-
-
-def postprocessing(
-    bench: Bench, cases: Sequence[Case], base: Config = THESIS, values: Sequence[float] = LAMBDAS
-) -> list[Row]:
-    """Figure 6.4: correct regions against the tolerance, each post-processing at its best."""
-    return _by_tolerance(train(bench, _vary(base, POSTPROCESSING), values, cases))
-
-
-def weights(
-    bench: Bench, cases: Sequence[Case], base: Config = THESIS, values: Sequence[float] = LAMBDAS
-) -> list[Row]:
-    """Figure 5.5 in numbers: the neighbourhood weights of section 5.5, each at its best lambda."""
-    return _by_tolerance(train(bench, _vary(base, WEIGHTS), values, cases))
-
-
-def comparison(
-    bench: Bench,
-    training: Sequence[Case],
-    test: Sequence[Case],
-    variants: Mapping[str, Config],
-    source: str,
-    values: Sequence[float] = LAMBDAS,
-) -> list[Row]:
-    """Table B.1 and figure 6.5: variants with lambda trained, run on the test images.
-
-    Parameters
-    ----------
-    bench : Bench
-    training, test : sequence of Case
-        Without training images, lambda is chosen for every test image on all others.
-    variants : mapping of str to Config
-    source : str
-        What the rows are said to be measured on.
-    values : sequence of float
-        Values of lambda to choose from. Method `planes` has no lambda and is not trained.
-    """
-    normals = {name: c for name, c in variants.items() if c.method == 'normals'}
-    planes = {name: c for name, c in variants.items() if c.method != 'normals'}
-    tested: dict[str, list[Measurement]] = bench.run(planes, test)
-    trained: dict[str, float] = {}
-    results = train(bench, normals, values, training or test)
-    for name, of_lambda in results.items():
-        trained[name] = best_lambda(of_lambda)
-        if not training:
-            tested[name] = left_out(of_lambda)
-    if training:
-        chosen = {name: replace(normals[name], smoothness=trained[name]) for name in normals}
-        tested |= bench.run(chosen, test)
-    return [
-        {'series': name, 'source': source, 'lambda': trained.get(name, ''), 'tolerance': tolerance}
-        | averages(tested[name], tolerance)
-        for name in variants
-        for tolerance in TOLERANCES
-    ]
-
-
-def left_out(results: Mapping[float, Sequence[Measurement]]) -> list[Measurement]:
+def left_out(results: ByLambda) -> list[Measurement]:
     """Each image's measurement with the lambda that is best on all other images."""
     count = len(next(iter(results.values())))
     chosen = []
@@ -213,8 +112,68 @@ def left_out(results: Mapping[float, Sequence[Measurement]]) -> list[Measurement
     return chosen
 
 
-def variants(sensor: str, params: Config | None = None) -> dict[str, Config]:
-    """The rows of ours in `comparison`.
+def vary(base: Config, variations: Mapping[str, Mapping[str, Any]]) -> dict[str, Config]:
+    """`base` with each of the changes."""
+    return {name: replace(base, **changes) for name, changes in variations.items()}
+
+
+def direction_sets(base: Config, limit: int) -> dict[str, Config]:
+    """`base` with each set of up to `limit` directions (table 6.1)."""
+    return vary(base, {k: v for k, v in DIRECTIONS.items() if v['direction_count'] <= limit})
+
+
+def by_lambda(results: Mapping[str, ByLambda]) -> list[Row]:
+    """The counts at T = 0.8 for each series and lambda (figure 6.3)."""
+    return [
+        {'series': name, 'lambda': value} | averages(measurements, 0.8)
+        for name, found in results.items()
+        for value, measurements in found.items()
+    ]
+
+
+def by_tolerance(results: Mapping[str, ByLambda]) -> list[Row]:
+    """The counts of each series at its best lambda, for each tolerance (figures 6.2, 6.4)."""
+    best = {name: best_lambda(found) for name, found in results.items()}
+    return [
+        {'series': name, 'lambda': best[name], 'tolerance': tolerance}
+        | averages(found[best[name]], tolerance)
+        for name, found in results.items()
+        for tolerance in TOLERANCES
+    ]
+
+
+def comparison(
+    bench: Bench,
+    training: Sequence[Case],
+    test: Sequence[Case],
+    variants: Mapping[str, Config],
+    lambdas: Sequence[float],
+) -> list[Row]:
+    """Table B.1 and figure 6.5: variants with lambda trained, run on the test images.
+
+    Without training images, lambda is chosen for every test image on all others. Method `planes`
+    has no lambda and is not trained.
+    """
+    normals = {name: c for name, c in variants.items() if c.method == 'normals'}
+    planes = {name: c for name, c in variants.items() if c.method != 'normals'}
+    tested: dict[str, list[Measurement]] = bench.run(planes, test)
+    results = bench.train(normals, lambdas, training or test)
+    best = {name: best_lambda(found) for name, found in results.items()}
+    if training:
+        chosen = {name: replace(normals[name], smoothness=best[name]) for name in normals}
+        tested |= bench.run(chosen, test)
+    else:
+        tested |= {name: left_out(found) for name, found in results.items()}
+    return [
+        {'series': name, 'lambda': best.get(name, ''), 'tolerance': tolerance}
+        | averages(tested[name], tolerance)
+        for name in variants
+        for tolerance in TOLERANCES
+    ]
+
+
+def compared(sensor: str, params: Config | None = None) -> dict[str, Config]:
+    """Variants to compare.
 
     The thesis's method as published, both methods with the defaults and, where given, with the
     parameters of a file.
@@ -235,21 +194,8 @@ def variants(sensor: str, params: Config | None = None) -> dict[str, Config]:
     return rows
 
 
-def _compile(config: Config) -> None:
-    """Have all that `config` runs compiled, or loaded, so that no measurement contains it."""
-    camera = Camera(48, 48, 48.0, 48.0, 23.5, 23.5)
-    wall = np.full(camera.shape, 1000, np.uint16)
-    # Files of the sensor are for images of another size.
-    config = replace(config, distortion_map='', mask='')
-    Segmenter(config).segment(RangeImage.from_depth(wall, camera))
-
-
 def timing(
-    bench: Bench,
-    cases: Sequence[Case],
-    base: Config = THESIS,
-    limit: int = 1249,
-    swap_limit: int = 73,
+    bench: Bench, cases: Sequence[Case], base: Config, limit: int, swap_limit: int = 73
 ) -> list[Row]:
     """Table 6.1: seconds for the labelling, with every label at full resolution.
 
@@ -257,22 +203,19 @@ def timing(
     alpha-beta-swap, and all of them coarse to fine.
     """
     configs = {}
-    for name, config in _vary(base, DIRECTIONS).items():
-        if config.direction_count > limit:
-            continue
+    for name, config in direction_sets(base, limit).items():
         configs[name, 'expansion'] = replace(config, exact=True)
         if config.direction_count <= swap_limit:
             configs[name, 'swap'] = replace(config, exact=True, moves='swap')
         configs[name, 'coarse to fine'] = config
     for config in configs.values():
-        _compile(replace(config, cycles=1))
+        _compile(config)
     results = bench.run(configs, cases)
     rows = []
     for (name, moves), measurements in results.items():
         seconds = np.array([item.timings['labels'] for item in measurements]) / 1000
         reference = results[name, 'expansion']
         energies = [m.energy / r.energy for m, r in zip(measurements, reference, strict=True)]
-        published = SECONDS[name][0] if moves == 'expansion' else ''
         rows.append(
             {
                 'series': name,
@@ -284,7 +227,16 @@ def timing(
                 'max_s': float(seconds.max()),
                 'energy_ratio': float(np.mean(energies)),
                 'correct': averages(measurements, 0.8)['correct'],
-                'thesis_mean_s': published,
+                'thesis_mean_s': SECONDS[name][0] if moves == 'expansion' else '',
             }
         )
     return rows
+
+
+def _compile(config: Config) -> None:
+    """Have all that `config` runs compiled, or loaded, so that no measurement contains it."""
+    camera = Camera(48, 48, 48.0, 48.0, 23.5, 23.5)
+    wall = np.full(camera.shape, 1000, np.uint16)
+    # Files of the sensor are for images of another size.
+    config = replace(config, cycles=1, distortion_map='', mask='')
+    Segmenter(config).segment(RangeImage.from_depth(wall, camera))

@@ -139,15 +139,6 @@ def _figures(images: Sequence[Compared], tolerances: Sequence[float]) -> dict[st
     return {'tolerances': table, 'precision': shared['precision'], 'recall': shared['recall']}
 
 
-def as_json(value: Any) -> Any:
-    """`value` with None in the place of NaN, which JSON does not know."""
-    if isinstance(value, Mapping):
-        return {key: as_json(item) for key, item in value.items()}
-    if isinstance(value, float) and math.isnan(value):
-        return None
-    return value
-
-
 def table(figures: Mapping[str, Any]) -> str:
     """Text table of `comparison_figures` or `evaluation_figures`, one row per tolerance.
 
