@@ -18,8 +18,8 @@ from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.bag_writer import BagWriter
-from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.message_types import make_rosbags, message_types
 from rangeseg_ros.io.recordings import BagError, Recording
 from rangeseg_ros.messages.frames import DepthFrame
@@ -165,7 +165,10 @@ def open_source(path: Path) -> Recording:
     try:
         if path.suffix == '.bag':
             raise BagError('ROS 1')
-        return Recording(path)
+        source = Recording(path)
+        if not source.connections:
+            raise BagError(source.damage or 'no index')
+        return source
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:
         raise BagError(f'{path}: not a whole rosbag2 to copy from: {error}') from None

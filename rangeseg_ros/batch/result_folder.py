@@ -103,8 +103,11 @@ class ResultFolder:
     def whole(self) -> bool:
         """Whether all results are there as the bag's record says."""
         try:
-            Recording(self.bag).close()
-            return bool(read_record(self.bag).get('files') == self.digest())
+            recording = Recording(self.bag)
+            recording.close()
+            return bool(
+                recording.connections and read_record(self.bag).get('files') == self.digest()
+            )
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception:
             return False

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.io.chunks import Lost
+from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from rangeseg_ros.io.recordings import BagError, RecordingError, open_recording
+from rangeseg_ros.io.recordings import BagError, Recording, RecordingError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.images import PIXEL_TYPES
@@ -64,7 +64,7 @@ class DepthBag:
         self.lost: Counter[str] = Counter()
         self.damage = ''
         try:
-            self._recording = open_recording(path)
+            self._recording = Recording(path)
         except OSError as error:
             raise BagError(f'{path}: {error.strerror}') from None
         except RecordingError as error:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.bags import DepthBag
-from rangeseg_ros.io.chunks import Lost
 from rangeseg_ros.io.message_types import CLOUD, COMPRESSED_IMAGE, IMAGE
-from rangeseg_ros.io.recordings import BagError, RecordingError, open_recording
+from rangeseg_ros.io.recordings import BagError, Recording, RecordingError
 from rangeseg_ros.messages.frames import DepthFrame
 
 
@@ -25,7 +25,7 @@ class CloudBag:
 
     def __init__(self, path: Path, topic: str) -> None:
         self.path, self.topic = path, topic
-        self._recording = open_recording(path)
+        self._recording = Recording(path)
 
     def __enter__(self) -> CloudBag:
         return self
@@ -51,7 +51,7 @@ def open_frames(path: Path, topic: str | None, camera_topic: str | None) -> Dept
         See `DepthBag`; also several topics of clouds, and no other.
     """
     try:
-        recording = open_recording(path)
+        recording = Recording(path)
     except (OSError, RecordingError):
         return DepthBag(path, topic, camera_topic)  # which says what is wrong
     kinds, counts = dict(recording.types), recording.counts

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
-from rangeseg_ros.io.chunks import Lost
+from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.message_types import EARLY_TRANSFORMS, TRANSFORMS
-from rangeseg_ros.io.recordings import open_recording
+from rangeseg_ros.io.recordings import Recording
 from rangeseg_ros.messages.transforms import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'
@@ -35,7 +35,7 @@ class RecordedTransforms:
     """
 
     def __init__(self, path: Path, timeout: float) -> None:
-        self._recording = open_recording(path)
+        self._recording = Recording(path)
         self._timeout = round(timeout * 1e9)
         self._buffer = TransformBuffer()
         self._messages = self._read()
@@ -86,7 +86,7 @@ def fixed_frame_of(path: Path) -> str:
     """
     parents: dict[str, str] = {}
     moving: set[str] = set()
-    with closing(open_recording(path)) as recording:
+    with closing(Recording(path)) as recording:
         topics = [t for t in (MOVING, STATIC) if recording.types.get(t) in TYPES]
         for topic, _, message in islice(recording.messages(topics) if topics else (), _LOOKED_AT):
             for one in getattr(message, 'transforms', ()):
