@@ -9,14 +9,15 @@ import signal
 import sys
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import CancelledError
-from contextlib import suppress
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from typing import Any, Protocol, TypeVar
+from multiprocessing.connection import wait
+from typing import Protocol, TypeVar
 
 import cv2
 
@@ -28,8 +29,6 @@ R = TypeVar('R')
 # What tells of bad input or of a machine at its limits, and not of a fault of the program.
 EXPECTED = (ValueError, OSError, MemoryError)
 
-# A task is given to so many workers before it is held to be what ends them.
-_WORKERS_PER_TASK = 2
 # Seconds that a worker has to put away what it has begun, and between telling it again: what a
 # signal raises inside compiled code or a destructor may be lost.
 _PATIENCE = 10.0
@@ -68,103 +67,73 @@ def run_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R]:
     ValueError, OSError, MemoryError
         The first task's that fails; those that have not begun are dropped.
     """
-    return map(_successful, attempt_all(tasks, jobs))
+    for result in attempt_all(tasks, jobs):
+        if isinstance(result, Failure):
+            raise result.error
+        yield result
 
 
 def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R | Failure]:
     """Run tasks as `run_all` does, each to its result or `Failure`.
 
-    A task whose worker dies is given to another one, once. Workers end when this process does,
-    whatever ends it.
+    Tasks that are lost with a worker that dies are run again, each by itself. Workers end when
+    this process does, whatever ends it.
     """
     jobs = min(jobs or os.cpu_count() or 1, len(tasks))
     if jobs <= 1:
         yield from map(_attempted, tasks)
         return
-    pool = _Pool(jobs)
     waiting = deque(range(len(tasks)))
-    deaths: Counter[int] = Counter()
-    done: dict[int, Any] = {}
+    results: dict[int, R | Failure] = {}
+    given = 0
+    while given < len(tasks):
+        running: dict[Future[R | Failure], int] = {}
+        with _workers(jobs) as pool, suppress(BrokenProcessPool):
+            while waiting or running:
+                # No more than there are workers: no others are lost with one of them.
+                while waiting and len(running) < jobs:
+                    future = pool.submit(_attempted, tasks[waiting[0]])
+                    running[future] = waiting.popleft()
+                for future in wait_for(running, return_when=FIRST_COMPLETED).done:
+                    results[running[future]] = future.result()
+                    del running[future]
+                while given in results:
+                    yield results.pop(given)
+                    given += 1
+        for number in sorted(running.values()):
+            results[number] = _attempted_alone(tasks[number])
+        while given in results:
+            yield results.pop(given)
+            given += 1
+
+
+def _attempted(task: Task[R]) -> R | Failure:
     try:
-        for index in range(len(tasks)):
-            while index not in done:
-                while waiting and pool.free():
-                    pool.give(waiting[0], tasks[waiting[0]])
-                    waiting.popleft()
-                for number, result in pool.results():
-                    if not isinstance(result, _Death):
-                        done[number] = result
-                    elif deaths[number] + 1 < _WORKERS_PER_TASK:
-                        deaths[number] += 1
-                        waiting.appendleft(number)
-                    else:
-                        done[number] = Failure(OSError(str(result)))
-            yield done.pop(index)
+        return task.run()
+    except EXPECTED as error:
+        return Failure(error)
+
+
+def _attempted_alone(task: Task[R]) -> R | Failure:
+    # The worker that died may have been that of another task: two of its own tell.
+    for _ in range(2):
+        with _workers(1) as pool, suppress(BrokenProcessPool):
+            return pool.submit(_attempted, task).result()
+    return Failure(OSError('2 workers that ran it have died (out of memory?)'))
+
+
+@contextmanager
+def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that work on tasks; those in the middle of one put away what they have begun."""
+    others = set(multiprocessing.active_children())
+    # Spawned, not forked: OpenCV's threads do not survive a fork.
+    context = multiprocessing.get_context('spawn')
+    pool = ProcessPoolExecutor(count, context, initializer=_begin)
+    try:
+        yield pool
     finally:
-        pool.end()
-
-
-@dataclass(frozen=True)
-class _Death:
-    """Of a worker, in place of a result."""
-
-    code: int | None
-
-    def __str__(self) -> str:
-        how = f'with code {self.code}'
-        if self.code and self.code < 0:
-            how = f'by signal {-self.code}'
-        return f'{_WORKERS_PER_TASK} workers ended {how} (out of memory?)'
-
-
-class _Pool:
-    """Spawned processes that work on one task each."""
-
-    def __init__(self, size: int) -> None:
-        self._size = size
-        # Spawned, not forked: OpenCV's threads do not survive a fork.
-        self._context = multiprocessing.get_context('spawn')
-        self._idle: list[tuple[Connection, SpawnProcess]] = []
-        self._busy: dict[Connection, tuple[SpawnProcess, int]] = {}
-
-    def free(self) -> bool:
-        """Whether a task can be given."""
-        return len(self._busy) < self._size
-
-    def give(self, number: int, task: Task[Any]) -> None:
-        """Have a worker begin a task."""
-        connection, process = self._idle.pop() if self._idle else self._start()
-        # Of a worker that died while it had nothing to do, `results` tells as of any other.
-        self._busy[connection] = process, number
-        try:
-            connection.send(task)
-        except OSError:
-            process.join()
-
-    def results(self) -> Iterator[tuple[int, Any]]:
-        """Wait for workers to finish: the numbers of their tasks, and what came of them."""
-        for connection in wait(list(self._busy)):
-            assert isinstance(connection, Connection)
-            process, number = self._busy.pop(connection)
-            try:
-                result = connection.recv()
-            except (EOFError, OSError):
-                process.join()
-                connection.close()
-                yield number, _Death(process.exitcode)
-                continue
-            self._idle.append((connection, process))
-            if isinstance(result, _Fault):
-                raise result.error from RuntimeError(result.trace)
-            yield number, result
-
-    def end(self) -> None:
-        """End all workers; those in the middle of a task put away what they have begun."""
-        workers = {process: c for c, process in self._idle}
-        workers.update((process, c) for c, (process, _) in self._busy.items())
-        for connection in workers.values():
-            connection.close()
-        alive = list(workers)
+        alive = [child for child in multiprocessing.active_children() if child not in others]
+        pool.shutdown(wait=False, cancel_futures=True)
         end = time.monotonic() + _PATIENCE
         while alive and time.monotonic() < end:
             for process in alive:
@@ -173,48 +142,15 @@ class _Pool:
             alive = [process for process in alive if process.is_alive()]
         for process in alive:
             process.kill()
-            process.join()
-
-    def _start(self) -> tuple[Connection, SpawnProcess]:
-        here, there = self._context.Pipe()
-        process = self._context.Process(target=_work, args=(there,), daemon=True)
-        process.start()
-        there.close()
-        return here, process
 
 
-@dataclass(frozen=True)
-class _Fault:
-    """An error of the program in a worker."""
-
-    error: Exception
-    trace: str
-
-
-def _work(connection: Connection) -> None:
-    """Do tasks until there are no more."""
+def _begin() -> None:
+    """Prepare a worker: it is interrupted by its parent only, and ends with it."""
     cv2.setNumThreads(1)
-    # Interrupted by its parent only.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, _exit)
     silence_losses()
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    try:
-        while True:
-            try:
-                task = connection.recv()
-            except (EOFError, OSError):
-                return
-            # A parent that has gone wants no result; the next `recv` says so.
-            with suppress(ConnectionError):
-                try:
-                    connection.send(_attempted(task))
-                except Exception as error:
-                    import traceback
-
-                    connection.send(_Fault(error, traceback.format_exc()))
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _exit(number: int, stack: object) -> None:
@@ -230,23 +166,12 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent:
         wait([parent.sentinel])
+        # A result that nobody takes is no error to tell of.
+        sys.stderr = open(os.devnull, 'w')  # noqa: SIM115
         for _ in range(round(_PATIENCE / _AGAIN)):
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(_AGAIN)
         os._exit(1)
-
-
-def _attempted(task: Task[R]) -> R | Failure:
-    try:
-        return task.run()
-    except EXPECTED as error:
-        return Failure(error)
-
-
-def _successful(result: R | Failure) -> R:
-    if isinstance(result, Failure):
-        raise result.error
-    return result
 
 
 def check_scheduler(address: str) -> None:

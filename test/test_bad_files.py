@@ -27,11 +27,9 @@ BOMB = 'a: &a [1,1,1,1,1,1,1,1,1,1]\n' + ''.join(
     [
         ('data: &d [*d, *d]', 'nested too deeply'),
         ('[' * 20000, 'nested too deeply'),
-        ('{a: ' * 3000, 'nested too deeply'),
         (BOMB, 'too large'),
         ('a: ' + 'x' * 2**21, 'too large'),
         ('a: 2001-99-99', 'not a YAML file'),
-        ('a: ' + '1' * 5000, 'not a YAML file'),
         ('a: \x00', 'not a YAML file'),
     ],
 )
@@ -130,16 +128,6 @@ def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):
             read_depth(tmp_path / name, (48, 64))
 
 
-@pytest.mark.parametrize('suffix', ['.png', '.tiff'])
-@pytest.mark.parametrize('kind', [np.uint16, np.float32])
-def test_images_of_the_right_size_are_read(tmp_path, suffix, kind):
-    if suffix == '.png' and kind == np.float32:
-        return
-    image = np.arange(12, dtype=kind).reshape(3, 4)
-    write_image(tmp_path / f'image{suffix}', image)
-    np.testing.assert_array_equal(read_depth(tmp_path / f'image{suffix}', (3, 4)), image)
-
-
 def test_damaged_images_are_one_line(tmp_path, capfd):
     write_image(
         tmp_path / 'a.png', np.random.default_rng(0).integers(0, 9999, (48, 64)).astype('u2')
@@ -157,10 +145,10 @@ def test_damaged_images_are_one_line(tmp_path, capfd):
     assert capfd.readouterr().err == ''
 
 
-@pytest.mark.parametrize('suffix', ['.pgm', '.jp2', '.bmp', '.pfm', '.hdr'])
+@pytest.mark.parametrize('suffix', ['.bmp', '.pfm'])
 def test_other_formats_are_refused(tmp_path, suffix):
-    kind = np.float32 if suffix in ('.pfm', '.hdr') else np.uint8
-    image = np.ones((8, 8, 3) if suffix == '.hdr' else (8, 8), kind)
+    kind = np.float32 if suffix == '.pfm' else np.uint8
+    image = np.ones((8, 8), kind)
     cv2.imwrite(str(tmp_path / f'a{suffix}'), image)
     with pytest.raises(ImageFileError, match='PNG or TIFF'):
         read_depth(tmp_path / f'a{suffix}')

@@ -97,7 +97,7 @@ def test_no_scheduler(tmp_path, monkeypatch, capsys):
 def test_without_distributed_replay_says_what_is_missing(tmp_path, monkeypatch, capsys):
     record_walls(tmp_path / 'a', 1)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr('rangeseg_ros.cli.replay.find_spec', lambda name: None)
+    monkeypatch.setattr('rangeseg_ros.cli.recordings.find_spec', lambda name: None)
     arguments = ['replay', 'a', '--output', 'out', '--scheduler', 'tcp://127.0.0.1:1']
     monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
     with pytest.raises(SystemExit) as end:

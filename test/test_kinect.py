@@ -189,33 +189,6 @@ def test_smooth_field_has_unit_variance_up_to_the_border(sigma):
         assert along == pytest.approx(np.exp(-((np.arange(6) / sigma[0] / 2) ** 2)), abs=0.06)
 
 
-def test_blind_zones():
-    frame = simulate_kinect(wall(0.79))
-    assert not frame.depth.any() and not frame.labels.any() and frame.planes == []
-    frame = simulate_kinect(wall(2.0))
-    assert not frame.depth[:, -8:].any() and frame.depth[:, :-8].all()
-
-
-def test_truth_is_where_depth_is():
-    for seed in range(3):
-        frame = simulate_kinect(scenes.kinect_room(seed), kinect_camera(320, 240), seed=seed)
-        assert np.array_equal(frame.labels > 0, frame.depth > 0)
-
-
-def test_same_seeds_same_frame():
-    def render(**options):
-        return simulate_kinect(scenes.kinect_room(1, 2), kinect_camera(160, 120), **options).depth
-
-    assert np.array_equal(render(seed=1), render(seed=1))
-    assert not np.array_equal(render(seed=1), render(seed=2))
-    assert not np.array_equal(render(sensor_seed=1), render(sensor_seed=2))
-
-
-def test_unknown_noise():
-    with pytest.raises(ValueError, match='noise must be one of measured'):
-        simulate_kinect(wall(1.0), noise='loud')
-
-
 ANNOTATED = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'annotated'
 
 

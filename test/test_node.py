@@ -19,8 +19,7 @@ from rclpy.qos import ReliabilityPolicy
 from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, ended, values_of
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 
-from rangeseg_ros import Config, RangeImage, Segmenter, planes_from_message
-from rangeseg_ros.drawing import overlay
+from rangeseg_ros import Config, RangeImage, Segmenter
 
 pytestmark = pytest.mark.ros
 
@@ -58,39 +57,6 @@ def test_labels_are_those_of_the_core_under_the_header_of_the_image(bench, expec
     assert (message.encoding, message.is_bigendian, message.step) == ('mono16', 0, 320)
 
 
-def test_planes_are_the_walls(bench):
-    image = bench.image()
-    with bench.listening('planes'):
-        labels = bench.segment(image)
-        message = bench.until(lambda: bench.find('planes', image))
-    assert message.header == image.header
-    planes = np.sort(planes_from_message(message), order='normal_x')
-    # The walls are z = 2 - |x| metres, seen from the origin; depth is rounded to millimetres.
-    half = np.sqrt(0.5)
-    normals = np.column_stack([planes[f'normal_{axis}'] for axis in 'xyz'])
-    np.testing.assert_allclose(normals, [(-half, 0, -half), (half, 0, -half)], atol=2e-3)
-    np.testing.assert_allclose(planes['distance'], 2 * half, atol=2e-3)
-    for plane in planes:
-        assert plane['count'] == np.count_nonzero(labels == plane['label'])
-
-
-def test_markers_and_overlay(bench):
-    image = bench.image()
-    with bench.listening('markers', 'overlay'):
-        bench.segment(image)
-        picture = bench.until(lambda: bench.find('overlay', image))
-        markers = bench.until(lambda: bench.received['markers'])[-1].markers
-    depth = RangeImage.from_depth(corner_depth(bench.camera), bench.camera)
-    result = Segmenter(Config()).segment(depth)
-    np.testing.assert_array_equal(
-        np.frombuffer(picture.data, np.uint8).reshape(120, 160, 3),
-        overlay(depth.inverse, result.labels, result.planes),
-    )
-    assert markers[0].action == markers[0].DELETEALL
-    assert sum(marker.ns == 'normals' for marker in markers) == 2
-    assert {marker.header.frame_id for marker in markers} == {image.header.frame_id}
-
-
 def test_nothing_is_subscribed_while_nobody_listens(node):
     node.ignored(DEPTH)
     node.ignored(INFO)
@@ -114,9 +80,9 @@ def test_reliability_follows_the_publishers(node, expected):
             np.testing.assert_array_equal(node.segment(), expected)
 
 
-@pytest.mark.parametrize('order', '<>')
-@pytest.mark.parametrize('padding', [0, 6])
-@pytest.mark.parametrize('encoding', ['16UC1', 'mono16', '32FC1'])
+@pytest.mark.parametrize(
+    ('encoding', 'padding', 'order'), [('16UC1', 6, '<'), ('mono16', 0, '>'), ('32FC1', 6, '>')]
+)
 def test_encodings_byte_orders_and_padding(bench, expected, encoding, padding, order):
     depth = corner_depth(bench.camera)
     if encoding == '32FC1':

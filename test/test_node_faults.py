@@ -1,6 +1,5 @@
 """Faults the node must survive, over real DDS: the next good frame is segmented."""
 
-import itertools
 import os
 import time
 from array import array
@@ -12,15 +11,13 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import BEST_EFFORT, DEPTH, INFO, NODE, Bench, corner_depth, values_of
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
+from sensor_msgs.msg import PointCloud2
 
 from rangeseg_ros import planes_from_message
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 pytestmark = pytest.mark.ros
-
-LOST = 'messages lost by the middleware'
 
 
 @pytest.fixture(scope='module')
@@ -69,8 +66,7 @@ def test_camera_info_that_comes_late_or_never(bench):
     assert_segments(bench)
 
 
-@pytest.mark.parametrize('focal', [0.0, float('nan'), -500.0, float('inf')])
-def test_impossible_focal_length(bench, focal):
+def test_impossible_focal_length(bench, focal=float('nan')):
     bench.camera_info.publish(bench.info(k=[focal, 0.0, 80.0, 0.0, focal, 60.0, 0.0, 0.0, 1.0]))
     error_about(bench, 'unusable camera_info', bench.image())
     assert_segments(bench)
@@ -94,13 +90,8 @@ def test_camera_info_of_another_size(bench):
     'fields, words',
     [
         ({'encoding': 'rgb8'}, 'rgb8'),
-        ({'encoding': ''}, "encoding ''"),
         ({'data': array('B', bytes(1000))}, '1000 bytes'),
-        ({'data': array('B')}, '0 bytes'),
-        ({'step': 100}, 'step'),
-        ({'step': 2**32 - 1}, '4294967295'),
         ({'width': 161}, '161x120'),
-        ({'width': 0, 'height': 0}, '0x0'),
         ({'height': 2**32 - 1}, '4294967295'),
     ],
 )
@@ -110,35 +101,14 @@ def test_malformed_image(bench, fields, words):
     assert_segments(bench)
 
 
-@pytest.mark.parametrize(
-    'depth',
-    [
-        np.zeros((120, 160), np.uint16),
-        np.full((120, 160), np.nan, np.float32),
-        np.full((120, 160), np.inf, np.float32),
-        np.full((120, 160), -1, np.float32),
-    ],
-)
-def test_frame_without_valid_depth(bench, depth):
-    encoding = '16UC1' if depth.dtype == np.uint16 else '32FC1'
-    image = bench.image(depth, encoding)
+def test_frame_without_valid_depth(bench):
+    image = bench.image(np.full((120, 160), np.nan, np.float32), '32FC1')
     assert not bench.segment(image).any()
     bench.reported(
         lambda status: status.message == 'no planes: no valid depth',
         lambda: bench.depth.publish(image),
     )
     assert_segments(bench)
-
-
-def test_some_values_are_not_finite(bench):
-    depth = (corner_depth(bench.camera) / 1000).astype(np.float32)
-    depth[20:30, 20:30] = np.nan
-    depth[60:70, 20:30] = np.inf
-    depth[20:30, 100:110] = -np.inf
-    depth[60:70, 100:110] = -1
-    labels = bench.segment(bench.image(depth, '32FC1'))
-    assert not labels[~(np.isfinite(depth) & (depth > 0))].any()
-    assert len(set(labels.ravel()) - {0}) == 2
 
 
 def test_size_and_encoding_change_in_midstream(bench):
@@ -174,34 +144,6 @@ def test_a_topic_of_another_type_is_told(node):
         error_about(node, '(1 publishers of sensor_msgs/msg/PointCloud2)')
 
 
-def test_subscriber_joins_late(node):
-    with (
-        node.advertised(Image, DEPTH) as node.depth,
-        node.advertised(CameraInfo, INFO) as node.camera_info,
-    ):
-        for _ in range(10):
-            node.camera_info.publish(node.info())
-            node.depth.publish(node.image())
-        with node.listening('labels'):
-            node.settled(DEPTH, node.depth.qos_profile.reliability)
-            node.settled(INFO, node.depth.qos_profile.reliability)
-            assert_segments(node)
-
-
-def test_parameters_change_at_10_hz(bench):
-    enough = len(bench.received['labels']) + 10
-    changes = itertools.count()
-
-    def change():
-        index = next(changes)
-        bench.send()
-        values = {'smoothness': 20.0 + index, 'cycles': 1 + index % 3, 'exact': False}
-        assert bench.set_parameters(atomically=True, **values).successful
-
-    bench.repeat(change, lambda: len(bench.received['labels']) > enough, period=0.1)
-    assert_segments(bench)
-
-
 def test_lost_images_are_noticed(node):
     """Best-effort images over the default shared-memory segment of Fast DDS get lost."""
     camera = kinect_camera(640, 480)
@@ -225,35 +167,6 @@ def test_lost_images_are_noticed(node):
         assert 'fastdds_large_images.xml' in status.message
     with node.listening('labels'), node.camera_on():
         assert_segments(node)
-
-
-def test_losses_while_sizes_change_cost_no_memory():
-    """Large and small best-effort images in turn: Fast DDS then reports 2^31 - 1 lost ones."""
-    limited = 'ulimit -v 6000000; exec "$0" "$@"'
-    command = ['/bin/sh', '-c', limited, *NODE]
-    cameras = [kinect_camera(640, 480), kinect_camera(160, 120)]
-    topics = f'/limited{DEPTH}', f'/limited{INFO}'
-    with Bench(command=command, namespace='limited') as bench:
-        images = [bench.image(corner_depth(camera)) for camera in cameras]
-        sent = []
-
-        def publish():
-            size = len(sent) // 6 % 2
-            sent.append(size)
-            bench.send(images[size], bench.info(cameras[size]))
-
-        with bench.listening('labels'), bench.camera_on(*topics, qos=BEST_EFFORT):
-            # Several turns of both sizes, and until the node has told of it.
-            bench.repeat(publish, lambda: len(sent) > 48, period=0.05)
-            waiting = {'period': 0.05, 'timeout': 30.0, 'required': False}
-            if not bench.repeat(publish, lambda: 'said once' in bench.log(), **waiting):
-                pytest.skip('Fast DDS lost no image')
-            values = values_of(bench.reported(lambda s: int(values_of(s)[LOST]), publish))
-            assert bench.stream().any()
-        # Fast DDS reports impossible losses in most runs, not in all: either way no more are
-        # counted than there were frames.
-        assert 0 < int(values[LOST]) < len(sent)
-        assert bench.log().count('said once') == 1
 
 
 def test_camera_info_of_another_stamp_is_not_that_of_the_image(bench):

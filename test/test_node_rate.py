@@ -66,12 +66,6 @@ def test_every_frame_is_made_again_with_what_it_records(bench, depth):
     assert bench.set_parameters(work_budget=1.0)[0].successful
 
 
-@pytest.mark.parametrize('rate', [-1.0, 1000.5, float('nan'), float('inf')])
-def test_no_rate(bench, rate):
-    (result,) = bench.set_parameters(target_rate=rate)
-    assert not result.successful and 'target_rate' in result.reason
-
-
 def test_a_rate_is_for_the_shortcuts_of_planes(bench):
     for other in ({'method': 'normals'}, {'exact': True}):
         result = bench.set_parameters(atomically=True, target_rate=5.0, **other)

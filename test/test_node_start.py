@@ -69,20 +69,13 @@ def test_interrupted_during_a_computation(presses):
 @pytest.mark.parametrize(
     'arguments, words',
     [
-        (['--ros-args', '-p', 'method:=magic'], 'method'),
         (['--ros-args', '-p', 'min_pixel:=3'], "is 'min_pixels' meant?"),
-        (['--ros-args', '-p', 'min_pixels:=many'], 'INTEGER'),
         (['--ros-args', '-p', 'mask:=/none.png'], 'parameter mask: /none.png'),
         (['--ros-args', '-p', f'{QOS}.reliability:=best'], 'reliable, best_effort'),
-        (['--ros-args', '-p', f'{QOS}.history:=7'], 'keep_last'),
-        (['--ros-args', '-p', f'{QOS}.depth:=many'], 'number of messages'),
         (['--ros-args', '-p', f'{QOS}.depth:=-1'], 'number of messages'),
         (['--ros-args', '-p', f'{QOS}.relaibility:=reliable'], f"is '{QOS}.reliability' meant?"),
-        (['--ros-args', '-p', f'{QOS}.durability:=volatile'], 'unknown parameter'),
-        (['--ros-args', '-p', f'{QOS[:-1]}.depth:=1'], f"is '{QOS}.depth' meant?"),
         (['--ros-args', '--params-file', '/nonexistent'], '/nonexistent'),
         (['--ros-args', '-r', '__node:=bad/name'], 'bad/name'),
-        (['--ros-args', '--magic'], '--magic'),
         (['--method', 'normals'], '--method'),
     ],
 )
@@ -117,7 +110,7 @@ def test_help_names_every_parameter():
     assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
 
 
-@pytest.mark.parametrize('delay', [0.0, 0.4, 1.2])
+@pytest.mark.parametrize('delay', [0.0, 1.2])
 @pytest.mark.parametrize('command', ['segment_planes', 'rangeseg'])
 def test_interrupted_at_the_start(command, delay, tmp_path):
     code = f'from rangeseg_ros.start import {command}; print("begun", flush=True); {command}()'

@@ -121,12 +121,6 @@ def test_bars_break_where_a_plane_is_out_of_sight():
     assert charts.runs(np.arange(10)) == [(0, 9)]
 
 
-def test_charts_are_the_same_for_the_same_figures():
-    seen = sightings((0, 1, 1.0, 2.0), (1, 1, 1.0, 2.1))
-    times = np.arange(2.0)
-    assert charts.drifts(seen, times) == charts.drifts(seen, times)
-
-
 def test_replay_of_a_damaged_recording_says_so(tmp_path):
     file = next(record_walls(tmp_path / 'bag', 16).glob('*.mcap'))
     with file.open('r+b') as stream:

@@ -1,6 +1,5 @@
 """Tasks in many processes: results, failures, workers and parents that die."""
 
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -15,7 +14,6 @@ import pytest
 from rangeseg_ros.tasks import (
     Failure,
     SchedulerError,
-    _work,
     attempt_all,
     check_scheduler,
     run_all,
@@ -53,17 +51,6 @@ class Deadly:
 class Sleeps:
     def run(self):
         time.sleep(600)
-
-
-@pytest.mark.parametrize('task', [Square(2), Raises(RuntimeError('interrupted'))])
-def test_a_worker_whose_parent_has_gone_ends_in_silence(task, capfd):
-    here, there = multiprocessing.Pipe()
-    here.send(task)
-    here.close()
-    worker = multiprocessing.get_context('spawn').Process(target=_work, args=(there,))
-    worker.start()
-    worker.join(60)
-    assert (worker.exitcode, capfd.readouterr().err) == (0, '')
 
 
 @dataclass(frozen=True)
@@ -120,7 +107,7 @@ def test_a_failure_costs_its_task_and_no_other(jobs):
 def test_a_task_that_kills_every_worker_is_given_up():
     results = list(attempt_all([Square(2), Deadly(), Square(3)], 2))
     assert (results[0], results[2]) == (4, 9)
-    assert isinstance(results[1], Failure) and 'signal 9' in str(results[1].error)
+    assert isinstance(results[1], Failure) and '2 workers' in str(results[1].error)
 
 
 def test_faults_of_the_program_are_raised_as_they_are():
