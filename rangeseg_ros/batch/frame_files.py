@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from numpy.typing import NDArray
+
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
@@ -31,24 +33,8 @@ class FrameFile:
     write: Callable[[Path, RangeImage, Segmentation], None]
 
 
-def _labels(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_image(path, result.labels)
-
-
-def _overlay(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_image(path, overlay(image.inverse, result.labels, result.planes))
-
-
-def _normals(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_image(path, result.normals)
-
-
-def _terrain(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_image(path, result.terrain)
-
-
-def _height(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_image(path, result.height)
+def _image(ending: str, pick: Callable[[RangeImage, Segmentation], NDArray]) -> FrameFile:
+    return FrameFile(ending, lambda path, image, result: write_image(path, pick(image, result)))
 
 
 def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
@@ -61,11 +47,14 @@ def _stairs(path: Path, image: RangeImage, result: Segmentation) -> None:
 
 
 FRAME_FILES = {
-    'labels': FrameFile('_labels.png', _labels),
-    'overlay': FrameFile('_overlay.png', _overlay),
-    'normals': FrameFile('_normals.tiff', _normals),
-    'terrain': FrameFile('_terrain.png', _terrain),
-    'height': FrameFile('_height.tiff', _height),
+    'labels': _image('_labels.png', lambda image, result: result.labels),
+    'overlay': _image(
+        '_overlay.png',
+        lambda image, result: overlay(image.inverse, result.labels, result.planes),
+    ),
+    'normals': _image('_normals.tiff', lambda image, result: result.normals),
+    'terrain': _image('_terrain.png', lambda image, result: result.terrain),
+    'height': _image('_height.tiff', lambda image, result: result.height),
     'planes': FrameFile('_planes.csv', _planes),
     'stairs': FrameFile('_stairs.csv', _stairs),
 }

@@ -1,16 +1,14 @@
-"""Time, memory and energy of the segmenter on the frames of a camera."""
+"""Time and memory of the segmenter on the frames of a camera."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import multiprocessing
 import re
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +20,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
-from rangeseg_ros.digest import code_digest
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
 
 WARM_UP = 3
@@ -52,32 +48,18 @@ class Frames:
     scale: float | None = None
 
     def image(self, path: Path, depth: NDArray) -> RangeImage:
-        """Range image of the content `depth` of a file.
-
-        Raises
-        ------
-        RangeImageError
-            As `RangeImage.from_depth`, naming the file.
-        """
+        """Range image of the content `depth` of a file, which RangeImageError names."""
         try:
             return RangeImage.from_depth(depth, self.camera, self.scale)
         except RangeImageError as error:
             raise RangeImageError(f'{path}: {error}') from None
 
-    def read(self, path: Path) -> RangeImage:
-        """Range image of a file; raises also what `read_depth` raises."""
-        return self.image(path, read_depth(path))
-
-
-def _silent(paths: Iterable[Path], total: int) -> Iterable[Path]:
-    return paths
-
 
 def measure(
     frames: Frames,
     config: Config,
-    rounds: int = 3,
-    progress: Progress = _silent,
+    rounds: int,
+    progress: Progress,
     threads: int | None = None,
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
@@ -105,7 +87,8 @@ def measure(
         `threads`.
     """
     # What numba has not compiled yet is compiled and cached here, not where it is measured.
-    Segmenter(config).segment(corrected(frames.read(frames.paths[0]), config))
+    first = frames.paths[0]
+    Segmenter(config).segment(corrected(frames.image(first, read_depth(first)), config))
     with ProcessPoolExecutor(1, multiprocessing.get_context('spawn')) as pool:
         return pool.submit(_measure, frames, config, rounds, progress, threads).result()
 
@@ -172,51 +155,8 @@ def peak_memory() -> float:
     return int(found[1]) / 1024 if found else math.nan
 
 
-def energy_ratio(
-    frames: Frames, config: Config, cache: Path, progress: Progress = _silent
-) -> dict[str, float]:
-    """Energy of the labellings against those of the exact minimisation.
-
-    Parameters
-    ----------
-    frames : Frames
-    config : Config
-        Compared to itself with `exact`.
-    cache : Path
-        Folder of the exact energies: what is there is not computed again.
-    progress : callable
-        As for `measure`.
-
-    Returns
-    -------
-    dict
-        `median` and `worst` over the frames; below 1 where the exact run ends higher.
-    """
-    segmenter, exact = Segmenter(config), Segmenter(replace(config, exact=True))
-    ratios = []
-    for path in progress(frames.paths, len(frames.paths)):
-        image = corrected(frames.read(path), config)
-        energy, least = segmenter.segment(image).energy, _cached_energy(exact, image, cache)
-        with np.errstate(divide='ignore'):
-            ratios.append(1.0 if energy == least else float(np.divide(energy, least)))
-    return {'median': float(np.median(ratios)), 'worst': max(ratios)}
-
-
-def _cached_energy(segmenter: Segmenter, image: RangeImage, cache: Path) -> float:
-    digest = hashlib.sha256(code_digest())
-    digest.update(repr((asdict(segmenter.config), image.camera)).encode())
-    digest.update(image.inverse.tobytes())
-    path = cache / f'{digest.hexdigest()[:16]}.json'
-    if path.exists():
-        return float(json.loads(path.read_text()))
-    energy = float(segmenter.segment(image).energy)
-    with replacing(path) as partial:
-        partial.write_text(json.dumps(energy))
-    return energy
-
-
 def table(figures: dict[str, Any]) -> str:
-    """Text of what `measure` gives, with `energy_ratio` where there is one."""
+    """Text of what `measure` gives."""
     rows = [('stage', 'median ms', 'p95 ms')]
     for name, stage in (*figures['stages'].items(), ('total', figures['total'])):
         rows.append((name, f'{stage["median_ms"]:.1f}', f'{stage["p95_ms"]:.1f}'))
@@ -228,33 +168,4 @@ def table(figures: dict[str, Any]) -> str:
         ('peak memory, MB', 'peak_memory_mb', '.0f'),
     ]
     lines += [f'{title:<20}{figures[key]:>12{form}}' for title, key, form in single]
-    if 'energy_ratio' in figures:
-        ratio = figures['energy_ratio']
-        lines.append(f'energy / exact: median {ratio["median"]:.4f}, worst {ratio["worst"]:.4f}')
-    return '\n'.join(lines)
-
-
-def budget_table(series: dict[str, dict[str, Any]]) -> str:
-    """Text of `measure` figures of several values of `work_budget`."""
-    head = ('median ms', 'p95 ms', 'cpu ms')
-    lines = [f'{"budget":<12}' + ''.join(f'{title:>11}' for title in head)]
-    for budget, figures in series.items():
-        total = figures['total']
-        lines.append(
-            f'{budget:<12}{total["median_ms"]:>11.1f}{total["p95_ms"]:>11.1f}'
-            f'{figures["cpu_ms"]:>11.1f}'
-        )
-    return '\n'.join(lines)
-
-
-def scaling_table(series: dict[str, dict[str, Any]]) -> str:
-    """Text of `measure` figures of several sizes of image, each with its `ratio`."""
-    head = ('median ms', 'p95 ms', 'ratio', 'cpu ms', 'peak MB')
-    lines = [f'{"size":<12}' + ''.join(f'{title:>11}' for title in head)]
-    for size, figures in series.items():
-        total = figures['total']
-        lines.append(
-            f'{size:<12}{total["median_ms"]:>11.1f}{total["p95_ms"]:>11.1f}'
-            f'{figures["ratio"]:>11.2f}{figures["cpu_ms"]:>11.1f}{figures["peak_memory_mb"]:>11.0f}'
-        )
     return '\n'.join(lines)

@@ -64,29 +64,18 @@ def _of_markers(draw: Callable[[RangeImage, Segmentation], list[Marker]]) -> Out
     )
 
 
-def _labels(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return image_message(make, header, result.labels, 'mono16')
+def _of_image(encoding: str, pick: Callable[[RangeImage, Segmentation], Any]) -> Output:
+    """A topic of images."""
+    return Output(
+        'sensor_msgs/msg/Image',
+        lambda make, header, image, result: image_message(
+            make, header, pick(image, result), encoding
+        ),
+    )
 
 
 def _planes(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
     return planes_message(make, header, result.planes)
-
-
-def _overlay(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    picture = overlay(image.inverse, result.labels, result.planes)
-    return image_message(make, header, picture, 'rgb8')
-
-
-def _normals(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return image_message(make, header, result.normals, '32FC3')
-
-
-def _edges(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return image_message(make, header, 255 * result.edges.astype(np.uint8), 'mono8')
-
-
-def _terrain(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return image_message(make, header, result.terrain, 'mono8')
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -133,13 +122,15 @@ def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 
 
 OUTPUTS = {
-    'labels': Output('sensor_msgs/msg/Image', _labels),
+    'labels': _of_image('mono16', lambda image, result: result.labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
     'markers': _of_markers(lambda image, result: of_planes(result.planes)),
-    'overlay': Output('sensor_msgs/msg/Image', _overlay),
-    'normals': Output('sensor_msgs/msg/Image', _normals),
-    'edges': Output('sensor_msgs/msg/Image', _edges),
-    'terrain': Output('sensor_msgs/msg/Image', _terrain),
+    'overlay': _of_image(
+        'rgb8', lambda image, result: overlay(image.inverse, result.labels, result.planes)
+    ),
+    'normals': _of_image('32FC3', lambda image, result: result.normals),
+    'edges': _of_image('mono8', lambda image, result: 255 * result.edges.astype(np.uint8)),
+    'terrain': _of_image('mono8', lambda image, result: result.terrain),
     'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
     'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
     'drops': Output('sensor_msgs/msg/PointCloud2', _drops),

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.calibrate import Calibration
+from rangeseg_ros.report.charts import svg
 from rangeseg_ros.report.page import write_page
 
 
@@ -133,7 +131,7 @@ def _images(
         axes.set_title(title, fontsize=10)
         axes.set_axis_off()
         figure.colorbar(drawn, ax=axes, shrink=0.8)
-    return _svg(figure)
+    return svg(figure)
 
 
 def _profiles(offset: NDArray[np.float32], bands: NDArray[np.float64]) -> str:
@@ -149,12 +147,4 @@ def _profiles(offset: NDArray[np.float32], bands: NDArray[np.float64]) -> str:
     right.set_xlabel('row, mean over the columns')
     for axes in (left, right):
         axes.grid(alpha=0.3)
-    return _svg(figure)
-
-
-def _svg(figure: Figure) -> str:
-    text = io.StringIO()
-    # Without date and random identifiers: the same figures give the same bytes.
-    with rc_context({'svg.hashsalt': 'rangeseg'}):
-        FigureCanvasSVG(figure).print_svg(text, metadata={'Date': None})
-    return text.getvalue()
+    return svg(figure)

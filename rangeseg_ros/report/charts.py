@@ -120,6 +120,11 @@ def lines(
 def _finished(figure: Figure, axes: Axes, label: str) -> str:
     axes.set_xlabel(label)
     axes.grid(alpha=0.3)
+    return svg(figure)
+
+
+def svg(figure: Figure) -> str:
+    """A figure as SVG."""
     text = io.StringIO()
     # Without date and random identifiers: the same figures give the same bytes.
     with rc_context({'svg.hashsalt': 'rangeseg'}):

@@ -20,6 +20,7 @@ from rclpy.exceptions import (
 )
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.signals import SignalHandlerOptions, install_signal_handlers
@@ -72,40 +73,16 @@ class SegmentPlanes(LifecycleNode):
         self._silent = self._active = False
         self._statistics = FrameStatistics()
         self._seldom = SeldomCallbackGroup(_EVENT_INTERVAL)
-        events = PublisherEventCallbacks(matched=lambda event: self._follow_demand())
-        overriding = QoSOverridingOptions.with_default_policies()
-        self._outputs = {
-            name: self.create_publisher(
-                message_class(output.kind),
-                f'~/{name}',
-                QoSProfile(depth=5),
-                event_callbacks=events,
-                callback_group=self._seldom,
-                qos_overriding_options=overriding,
-            )
-            for name, output in OUTPUTS.items()
-        }
+        newest = QoSProfile(depth=5)
         # A map is for whoever comes, whenever that is.
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._maps = {
-            name: self.create_publisher(
-                message_class(kind),
-                f'~/{name}',
-                latched,
-                event_callbacks=events,
-                callback_group=self._seldom,
-                qos_overriding_options=overriding,
-            )
-            for name, (kind, _) in MAP_OUTPUTS.items()
+        self._outputs = {
+            name: self._publisher(name, output.kind, newest) for name, output in OUTPUTS.items()
         }
-        self._odometry = self.create_publisher(
-            message_class(ODOMETRY),
-            '~/odometry',
-            QoSProfile(depth=5),
-            event_callbacks=events,
-            callback_group=self._seldom,
-            qos_overriding_options=overriding,
-        )
+        self._maps = {
+            name: self._publisher(name, kind, latched) for name, (kind, _) in MAP_OUTPUTS.items()
+        }
+        self._odometry = self._publisher('odometry', ODOMETRY, newest)
         self._diagnostics = self.create_publisher(
             DiagnosticArray, '/diagnostics', 10, callback_group=self._seldom
         )
@@ -124,6 +101,16 @@ class SegmentPlanes(LifecycleNode):
         else:
             self.trigger_configure()
             self.trigger_activate()
+
+    def _publisher(self, name: str, kind: str, quality: QoSProfile) -> Publisher:
+        return self.create_publisher(
+            message_class(kind),
+            f'~/{name}',
+            quality,
+            event_callbacks=PublisherEventCallbacks(matched=lambda event: self._follow_demand()),
+            callback_group=self._seldom,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Follow the listeners from now on."""

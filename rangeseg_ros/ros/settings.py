@@ -10,8 +10,8 @@ from rangeseg_ros.compilation.preparation import needs, prepare
 from rangeseg_ros.compilation.rehearsal import FIRST
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.ros.latest import Latest
 from rangeseg_ros.ros.parameters import NodeConfig
+from rangeseg_ros.ros.waiting import WaitingRoom
 
 
 class Settings:
@@ -43,7 +43,7 @@ class Settings:
         self._in_use: NodeConfig | None = None
         self._wanted = config
         self._prepared: set[tuple[object, ...]] = set()
-        self._jobs: Latest[NodeConfig] = Latest()
+        self._jobs: WaitingRoom[NodeConfig] = WaitingRoom()
         self._closed = self.busy = False
         self._ready: frozenset[str] = frozenset()
         self._came = Condition()
@@ -104,7 +104,8 @@ class Settings:
         self._on_change()
 
     def _work(self) -> None:
-        while config := self._jobs.take():
+        while job := self._jobs.take():
+            config, _ = job
             self.busy = True
             if self._in_use is None:
                 self._prepare(config, FIRST)

@@ -25,7 +25,7 @@ class WaitingRoom(Generic[Item]):
         (item, seconds waited) -> seconds for which it is to wait on, 0 when it is ready.
     """
 
-    def __init__(self, delay: Callable[[Item, float], float]) -> None:
+    def __init__(self, delay: Callable[[Item, float], float] = lambda item, waited: 0.0) -> None:
         self._delay = delay
         self._changed = Condition()
         self._items: list[tuple[Item, float]] = []
