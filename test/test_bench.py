@@ -69,7 +69,5 @@ def test_bad_input(frames, tmp_path):
     write_image(other, simulate_kinect(kinect_room(0), kinect_camera(32, 24)).depth)
     # Before and in the process that measures.
     for paths in ((other,), (frames[0], other)):
-        with pytest.raises(
-            ValueError, match=r'other\.png: .* 32x24, its camera 96x72'
-        ):
+        with pytest.raises(ValueError, match=r'other\.png: .* 32x24, its camera 96x72'):
             run(*paths, *frames[-2:], '--rounds', 1)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
 
 from rangeseg_ros.cli import options, simulate_terrain
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
@@ -33,33 +34,12 @@ from rangeseg_ros.simulation.scanners import (
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.segcomp_truth import ground_truth, region_angles
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
-
-seed_option = click.option(
-    '--seed',
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help='Seed of the first scene; the next ones have the next numbers.',
-)
-output_option = click.option(
-    '--output',
-    type=click.Path(path_type=Path),
-    required=True,
-    help='Folder to make; it must not exist, or be empty.',
-)
-
-sets_option = click.option(
-    '--scenes',
-    type=click.IntRange(min=1),
-    default=40,
-    show_default=True,
-    help='How many; 40 as in the real sets, 10 of them for training.',
-)
+_count = click.IntRange(min=1)
+_number = partial(click.option, show_default=True)
 
 
 @click.group()
@@ -67,106 +47,87 @@ def command() -> None:
     """Simulate range images with ground truth."""
 
 
-scenes_option = click.option(
-    '--scenes', type=click.IntRange(min=1), default=12, show_default=True, help='How many.'
-)
-frames_option = click.option(
-    '--frames',
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help='Frames of each scene, at 30 Hz from a camera that moves as if held by hand.',
-)
-sensor_seed_option = click.option(
-    '--sensor-seed',
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help='Which one of its kind the sensor is: its fixed distortion.',
-)
-scene_option = click.option(
-    '--scene',
-    'kind',
-    type=click.Choice(list(SCENES)),
-    default='room',
-    show_default=True,
-    help='Rooms with boxes, or with a ball and a cylinder as well.',
-)
+def set_options(scenes: int, text: str) -> Callable[..., Any]:
+    """Options of all sets."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in (
+            click.option(
+                '--output',
+                type=click.Path(path_type=Path),
+                required=True,
+                help='Folder to make; it must not exist, or be empty.',
+            ),
+            _number(
+                '--seed',
+                type=click.IntRange(min=0),
+                default=0,
+                help='Seed of the first scene; the next ones have the next numbers.',
+            ),
+            _number('--scenes', type=_count, default=scenes, help=text),
+        ):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def room_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Options of sets of rooms."""
+    for option in (
+        click.option('--height', type=click.IntRange(16, 4096), help="Rows; the sensor's own."),
+        click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own."),
+        _number(
+            '--scene',
+            type=click.Choice(list(SCENES)),
+            default='room',
+            help='Rooms with boxes, or with a ball and a cylinder as well.',
+        ),
+        _number(
+            '--sensor-seed',
+            type=click.IntRange(min=0),
+            default=0,
+            help='Which one of its kind the sensor is: its fixed distortion.',
+        ),
+        _number(
+            '--frames',
+            type=_count,
+            default=1,
+            help='Frames of each scene, at 30 Hz from a camera that moves as if held by hand.',
+        ),
+        set_options(12, 'How many.'),
+    ):
+        command = option(command)
+    return command
 
 
 @command.command()
-@click.option(
+@_number(
     '--sensor',
     type=click.Choice(list(SENSORS)),
     default='kinect',
-    show_default=True,
     help='Structured light, active stereo, time of flight of a phone, lidar of a tablet, or a '
     'sensor without error.',
 )
-@scenes_option
-@frames_option
-@seed_option
-@sensor_seed_option
-@scene_option
-@click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own.")
-@click.option('--height', type=click.IntRange(16, 4096), help="Rows; the sensor's own.")
-@output_option
-def rooms(
-    sensor: str,
-    scenes: int,
-    frames: int,
-    seed: int,
-    sensor_seed: int,
-    kind: str,
-    width: int | None,
-    height: int | None,
-    output: Path,
-) -> None:
+@room_options
+def rooms(sensor: str, **given: Any) -> None:
     """Rooms as depth sensors of several kinds see them.
 
     The files are those of `simulate kinect`. Another width keeps the horizontal field of view.
     """
-    camera = SENSORS[sensor](sensor_seed).camera
-    camera = resize(camera, width or camera.width, height or camera.height)
-
-    def see(scene: Scene, frame: int, scene_seed: int) -> Frame:
-        if sensor == 'kinect':
-            return simulate_kinect(
-                scene, camera, frame=frame, sensor_seed=sensor_seed, seed=scene_seed
-            )
-        return simulate(scene, SENSORS[sensor](sensor_seed), camera, frame=frame, seed=scene_seed)
-
-    _write_rooms(output, camera, range(seed, seed + scenes), frames, SCENES[kind], see)
+    _write_rooms(sensor, 'measured', **given)
 
 
 @command.command()
-@scenes_option
-@frames_option
-@seed_option
-@sensor_seed_option
-@click.option(
+@_number(
     '--noise',
     type=click.Choice(NOISES),
     default='measured',
-    show_default=True,
     help='As measured on real sensors; the textbook formula, correlated over 1.5 pixels or '
     'independent; or none.',
 )
-@scene_option
-@click.option('--width', type=click.IntRange(16, 4096), default=640, show_default=True)
-@click.option('--height', type=click.IntRange(16, 4096), default=480, show_default=True)
-@output_option
-def kinect(
-    scenes: int,
-    frames: int,
-    seed: int,
-    sensor_seed: int,
-    noise: str,
-    kind: str,
-    width: int,
-    height: int,
-    output: Path,
-) -> None:
+@room_options
+def kinect(noise: str, **given: Any) -> None:
     """Rooms as a Kinect sees them, with a choice of its noise.
 
     \b
@@ -182,55 +143,61 @@ def kinect(
     NAME is the scene's seed, and the number of the frame where there are several. Without noise
     the images are rounded to millimetres; the bag then holds exact metres (32FC1).
     """
-    camera = kinect_camera(width, height)
-
-    def see(scene: Scene, frame: int, scene_seed: int) -> Frame:
-        return simulate_kinect(
-            scene, camera, frame=frame, noise=noise, sensor_seed=sensor_seed, seed=scene_seed
-        )
-
-    _write_rooms(output, camera, range(seed, seed + scenes), frames, SCENES[kind], see)
+    _write_rooms('kinect', noise, **given)
 
 
 def _write_rooms(
-    output: Path,
-    camera: Camera,
-    seeds: range,
+    sensor: str,
+    noise: str,
+    *,
+    scenes: int,
     frames: int,
-    build: Callable[[int, int], Scene],
-    see: Callable[[Scene, int, int], Frame],
+    seed: int,
+    sensor_seed: int,
+    scene: str,
+    width: int | None,
+    height: int | None,
+    output: Path,
 ) -> None:
-    """Write what `see(scene, frame, seed)` sees in the scenes `build(seed, frames)`."""
+    """Write what a sensor sees in rooms. More than seven parameters: the options of a command."""
+    camera = SENSORS[sensor](sensor_seed).camera
+    camera = resize(camera, width or camera.width, height or camera.height)
 
-    def simulated() -> Iterator[tuple[str, Frame]]:
-        for seed in seeds:
-            scene = build(seed, frames)
+    def see(room: Scene, frame: int, room_seed: int) -> Frame:
+        given = {'frame': frame, 'seed': room_seed}
+        if sensor == 'kinect':
+            return simulate_kinect(room, camera, noise=noise, sensor_seed=sensor_seed, **given)
+        return simulate(room, SENSORS[sensor](sensor_seed), camera, **given)
+
+    def seen() -> Iterator[tuple[str, Frame]]:
+        for room_seed in range(seed, seed + scenes):
+            room = SCENES[scene](room_seed, frames)
             for frame in range(frames):
-                name = f'{seed:06d}' if frames == 1 else f'{seed:06d}_{frame:06d}'
-                yield name, see(scene, frame, seed)
+                name = f'{room_seed:06d}' if frames == 1 else f'{room_seed:06d}_{frame:06d}'
+                yield name, see(room, frame, room_seed)
 
-    count = len(seeds) * frames
+    truth: list[tuple[str, TruePlane]] = []
+    count = scenes * frames
     with options.new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
-        with (
-            _TruthTable(folder / 'planes.csv') as table,
-            DepthBagWriter(folder / 'bag', camera) as bag,
-        ):
-            for index, (name, image) in enumerate(options.progress(simulated(), count, 'image')):
+        with DepthBagWriter(folder / 'bag', camera) as bag:
+            for index, (name, image) in enumerate(options.progress(seen(), count, 'image')):
                 depth = image.depth
                 if depth.dtype != np.uint16:
                     depth = np.rint(1000 * depth).astype(np.uint16)
                 write_image(folder / 'depth' / f'{name}.png', depth)
                 write_image(folder / 'truth' / f'{name}.png', image.labels)
-                table.write(name, image.planes)
+                truth += [(name, plane) for plane in image.planes]
                 bag.write(image.depth, 10**9 + round(index * 1e9 / 30))
+        _write_truth(folder, truth)
     click.echo(f'{output}: {count} images')
 
 
+_segcomp_options = set_options(40, 'How many; 40 as in the real sets, 10 of them for training.')
+
+
 @command.command()
-@sets_option
-@seed_option
-@output_option
+@_segcomp_options
 def abw(scenes: int, seed: int, output: Path) -> None:
     """Polyhedra as the ABW structured-light scanner sees them, in segcomp's files.
 
@@ -253,9 +220,7 @@ def abw(scenes: int, seed: int, output: Path) -> None:
 
 
 @command.command()
-@sets_option
-@seed_option
-@output_option
+@_segcomp_options
 def perceptron(scenes: int, seed: int, output: Path) -> None:
     """Polyhedra as the Perceptron laser scanner sees them, in segcomp's files.
 
@@ -285,43 +250,31 @@ def _write_segcomp_set(
 ) -> None:
     """Write images by `write(path, split, number, scene's seed)`, and their ground truth."""
     training = min(scenes // 4, 10)
-    regions = 0
-    with options.new_folder(output) as folder, _TruthTable(folder / 'planes.csv') as table:
+    truth: list[tuple[str, TruePlane]] = []
+    with options.new_folder(output) as folder:
         for index in options.progress(range(scenes), scenes, 'image'):
             split, number = ('train', index) if index < training else ('test', index - training)
             path = folder / f'{sensor}.{split}.{number}'
             image, planes = ground_truth(write(path, split, number, seed + index))
             write_segmentation(f'{path}.gt-seg', image)
             write_angles(f'{path}.gt-ang', region_angles(image, planes))
-            table.write(path.name, planes)
-            regions += len(planes)
+            truth += [(path.name, plane) for plane in planes]
+        _write_truth(folder, truth)
     click.echo(
         f'{output}: {training} training and {scenes - training} test images, '
-        f'{regions / scenes:.1f} regions each'
+        f'{len(truth) / scenes:.1f} regions each'
     )
 
 
-class _TruthTable:
-    """CSV of the planes of all images."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> _TruthTable:
-        self._file = self.path.open('w', newline='')
-        self._rows = csv.writer(self._file, lineterminator='\n')
+def _write_truth(folder: Path, truth: list[tuple[str, TruePlane]]) -> None:
+    """Table of the planes of all images."""
+    with (folder / 'planes.csv').open('w', newline='') as file:
+        rows = csv.writer(file, lineterminator='\n')
         normal = ('normal_x', 'normal_y', 'normal_z')
-        self._rows.writerow(['image', 'label', 'face', *normal, 'distance', 'count'])
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
-
-    def write(self, image: str, planes: list[TruePlane]) -> None:
-        """Append the planes of an image."""
-        for plane in planes:
+        rows.writerow(['image', 'label', 'face', *normal, 'distance', 'count'])
+        for image, plane in truth:
             equation = (f'{value:.9g}' for value in (*plane.normal, plane.distance))
-            self._rows.writerow([image, plane.label, plane.face, *equation, plane.count])
+            rows.writerow([image, plane.label, plane.face, *equation, plane.count])
 
 
 command.add_command(simulate_terrain.command)
