@@ -1,129 +1,69 @@
 """The node for as long as is asked for at 30 Hz: memory over time, and where every frame went.
 
-    python test/node_soak.py FOLDER --minutes 60 --output soak.json
+    python test/node_soak.py --minutes 60 --output soak.json
 
-FOLDER holds depth images (16-bit PNG, millimetres) and camera.yaml. Not a test: it takes its time
-and all of a computer. Listens to labels, planes and markers.
+Not a test: it takes its time and all of a computer. Listeners of every output come and go.
 """
 
 import argparse
 import json
 import os
-import signal
-import subprocess
-import sys
+import random
 import time
-from array import array
-from itertools import chain, cycle
+from contextlib import ExitStack
 from pathlib import Path
-
-import cv2
 
 PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
 # Before the middleware is loaded.
 os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', os.fspath(PROFILE))
 
-import rclpy  # noqa: E402
-from rclpy.signals import SignalHandlerOptions  # noqa: E402
-from ros_bench import DEPTH, INFO, RELIABLE, Bench, values_of  # noqa: E402
-from sensor_msgs.msg import CameraInfo, Image  # noqa: E402
+from ros_bench import TYPES, Bench, values_of  # noqa: E402
 
-from rangeseg_ros.io.cameras import read_camera  # noqa: E402
+from rangeseg_ros.simulation.kinect import simulate_kinect  # noqa: E402
+from rangeseg_ros.simulation.scenes import kinect_room  # noqa: E402
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera  # noqa: E402
 
-RATE = 30.0
-MIB = 2**20
+RATE, FRAMES = 30.0, 20
 
 
-def camera(folder, domain):
-    """Publish the images to and fro until SIGTERM; print how many there were."""
-    going = [True]
-    signal.signal(signal.SIGTERM, lambda number, stack: going.clear())
-    rclpy.init(domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node('camera')
-    intrinsics = read_camera(folder / 'camera.yaml')
-    images = node.create_publisher(Image, DEPTH, RELIABLE)
-    infos = node.create_publisher(CameraInfo, INFO, RELIABLE)
-    height, width = intrinsics.shape
-    info = CameraInfo(height=height, width=width)
-    info.k = [intrinsics.fx, 0.0, intrinsics.cx, 0.0, intrinsics.fy, intrinsics.cy, 0.0, 0.0, 1.0]
-    message = Image(height=height, width=width, encoding='16UC1', step=2 * width)
-    paths = sorted((folder / 'depth').glob('*.png')) or sorted(folder.glob('*.png'))
-    pixels = [cv2.imread(os.fspath(path), cv2.IMREAD_UNCHANGED) for path in paths]
-    data = [array('B', image.tobytes()) for image in pixels]
-    while going and not (images.get_subscription_count() and infos.get_subscription_count()):
-        time.sleep(0.05)
-    time.sleep(1.0)
-    due, sent = time.monotonic(), 0
-    for part in cycle(chain(data, data[-2:0:-1])):
-        if not going:
-            break
-        message.header.stamp = info.header.stamp = node.get_clock().now().to_msg()
-        message.header.frame_id = info.header.frame_id = 'camera_depth_optical_frame'
-        message.data = part
-        infos.publish(info)
-        images.publish(message)
-        sent += 1
-        due += 1 / RATE
-        time.sleep(max(0.0, due - time.monotonic()))
-    time.sleep(2.0)
-    print(sent)
-
-
-def resident(process):
-    """Resident memory of a process, MiB."""
-    pages = int(Path(f'/proc/{process}/statm').read_text().split()[1])
-    return pages * os.sysconf('SC_PAGE_SIZE') / MIB
+def state(process):
+    """Resident memory, MiB, threads and open files of a process."""
+    folder = Path(f'/proc/{process}')
+    pages = int((folder / 'statm').read_text().split()[1])
+    return {
+        'resident MiB': round(pages * os.sysconf('SC_PAGE_SIZE') / 2**20, 1),
+        'threads': len(list((folder / 'task').iterdir())),
+        'files': len(list((folder / 'fd').iterdir())),
+    }
 
 
 def main():
+    """Publish, look every half minute, and write what is seen."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('folder', type=Path)
     parser.add_argument('--minutes', type=float, default=60)
     parser.add_argument('--output', type=Path)
-    parser.add_argument('--camera', type=int, metavar='DOMAIN', help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.camera is not None:
-        camera(arguments.folder, arguments.camera)
-        return
-    report = {'minutes': [], 'resident MiB': [], 'output Hz': [], 'latency ms': [], 'load': []}
-    with Bench() as bench, bench.listening('labels', 'planes', 'markers'):
-        command = [sys.executable, __file__, arguments.folder]
-        command += ['--camera', os.environ['ROS_DOMAIN_ID']]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as source:
-            start = time.monotonic()
-            while (minutes := (time.monotonic() - start) / 60) < arguments.minutes:
-                bench.spin(min(30.0, 60 * arguments.minutes / 10))
+    camera, draw, report = kinect_camera(640, 480), random.Random(0), []
+    room = kinect_room(0, FRAMES)
+    depths = [simulate_kinect(room, camera, frame=k, seed=k).depth for k in range(FRAMES)]
+    begin, sent = time.monotonic(), 0
+    with Bench(camera=camera) as bench, bench.listening('labels'), bench.camera_on():
+        while (minutes := (time.monotonic() - begin) / 60) < arguments.minutes:
+            with ExitStack() as stack:
+                stack.enter_context(bench.listening(*draw.sample(sorted(TYPES), 3)))
+                until = time.monotonic() + 30
+                while time.monotonic() < until:
+                    bench.send(bench.image(depths[sent % FRAMES]))
+                    sent += 1
+                    bench.spin(1 / RATE)
                 values = values_of(bench.received['diagnostics'][-1].status[0])
-                report['minutes'].append(round(minutes, 2))
-                report['resident MiB'].append(round(resident(bench.process.pid), 1))
-                report['output Hz'].append(values['output rate (Hz)'])
-                report['latency ms'].append(values.get('latency (ms)'))
-                report['load'].append(os.getloadavg()[0])
-                for messages in bench.received.values():
-                    del messages[:-1]
-                if arguments.output:
-                    arguments.output.write_text(json.dumps(report, indent=1))
-            source.terminate()
-            sent = int(source.stdout.read())
-        bench.spin(3.0)
-        values = values_of(bench.received['diagnostics'][-1].status[0])
-        received, published, dropped, refused = (
-            int(values[f'frames {what}'])
-            for what in ('received', 'published', 'dropped for newer ones', 'refused')
-        )
-        unseen = int(values['messages lost or overwritten, by their numbers'])
-        report['frames'] = {
-            'sent': sent,
-            'received': received,
-            'lost or overwritten': unseen,
-            'published': published,
-            'dropped for newer ones': dropped,
-            'refused': refused,
-            'unaccounted': sent - unseen - published - dropped - refused,
-        }
-    print(json.dumps(report, indent=1))
-    if arguments.output:
-        arguments.output.write_text(json.dumps(report, indent=1))
+            counts = {name: values[name] for name in values if name.startswith(('frames', 'mess'))}
+            report.append({'minutes': minutes, 'sent': sent, **state(bench.process.pid), **counts})
+            for messages in bench.received.values():
+                del messages[:-1]
+            if arguments.output:
+                arguments.output.write_text(json.dumps(report, indent=1))
+    print(json.dumps(report[-1], indent=1))
 
 
 if __name__ == '__main__':

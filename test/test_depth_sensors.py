@@ -170,12 +170,3 @@ def test_rooms_command(tmp_path, name):
     result = CliRunner().invoke(command, [*options, '--output', str(output)])
     assert result.exit_code == 0, result.output
     assert (read_depth(output / 'depth' / '000000.png') > 0).mean() > 0.4
-
-
-def test_rooms_of_a_kinect_are_those_of_its_own_command(tmp_path):
-    size = ['--scenes', '1', '--width', '80', '--height', '60', '--sensor-seed', '3']
-    for name in ('kinect', 'rooms'):
-        arguments = [name, *size, '--output', str(tmp_path / name)]
-        assert CliRunner().invoke(command, arguments).exit_code == 0
-    one, other = (tmp_path / name / 'depth' / '000000.png' for name in ('kinect', 'rooms'))
-    assert one.read_bytes() == other.read_bytes()

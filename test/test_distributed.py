@@ -75,25 +75,6 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
         assert not list((tmp_path / 'out' / name).glob('.*'))
 
 
-def test_no_scheduler(tmp_path, monkeypatch, capsys):
-    pytest.importorskip('distributed')
-    import dask
-
-    record_walls(tmp_path / 'a', 1)
-    monkeypatch.chdir(tmp_path)
-    arguments = ['replay', 'a', '--output', 'out', '--scheduler', 'tcp://127.0.0.1:1']
-    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
-    with (
-        dask.config.set({'distributed.comm.timeouts.connect': '1s'}),
-        pytest.raises(SystemExit) as end,
-    ):
-        main()
-    error = capsys.readouterr().err
-    assert end.value.code == 2
-    assert error.splitlines()[-1].startswith('rangeseg: ')
-    assert not (tmp_path / 'out').exists()
-
-
 def test_without_distributed_replay_says_what_is_missing(tmp_path, monkeypatch, capsys):
     record_walls(tmp_path / 'a', 1)
     monkeypatch.chdir(tmp_path)

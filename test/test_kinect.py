@@ -1,13 +1,9 @@
 """The Kinect model: shadows, quantisation, and the statistics measured on real frames."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
@@ -187,41 +183,3 @@ def test_smooth_field_has_unit_variance_up_to_the_border(sigma):
         # The autocorrelation of a smoothed field is the kernel convolved with itself.
         along = [(fields[..., 0] * fields[..., k]).mean() for k in range(6)]
         assert along == pytest.approx(np.exp(-((np.arange(6) / sigma[0] / 2) ** 2)), abs=0.06)
-
-
-ANNOTATED = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'annotated'
-
-
-def six_pixel_differences(depth, labels, camera):
-    """Spread of disparity over six pixels on planes, in quanta: what observed normals are made of.
-
-    One value per plane of at least 8000 pixels and direction (rows, columns).
-    """
-    spreads = []
-    for label in np.unique(labels[(labels > 0) & (labels < 65535)]):
-        mask = ((labels == label) & (depth > 0)).astype(np.uint8)
-        mask = cv2.erode(mask, np.ones((9, 9), np.uint8), borderValue=0) > 0
-        if mask.sum() < 8000:
-            continue
-        disparity = np.where(mask, 1000 / QUANTUM / np.maximum(depth, 1), 0)
-        plane, *_ = np.linalg.lstsq(camera.rays[mask].astype(float), disparity[mask], rcond=None)
-        error = disparity - camera.rays @ plane
-        for one, other in ((np.s_[:, 6:], np.s_[:, :-6]), (np.s_[6:], np.s_[:-6])):
-            both = mask[one] & mask[other]
-            spreads.append((error[one] - error[other])[both].std())
-    return spreads
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not ANNOTATED.exists(), reason='no annotated frames')
-def test_short_differences_are_like_those_of_real_frames():
-    real, simulated = [], []
-    for folder in sorted(ANNOTATED.glob('seq_*')):
-        depth, labels = (read_labels(folder / f'{name}.png') for name in ('depth', 'truth'))
-        fx, fy, cx, cy = map(float, (folder / 'camera.txt').read_text().split())
-        real += six_pixel_differences(depth, labels, Camera(640, 480, fx, fy, cx, cy))
-    for seed in range(4):
-        frame = simulate_kinect(scenes.kinect_room(seed), sensor_seed=seed, seed=seed)
-        simulated += six_pixel_differences(frame.depth, frame.labels, frame.camera)
-    # Planes of one real sensor scatter by 11 %.
-    assert np.median(simulated) == pytest.approx(np.median(real), rel=0.11)

@@ -125,7 +125,7 @@ if __name__ == '__main__':
 """
 
 
-@pytest.mark.parametrize('name', ['SIGTERM', 'SIGHUP', 'SIGKILL', 'SIGINT'])
+@pytest.mark.parametrize('name', ['SIGTERM', 'SIGKILL', 'SIGINT'])
 def test_workers_end_with_their_parent(tmp_path, name):
     program = tmp_path / 'parent.py'
     program.write_text(PARENT.format(folder=str(Path(__file__).parent)))
