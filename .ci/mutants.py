@@ -54,9 +54,10 @@ _SWAPS = {
 
 
 class Mutant(NamedTuple):
-    """A change of the lines `first` to `last` of a file to `text`."""
+    """A change of the lines `first` to `last` of a file, in `function`, to `text`."""
 
     path: Path
+    function: str
     first: int
     last: int
     before: str
@@ -73,14 +74,18 @@ def mutants(path: Path) -> Iterator[Mutant]:
     """All mutants of a module."""
     source = path.read_text()
     lines = source.splitlines(keepends=True)
-    for node in _expressions(ast.parse(source)):
+    tree = ast.parse(source)
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    for node in _expressions(tree):
+        around = [f.name for f in functions if f.lineno <= node.lineno <= f.end_lineno]
         for changed in _changes(node):
             # Columns count bytes.
             first, last = lines[node.lineno - 1].encode(), lines[node.end_lineno - 1].encode()
             text = first[: node.col_offset].decode() + f'({ast.unparse(changed)})'
             text += last[node.end_col_offset :].decode()
             before = ast.unparse(node)
-            yield Mutant(path, node.lineno, node.end_lineno, before, ast.unparse(changed), text)
+            function, after = (around or [path.stem])[-1], ast.unparse(changed)
+            yield Mutant(path, function, node.lineno, node.end_lineno, before, after, text)
 
 
 def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
@@ -150,14 +155,15 @@ class Selection:
         parts = path.relative_to(ROOT).with_suffix('').parts
         return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
 
-    def tests(self, path: Path) -> list[Path]:
+    def tests(self, path: Path, function: str) -> list[Path]:
         """Those at the fewest imports from the module, those of few other modules first."""
         ring, seen, chosen = {self._name(path)}, set(), []
         while ring and len(chosen) < self._most:
             near = [test for test, used in self._tests.items() if used & ring]
             near = sorted(set(near) - set(chosen), key=lambda test: len(self._tests[test]))
-            # Those named alike are about it.
+            # Those named alike, or that name the function, are about it.
             near.sort(key=lambda test: path.stem not in test.stem)
+            near.sort(key=lambda test: function not in test.read_text())
             chosen += near[: self._most - len(chosen)]
             seen |= ring
             ring = {user for module in ring for user in self._users[module]} - seen
@@ -168,7 +174,7 @@ class Selection:
 def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
     """What tests say of a copy of the package, perhaps changed, and which failed first."""
     with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
-        for name in ('rangeseg_ros', 'test', 'params', 'launch', 'examples', 'docs'):
+        for name in ('rangeseg_ros', 'test', 'params', 'launch', 'rviz', 'examples', 'docs'):
             shutil.copytree(ROOT / name, Path(folder, name))
         for name in ('pyproject.toml', 'README.md', 'setup.py', 'package.xml', 'CHANGELOG.rst'):
             shutil.copy(ROOT / name, folder)
@@ -227,7 +233,9 @@ def main() -> int:
     table: dict[str, Counter[str]] = defaultdict(Counter)
     sound: dict[str, bool] = {}
     for mutant in drawn:
-        tests = [str(test.relative_to(ROOT)) for test in selection.tests(mutant.path)]
+        tests = [
+            str(test.relative_to(ROOT)) for test in selection.tests(mutant.path, mutant.function)
+        ]
         outcome, failed = run(tests, mutant) if tests else ('untested', '')
         if outcome == 'killed' and failed:
             if failed not in sound:

@@ -12,12 +12,13 @@ import pytest
 pytest.importorskip('rclpy')
 pytest.importorskip('shape_msgs.msg')
 
+from rclpy.serialization import deserialize_message
 from ros_bench import DEPTH  # noqa: F401 - gives DDS a domain of its own
 from std_msgs.msg import Header
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.messages.make import make_rclpy
+from rangeseg_ros.messages.make import make_rclpy, message_class
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
@@ -59,6 +60,8 @@ def room():
         name: OUTPUTS[name].message(make_rclpy, header, image, result)
         for name in ('planes', 'markers')
     }
+    kind = message_class(OUTPUTS['markers'].kind)
+    messages['markers'] = deserialize_message(messages['markers'], kind)
     return messages, result.planes
 
 

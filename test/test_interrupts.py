@@ -35,11 +35,16 @@ def run(body):
 
 
 @pytest.mark.parametrize(
-    'body',
-    [LOST, WRAPPED, MISTAKEN, IN_A_CALLBACK],
-    ids=['lost', 'wrapped', 'mistaken', 'in a callback'],
+    ('body', 'name', 'code'),
+    [
+        (LOST, 'SIGINT', 130),
+        (WRAPPED, 'SIGINT', 130),
+        (MISTAKEN, 'SIGTERM', 143),
+        (IN_A_CALLBACK, 'SIGTERM', 143),
+        (LOST, 'SIGHUP', 129),
+    ],
+    ids=['lost', 'wrapped', 'mistaken', 'in a callback', 'hang-up'],
 )
-@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143), ('SIGHUP', 129)])
 def test_a_signal_ends_the_command(body, name, code):
     done = run(body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException'))
     assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')

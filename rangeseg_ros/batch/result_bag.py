@@ -106,8 +106,9 @@ class ResultBag:
             connection = self._topics[name]
             head, shown = there if name in IN_TARGET else here
             message = OUTPUTS[name].message(make_rosbags, head, image, shown)
-            data = self._store.serialize_cdr(message, connection.msgtype)
-            yield frame.time, connection, bytes(data)
+            if not isinstance(message, bytes):
+                message = bytes(self._store.serialize_cdr(message, connection.msgtype))
+            yield frame.time, connection, message
         if motion:
             connection = self._topics['odometry']
             message = odometry_message(make_rosbags, header, motion)

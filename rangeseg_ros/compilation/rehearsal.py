@@ -23,6 +23,7 @@ FIRST = ('labels', 'planes')
 """Outputs that need the fewest kernels: most listeners have no other."""
 
 CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
+_HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id='')
 
 
 def rehearse(
@@ -43,7 +44,7 @@ def rehearse(
         for number, image in enumerate(_frames(kind)):
             result = sequence.segment(image, number)
             for name in outputs:
-                OUTPUTS[name].message(_make, None, image, result)
+                OUTPUTS[name].message(_make, _HEADER, image, result)
 
 
 def _frames(kind: str) -> Iterator[RangeImage]:

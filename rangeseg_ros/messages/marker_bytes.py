@@ -26,7 +26,7 @@ _NO_MESH = 2 * _EMPTY_TEXT + bytes(5)
 
 
 def markers_bytes(header: Any, markers: Iterable[Marker]) -> bytes:
-    """The serialised `markers_message` of the same markers.
+    """A serialised visualization_msgs/MarkerArray of `markers`, and of no older ones.
 
     Parameters
     ----------

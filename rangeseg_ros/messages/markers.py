@@ -1,9 +1,9 @@
-"""Planes, the ground and stairs as RViz markers: what is drawn, and its message."""
+"""Planes, the ground and stairs as RViz markers: what is drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.meaning.ramps import Ramp
 from rangeseg_ros.core.meaning.stairs import Stairs
 from rangeseg_ros.drawing import colours
-from rangeseg_ros.messages.make import Make
 
 # visualization_msgs/Marker: type and action.
 ARROW, LINE_STRIP, TEXT_VIEW_FACING, TRIANGLE_LIST = 0, 4, 9, 11
@@ -124,49 +123,3 @@ def _text(namespace: str, number: int, text: str, position: NDArray[np.floating]
     x, y, z = position.tolist()
     size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
     return Marker(namespace, number, TEXT_VIEW_FACING, size, white, text=text, position=(x, y, z))
-
-
-def markers_message(make: Make, header: Any, markers: Iterable[Marker]) -> Any:
-    """visualization_msgs/MarkerArray of `markers`, and of no older ones."""
-    time = make('builtin_interfaces/msg/Time', sec=0, nanosec=0)
-    untextured = make(
-        'sensor_msgs/msg/CompressedImage',
-        header=make('std_msgs/msg/Header', stamp=time, frame_id=''),
-        format='',
-        data=np.empty(0, np.uint8),
-    )
-    mesh = make('visualization_msgs/msg/MeshFile', filename='', data=np.empty(0, np.uint8))
-    lasting = make('builtin_interfaces/msg/Duration', sec=0, nanosec=0)
-    unturned = make('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=1.0)
-
-    def triple(kind: str, values: Sequence[float]) -> Any:
-        x, y, z = values
-        return make(f'geometry_msgs/msg/{kind}', x=x, y=y, z=z)
-
-    def message(marker: Marker) -> Any:
-        position = triple('Point', marker.position)
-        return make(
-            'visualization_msgs/msg/Marker',
-            header=header,
-            ns=marker.namespace,
-            id=marker.number,
-            type=marker.kind,
-            action=marker.action,
-            pose=make('geometry_msgs/msg/Pose', position=position, orientation=unturned),
-            scale=triple('Vector3', marker.scale),
-            color=make('std_msgs/msg/ColorRGBA', **dict(zip('rgba', marker.colour, strict=True))),
-            lifetime=lasting,
-            frame_locked=False,
-            points=[triple('Point', point) for point in marker.points.astype(float).tolist()],
-            colors=[],
-            texture_resource='',
-            texture=untextured,
-            uv_coordinates=[],
-            text=marker.text,
-            mesh_resource='',
-            mesh_file=mesh,
-            mesh_use_embedded_materials=False,
-        )
-
-    messages = [message(marker) for marker in (CLEAR, *markers)]
-    return make('visualization_msgs/msg/MarkerArray', markers=messages)

@@ -25,7 +25,6 @@ from rangeseg_ros.messages.make import Make
 from rangeseg_ros.messages.marker_bytes import markers_bytes
 from rangeseg_ros.messages.markers import (
     Marker,
-    markers_message,
     of_outline,
     of_planes,
     of_ramps,
@@ -45,22 +44,18 @@ class Output:
     kind : str
         Type of the message.
     message : callable
-        (make, header, image, result) -> message.
-    serialised : callable or None
-        (header, image, result) -> the bytes of that message, where that is faster.
+        (make, header, image, result) -> message, or its bytes where that is faster.
     """
 
     kind: str
     message: Callable[[Make, Any, RangeImage, Segmentation], Any]
-    serialised: Callable[[Any, RangeImage, Segmentation], bytes] | None = None
 
 
 def _of_markers(draw: Callable[[RangeImage, Segmentation], list[Marker]]) -> Output:
     """A topic of markers."""
     return Output(
         'visualization_msgs/msg/MarkerArray',
-        lambda make, header, image, result: markers_message(make, header, draw(image, result)),
-        lambda header, image, result: markers_bytes(header, draw(image, result)),
+        lambda make, header, image, result: markers_bytes(header, draw(image, result)),
     )
 
 
@@ -145,7 +140,7 @@ IN_TARGET = frozenset({'planes', 'markers'})
 
 
 def _map_markers(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
-    return markers_message(make, header, of_planes(planes))
+    return markers_bytes(header, of_planes(planes))
 
 
 MAP_OUTPUTS: dict[str, tuple[str, Callable[[Make, Any, Sequence[Plane]], Any]]] = {

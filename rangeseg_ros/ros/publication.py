@@ -94,10 +94,7 @@ class Publication:
                 if not self._settings.ready_for(name):
                     return
                 header, shown = there if name in IN_TARGET else here
-                if output.serialised:
-                    publisher.publish(output.serialised(header, image, shown))
-                else:
-                    publisher.publish(output.message(make_rclpy, header, image, shown))
+                publisher.publish(output.message(make_rclpy, header, image, shown))
         if result.motion and self._odometry_publisher.get_subscription_count():
             message = odometry_message(make_rclpy, frame.message.header, result.motion)
             self._odometry_publisher.publish(message)
