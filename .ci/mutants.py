@@ -156,11 +156,15 @@ class Selection:
         return '.'.join(parts[:-1] if parts[-1] == '__init__' else parts)
 
     def tests(self, path: Path, function: str) -> list[Path]:
-        """Those at the fewest imports from the module, those of few other modules first."""
+        """Those at the fewest imports from the module, those that use it most first."""
+        tree = ast.parse(path.read_text())
+        names = [node.name for node in tree.body if hasattr(node, 'name')]
+        names += re.findall(r'^([A-Z]\w+)\b.* = ', path.read_text(), re.MULTILINE)
         ring, seen, chosen = {self._name(path)}, set(), []
         while ring and len(chosen) < self._most:
             near = [test for test, used in self._tests.items() if used & ring]
-            near = sorted(set(near) - set(chosen), key=lambda test: len(self._tests[test]))
+            uses = {test: sum(map(test.read_text().count, names)) for test in near}
+            near = sorted(set(near) - set(chosen), key=lambda test: (-uses[test], test))
             # Those named alike, or that name the function, are about it.
             near.sort(key=lambda test: path.stem not in test.stem)
             near.sort(key=lambda test: function not in test.read_text())
