@@ -37,8 +37,8 @@ from rangeseg_ros.ros.gravity import IMU_TOPIC
 from rangeseg_ros.ros.parameters import bind
 from rangeseg_ros.ros.pipeline import Pipeline
 from rangeseg_ros.ros.publication import Publication
-from rangeseg_ros.ros.seldom import SeldomCallbackGroup
 from rangeseg_ros.ros.settings import Settings
+from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
@@ -72,7 +72,7 @@ class SegmentPlanes(LifecycleNode):
         self._input: DepthInput | None = None
         self._silent = self._active = False
         self._statistics = FrameStatistics()
-        self._seldom = SeldomCallbackGroup(_EVENT_INTERVAL)
+        self._throttled = ThrottledCallbackGroup(_EVENT_INTERVAL)
         newest = QoSProfile(depth=5)
         # A map is for whoever comes, whenever that is.
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -84,7 +84,7 @@ class SegmentPlanes(LifecycleNode):
         }
         self._odometry = self._publisher('odometry', ODOMETRY, newest)
         self._diagnostics = self.create_publisher(
-            DiagnosticArray, '/diagnostics', 10, callback_group=self._seldom
+            DiagnosticArray, '/diagnostics', 10, callback_group=self._throttled
         )
         # A clock that stands still, of a simulation or a recording, must not silence the reports.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -108,7 +108,7 @@ class SegmentPlanes(LifecycleNode):
             f'~/{name}',
             quality,
             event_callbacks=PublisherEventCallbacks(matched=lambda event: self._follow_demand()),
-            callback_group=self._seldom,
+            callback_group=self._throttled,
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
 
@@ -172,7 +172,7 @@ class SegmentPlanes(LifecycleNode):
             self._unsubscribe()
 
     def _accept(self, frame: DepthFrame) -> None:
-        self._seldom.message_came()
+        self._throttled.message_came()
         self._pipeline.put(frame)
 
     def _unsubscribe(self) -> None:
@@ -183,7 +183,7 @@ class SegmentPlanes(LifecycleNode):
 
     def _look_around(self) -> None:
         """Once a second: follow the publishers, report."""
-        self._seldom.look()
+        self._throttled.look()
         if self._input:
             self._input.follow_publishers()
             if lost := self._statistics.lost(self._input):

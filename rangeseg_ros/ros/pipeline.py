@@ -23,11 +23,11 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.diagnostics import FrameStatistics
+from rangeseg_ros.ros.latest_ready import LatestReady
 from rangeseg_ros.ros.locator import Locator
-from rangeseg_ros.ros.order import Order
 from rangeseg_ros.ros.publication import Publication, Result
 from rangeseg_ros.ros.settings import Settings
-from rangeseg_ros.ros.waiting import WaitingRoom
+from rangeseg_ros.ros.ticket_lock import TicketLock
 
 _AT_ONCE = 2
 """Frames that are worked on at a time: one that comes before the last is done need not wait."""
@@ -36,7 +36,7 @@ _AT_ONCE = 2
 class Work(NamedTuple):
     """A frame that is being worked on, and what with; `began` in seconds."""
 
-    place: int
+    ticket: int
     frame: DepthFrame
     segmenter: Segmenter
     pace: Pace
@@ -80,9 +80,9 @@ class Pipeline:
         self._publication = publication
         self._settings = settings
         self._statistics = statistics
-        self._frames: WaitingRoom[DepthFrame] = WaitingRoom(self._delay)
+        self._frames: LatestReady[DepthFrame] = LatestReady(self._delay)
         self.locator = Locator(node, self._frames.look_again)
-        self._order = Order()
+        self._turns = TicketLock()
         self._beginning = Lock()
         # Of the frame that was begun last.
         self._pace = Pace(0.0, 1.0)
@@ -125,7 +125,7 @@ class Pipeline:
                     segmented = self._segment(work)
             except Exception as error:
                 segmented = error
-            with self._order.turn(work.place), sharing_cores():
+            with self._turns.turn(work.ticket), sharing_cores():
                 before = self._size
                 self._finish(work, segmented)
                 # What the next frame needs memory for, and the system after a larger frame.
@@ -151,7 +151,7 @@ class Pipeline:
             if config is not self._given or budget != self._segmenter.config.work_budget:
                 self._given = config
                 self._segmenter = Segmenter(replace(config, work_budget=budget))
-            return Work(self._order.line_up(), frame, self._segmenter, pace, began)
+            return Work(self._turns.take_ticket(), frame, self._segmenter, pace, began)
 
     def _segment(self, work: Work) -> Segmented:
         """Do what needs no other frame."""

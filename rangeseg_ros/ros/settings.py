@@ -10,8 +10,8 @@ from rangeseg_ros.compilation.preparation import needs, prepare
 from rangeseg_ros.compilation.rehearsal import FIRST
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.messages.outputs import OUTPUTS
+from rangeseg_ros.ros.latest_ready import LatestReady
 from rangeseg_ros.ros.parameters import NodeConfig
-from rangeseg_ros.ros.waiting import WaitingRoom
 
 
 class Settings:
@@ -43,7 +43,7 @@ class Settings:
         self._in_use: NodeConfig | None = None
         self._wanted = config
         self._prepared: set[tuple[object, ...]] = set()
-        self._jobs: WaitingRoom[NodeConfig] = WaitingRoom()
+        self._jobs: LatestReady[NodeConfig] = LatestReady()
         self._closed = self.busy = False
         self._ready: frozenset[str] = frozenset()
         self._came = Condition()

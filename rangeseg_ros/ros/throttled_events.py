@@ -1,4 +1,4 @@
-"""Events that are not looked for with every message."""
+"""Callbacks that the executor checks at intervals only."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 
 
-class SeldomCallbackGroup(MutuallyExclusiveCallbackGroup):
-    """Callbacks that the executor looks for at intervals while messages come, and always else.
+class ThrottledCallbackGroup(MutuallyExclusiveCallbackGroup):
+    """Callbacks that are checked at intervals while messages arrive, and always otherwise.
 
-    For every message the executor asks the middleware anew for all that a node waits for. With
-    three events for each publisher that takes longer than to take the message, and the
-    interpreter is not there for the segmentation meanwhile. Events that are not looked for wait.
+    For every message the executor checks all entities of a node. With three events per publisher
+    this takes longer than taking the message, and blocks the interpreter for the segmentation.
+    Events that are not checked stay pending.
 
     Parameters
     ----------
@@ -28,16 +28,16 @@ class SeldomCallbackGroup(MutuallyExclusiveCallbackGroup):
         self._due = 0.0
 
     def can_execute(self, entity: Any) -> bool:
-        """Whether the executor is to look for an event."""
+        """Whether the executor checks an event now."""
         return self._looked_for and bool(super().can_execute(entity))
 
     def message_came(self) -> None:
-        """Have the executor look only if it has not for an interval."""
+        """Check events only if the last check is an interval ago."""
         now = time.monotonic()
         self._looked_for = now >= self._due
         if self._looked_for:
             self._due = now + self._interval
 
     def look(self) -> None:
-        """Have the executor look, until the next message comes."""
+        """Check events until the next message arrives."""
         self._looked_for = True

@@ -12,7 +12,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Empty
 
-from rangeseg_ros.ros.seldom import SeldomCallbackGroup
+from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 
 
 @pytest.fixture
@@ -25,7 +25,7 @@ def context():
 
 @pytest.mark.ros
 def test_events_wait_while_messages_come(context):
-    came, group = [], SeldomCallbackGroup(interval=1e9)
+    came, group = [], ThrottledCallbackGroup(interval=1e9)
     node, other = (rclpy.create_node(name, context=context) for name in ('node', 'other'))
     events = PublisherEventCallbacks(matched=lambda event: came.append(event.current_count))
     publisher = node.create_publisher(
@@ -60,11 +60,13 @@ def test_events_wait_while_messages_come(context):
 
 
 def test_the_interval_is_kept(monkeypatch):
-    group = SeldomCallbackGroup(interval=0.1)
+    group = ThrottledCallbackGroup(interval=0.1)
     event, looked = Event(), []
     group.add_entity(event)
     for now in (5.0, 5.05, 5.09, 5.1, 5.15, 5.25):
-        monkeypatch.setattr('rangeseg_ros.ros.seldom.time.monotonic', lambda now=now: now)
+        monkeypatch.setattr(
+            'rangeseg_ros.ros.throttled_events.time.monotonic', lambda now=now: now
+        )
         group.message_came()
         looked.append(group.can_execute(event))
     assert looked == [True, False, False, True, False, True]

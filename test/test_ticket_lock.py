@@ -1,15 +1,15 @@
-"""Turns of threads in the order in which they lined up."""
+"""Threads get the lock in the order of their tickets."""
 
 import threading
 
 import pytest
 
-from rangeseg_ros.ros.order import Order
+from rangeseg_ros.ros.ticket_lock import TicketLock
 
 
 def test_turns_are_in_order_whoever_is_ready_first():
-    order, had = Order(), []
-    places = [order.line_up() for _ in range(5)]
+    order, had = TicketLock(), []
+    places = [order.take_ticket() for _ in range(5)]
 
     def work(place):
         with order.turn(place):
@@ -24,8 +24,8 @@ def test_turns_are_in_order_whoever_is_ready_first():
 
 
 def test_a_turn_that_fails_is_over():
-    order = Order()
-    first, second = order.line_up(), order.line_up()
+    order = TicketLock()
+    first, second = order.take_ticket(), order.take_ticket()
     with pytest.raises(ValueError), order.turn(first):
         raise ValueError
     with order.turn(second):

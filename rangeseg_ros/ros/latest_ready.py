@@ -1,4 +1,4 @@
-"""Frames that wait for what they need: the newest that has it comes first."""
+"""A buffer of items that wait for what they need, such as transforms."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Generic, TypeVar
 
 Item = TypeVar('Item')
 
-# Items that wait at most: so long that transforms that always come late do not starve, and so few
-# that images do not fill the memory.
-_MOST = 12
+# Largest number of waiting items: enough for transforms that always come late, and few enough for
+# the memory.
+_CAPACITY = 12
 
 
-class WaitingRoom(Generic[Item]):
-    """Hands out the newest item that is ready, and drops those before it.
+class LatestReady(Generic[Item]):
+    """Gives the newest item that is ready, and drops the items before it.
 
-    An item that is not ready never blocks another, and is handed out once its patience ends.
+    An item that is not ready does not block others; it is given once its waiting time is over.
 
     Parameters
     ----------
     delay : callable
-        (item, seconds waited) -> seconds for which it is to wait on, 0 when it is ready.
+        (item, seconds waited) -> seconds that it has to wait longer, 0 when it is ready.
     """
 
     def __init__(self, delay: Callable[[Item, float], float] = lambda item, waited: 0.0) -> None:
@@ -32,17 +32,17 @@ class WaitingRoom(Generic[Item]):
         self._closed = False
 
     def put(self, item: Item) -> int:
-        """Let `item` wait; how many items it takes the place of."""
+        """Add an item; the number of items that it replaces."""
         with self._changed:
             self._items.append((item, time.monotonic()))
             ready = self._left(-1) <= 0
-            dropped = len(self._items) - (1 if ready else min(len(self._items), _MOST))
+            dropped = len(self._items) - (1 if ready else min(len(self._items), _CAPACITY))
             del self._items[:dropped]
             self._changed.notify_all()
             return dropped
 
     def take(self) -> tuple[Item, int] | None:
-        """Wait for an item; it and how many before it are dropped. None once closed."""
+        """Wait for a ready item; it, and the number of dropped items. None once closed."""
         with self._changed:
             while not self._closed:
                 left = [self._left(k) for k in range(len(self._items))]
@@ -55,12 +55,12 @@ class WaitingRoom(Generic[Item]):
             return None
 
     def look_again(self) -> None:
-        """Something came that items may have waited for."""
+        """Check again whether items are ready."""
         with self._changed:
             self._changed.notify_all()
 
     def close(self) -> None:
-        """Let everybody who waits go."""
+        """Wake all waiting threads; nothing is given any more."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
