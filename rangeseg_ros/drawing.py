@@ -16,9 +16,9 @@ _SQUARE = np.ones((3, 3), np.uint8)
 
 
 def colours(ids: Sequence[int] | NDArray) -> NDArray[np.uint8]:
-    """Colours of plane ids, (N, 3) RGB: always the same, and easy to tell apart.
+    """Colours of plane ids, (N, 3) RGB: fixed, and easy to distinguish.
 
-    There are 48 of them, each as far from all before it as the eye can tell in CIE L*a*b* (Glasbey
+    There are 48 of them, each at the largest distance from all before it in CIE L*a*b* (Glasbey
     et al., Color Research and Application 32, 2007); greys are left to what has no plane.
     """
     return _palette()[(np.asarray(ids, int) - 1) % len(_palette())]

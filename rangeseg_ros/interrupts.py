@@ -14,7 +14,7 @@ _received = 0
 
 
 def watch() -> None:
-    """Remember interrupts, which raise KeyboardInterrupt as ever, and SIGTERM and SIGHUP.
+    """Remember interrupts, which raise KeyboardInterrupt as usual, and SIGTERM and SIGHUP.
 
     These end the command as errors do: what was begun is put away. Who ignores any of them still
     does.

@@ -26,10 +26,10 @@ from rangeseg_ros.interrupts import silence_losses
 R_co = TypeVar('R_co', covariant=True)
 R = TypeVar('R')
 
-# What tells of bad input or of a machine at its limits, and not of a fault of the program.
+# Errors of the input or of the machine, as opposed to faults of the program.
 EXPECTED = (ValueError, OSError, MemoryError)
 
-# Seconds that a worker has to put away what it has begun, and between telling it again: what a
+# Seconds that a worker has to put away what it has begun, and between repeated signals: what a
 # signal raises inside compiled code or a destructor may be lost.
 _PATIENCE = 10.0
 _AGAIN = 0.5
@@ -115,7 +115,7 @@ def _attempted(task: Task[R]) -> R | Failure:
 
 
 def _attempted_alone(task: Task[R]) -> R | Failure:
-    # The worker that died may have been that of another task: two of its own tell.
+    # The worker that died may have run another task: two runs alone are decisive.
     for _ in range(2):
         with _workers(1) as pool, suppress(BrokenProcessPool):
             return pool.submit(_attempted, task).result()
@@ -166,7 +166,7 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     if parent:
         wait([parent.sentinel])
-        # A result that nobody takes is no error to tell of.
+        # The parent takes no result any more, which is no error to print.
         sys.stderr = open(os.devnull, 'w')  # noqa: SIM115
         for _ in range(round(_PATIENCE / _AGAIN)):
             os.kill(os.getpid(), signal.SIGTERM)

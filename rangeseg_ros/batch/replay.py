@@ -86,8 +86,8 @@ class Outcome:
 class Replay:
     """Segmentation of one recording.
 
-    The bag among the results appears under its name when all else is there. It tells that the
-    recording is done, and a further `run` leaves it alone as long as recording, parameters, code
+    The bag among the results gets its name when all else is complete. It marks the recording as
+    done, and a further `run` leaves it alone as long as recording, parameters, code
     and the other results are the same; any other state is started anew, as ids depend on all
     frames before.
 

@@ -92,7 +92,7 @@ class ResultFolder:
     def digest(self) -> str:
         """Of the names and contents of all results but the bag; of the report, its name alone.
 
-        The report tells times, which are new in every run, and the bag holds this digest.
+        Times in the report differ in every run, and the bag holds this digest.
         """
         files = {
             path.name: b'' if path.suffix == '.html' else path.read_bytes() for path in self._own()
@@ -134,7 +134,7 @@ class ResultFolder:
             if _PARTIAL.fullmatch(path.name):
                 shutil.rmtree(path, ignore_errors=True)
         if self.bag.exists():
-            # In one step: half of a bag could not be told from one of somebody else.
+            # In one step: half of a bag could not be distinguished from a foreign one.
             aside = self.path / f'.{os.getpid()}.{BAG}'
             os.replace(self.bag, aside)
             shutil.rmtree(aside)

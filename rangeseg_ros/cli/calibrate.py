@@ -24,7 +24,7 @@ from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.report.calibration import Shown, write_calibration
 from rangeseg_ros.tasks import run_all
 
-# Frames that tell the noise, and those of them that the report shows.
+# Frames that the noise is measured on, and how many of them the report shows.
 _SAMPLED, _SHOWN = 24, 3
 _HEADER = '# Written by rangeseg calibrate.\n'
 
@@ -100,7 +100,7 @@ def command(
     tasks = parts(sources, config, kept)
     seen = list(options.progress(run_all(tasks, jobs), len(tasks), 'part'))
     result = calibrate(*_together(seen))
-    _tell(result)
+    _report(result)
 
     numbered = [(source, number) for source in sources for number in range(len(source))]
     chosen = np.linspace(0, len(numbered) - 1, min(_SAMPLED, len(numbered))).round().astype(int)
@@ -154,7 +154,7 @@ def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
     return concatenate(frames), seen[0].shape, seen[0].camera
 
 
-def _tell(result: Calibration) -> None:
+def _report(result: Calibration) -> None:
     less = 1 - result.after / result.before
     click.echo(
         f'residual of planes on frames left out: {result.before:.5f} to {result.after:.5f} 1/m, '

@@ -33,7 +33,7 @@ from rangeseg_ros.tasks import run_all
 @click.option(
     '--unknown-height',
     is_flag=True,
-    help='Terrains: the height of the sensor is not told.',
+    help='Terrains: do not give the height of the sensor to the segmenter.',
 )
 @options.jobs
 @click.option(
@@ -66,7 +66,7 @@ def command(
       depth/*.png, truth/*.png, camera.yaml, as `simulate kinect` writes
       folders of depth.png, truth.png and camera.txt (fx fy cx cy)
       labelled laser scans *.pcd (x forward, z up, intensity >= 10)
-      terrain.csv, as `simulate terrain` writes: how terrain is told
+      terrain.csv, as `simulate terrain` writes: terrain classes
 
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
     with errors of angles and planes where the truth knows them, and each image in `per_image`.
@@ -74,9 +74,9 @@ def command(
     config = options.read_parameters(params_file, method=method)
     if (folder / 'terrain.csv').exists():
         terrains = terrain_tasks(folder, config, not unknown_height, output)
-        told = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
-        figures = terrain_figures(told)
-        click.echo(f'{folder}: {len(told)} images')
+        measured = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
+        figures = terrain_figures(measured)
+        click.echo(f'{folder}: {len(measured)} images')
         click.echo(terrain_table(figures))
         options.write_json(json_file, figures)
         return

@@ -131,8 +131,7 @@ def _write_params(
 ) -> None:
     """Parameter file with the best lambda and whatever else differs from the defaults.
 
-    Where --params names no method the file names none either: lambda is then there for whoever
-    chooses `normals`.
+    Where --params names no method, the file names none: lambda then counts with `normals` only.
     """
     best = max((r for r in rows if r['series'] == 'identified'), key=lambda row: row['correct'])
     params = {

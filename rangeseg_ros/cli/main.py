@@ -80,7 +80,7 @@ def _fail(reason: str) -> NoReturn:
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     interrupts.watch()
-    # Errors are told here, in one line.
+    # This command prints errors itself, in one line.
     os.environ.setdefault('OPENCV_LOG_LEVEL', 'SILENT')
     warnings.showwarning = _warn
     try:

@@ -30,8 +30,8 @@ def command(
 
     The camera stays where it is on its robot, which may drive: the floor is the largest plane
     facing up that does not move. Prints both angles and the height with their standard deviations,
-    a static_transform_publisher and the origin of a URDF joint. Yaw, and where the camera is over
-    the floor, no floor tells. Where the floor is not sure, says why, and the exit code is 1.
+    a static_transform_publisher and the origin of a URDF joint. Yaw and the position over the
+    floor cannot be estimated from the floor. If the floor is uncertain, prints why and exits with 1.
     """
     config = options.read_parameters(params_file, exact=exact)
     # The frame is the camera's own, and its place in that has no error.
@@ -44,7 +44,7 @@ def command(
     mount = mount_of(sequence.map.planes, frames, sequence.config.role_tolerance)
     if mount is None:
         raise click.ClickException(f'{recording}: no plane that faces up in {frames} frames')
-    for line in _told(mount, base, name):
+    for line in _lines(mount, base, name):
         click.echo(line)
     for doubt in mount.doubts:
         click.echo(f'rangeseg: the floor is not sure: {doubt}', err=True)
@@ -52,7 +52,7 @@ def command(
         ctx.exit(1)
 
 
-def _told(mount: Mount, base: str, frame: str) -> list[str]:
+def _lines(mount: Mount, base: str, frame: str) -> list[str]:
     roll, pitch = np.degrees([mount.roll, mount.pitch])
     sigma = np.degrees(mount.sigma[:2])
     x, y, z, w = mount.quaternion

@@ -70,8 +70,8 @@ _NUMBERS = (
 
 def intrinsics(command: Callable[..., Any]) -> Callable[..., Any]:
     """Options for `--camera` or for numbers in its place: `camera_file`, `fx` ... `fov`."""
-    for name, told in reversed(_NUMBERS):
-        command = click.option(name, type=Finite(), help=told)(command)
+    for name, text in reversed(_NUMBERS):
+        command = click.option(name, type=Finite(), help=text)(command)
     file = click.option(
         '--camera',
         'camera_file',

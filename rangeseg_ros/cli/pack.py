@@ -70,7 +70,7 @@ def command(
     if not paths:
         raise click.ClickException(f'{frames_dir}: no {", ".join(SUFFIXES)} images')
     if (len(paths) - 1) / rate > 2**31 - 2:
-        raise click.UsageError(f'--rate {rate:g} leads to stamps that ROS cannot tell')
+        raise click.UsageError(f'--rate {rate:g} leads to stamps beyond the range of ROS')
     camera = read_camera(camera_file, raw)
     poses = match_poses(paths, poses_dir) if poses_dir else {}
     without: list[str] = []

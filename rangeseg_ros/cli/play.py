@@ -69,7 +69,7 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock:
         publishers = _publishers(node, reader.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
-        tell = _clock(node) if clock and CLOCK not in publishers else _silent
+        publish_time = _clock(node) if clock and CLOCK not in publishers else _silent
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
             interrupts.check()
             time.sleep(0.05)
@@ -77,7 +77,7 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock:
         while True:
             interrupts.check()  # there may be no message
             for topic, data in options.progress(
-                _timed(reader, publishers, rate, tell), reader.message_count, 'message'
+                _timed(reader, publishers, rate, publish_time), reader.message_count, 'message'
             ):
                 publishers[topic].publish(data)
             if not loop:
@@ -134,11 +134,11 @@ def _clock(node: Any) -> Callable[[int], None]:
     publisher = node.create_publisher(Clock, CLOCK, 1)
     message = Clock()
 
-    def tell(now: int) -> None:
+    def publish_time(now: int) -> None:
         message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
         publisher.publish(message)
 
-    return tell
+    return publish_time
 
 
 def _silent(now: int) -> None:
@@ -146,17 +146,17 @@ def _silent(now: int) -> None:
 
 
 def _timed(
-    reader: Reader, topics: Collection[str], rate: float, tell: Callable[[int], None]
+    reader: Reader, topics: Collection[str], rate: float, publish_time: Callable[[int], None]
 ) -> Iterator[tuple[str, bytes]]:
-    """Topics and contents of the messages, each when it is due; `tell` gets the time meanwhile."""
+    """Topics and contents of messages when they are due; the time is published meanwhile."""
     start = time.monotonic()
     wanted = [connection for connection in reader.connections if connection.topic in topics]
     for connection, stamp, data in reader.messages(wanted):
         due = start + (stamp - reader.start_time) / 1e9 / rate
         while (left := due - time.monotonic()) > CLOCK_PERIOD:
-            tell(stamp - round(left * rate * 1e9))
+            publish_time(stamp - round(left * rate * 1e9))
             interrupts.check()
             time.sleep(CLOCK_PERIOD)
         time.sleep(max(0.0, left))
-        tell(stamp)
+        publish_time(stamp)
         yield connection.topic, bytes(data)

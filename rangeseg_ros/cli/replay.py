@@ -106,7 +106,7 @@ def command(
 
 
 def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
-    """What the overview tells of a recording."""
+    """Row of a recording in the overview."""
     name = task.folder.name
     if isinstance(outcome, Failure):
         nothing = dict.fromkeys(('frames', 'empty', 'duration', 'planes_per_frame', 'ids'), 0)

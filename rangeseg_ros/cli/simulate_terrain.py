@@ -63,7 +63,7 @@ def command(
     OUTPUT/camera.yaml         intrinsics
 
     The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees. Another width keeps the
-    horizontal field of view. `rangeseg evaluate OUTPUT` measures how well terrain is told.
+    horizontal field of view. `rangeseg evaluate OUTPUT` compares classes of pixels with the truth.
     """
     names = [kind] if kind else list(KINDS)
     camera = SENSORS[sensor](seed).camera

@@ -127,7 +127,7 @@ class _Classes:
     ) -> None:
         """Assign `kind` to the regions that consist of two or more regions of `other`.
 
-        `whole` and `part` are the pairs' indices here and in `other`; `inside` tells the pairs
+        `whole` and `part` are the pairs' indices here and in `other`; `inside` marks the pairs
         whose part lies within the whole to the share `tolerance`.
         """
         whole, part, shared = whole[inside], part[inside], shared[inside]

@@ -95,7 +95,7 @@ def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:
 
     Where the image has the label 65535, judged not to be planar, its 0 means not judged, and
     regions are compared over the judged pixels only: a found region that covers something curved
-    pays for it, one that runs into what nobody judged does not. Otherwise all pixels count, as in
+    pays for it, one that extends into unjudged pixels does not. Otherwise all pixels count, as in
     the reference tool.
 
     Parameters

@@ -91,7 +91,7 @@ class Task:
     config : Config
         Parameters of the segmenter.
     cache : Path or None
-        Folder of finished measurements: what is there is not computed again.
+        Folder of finished measurements, which are not computed again.
     output : Path or None
         Folder for <name>_labels.png, <name>_classes.png, and of images of segcomp sets
         <name>.ms-seg and <name>.ms-nor, unless there are too many regions for these.

@@ -70,11 +70,11 @@ class Part:
     Attributes
     ----------
     start : int
-        Time of its first message, nanoseconds; 0 where the file does not tell.
+        Time of its first message, nanoseconds; 0 where the file does not say.
     read : callable
         Gives the records.
     channels : set of int
-        Whose messages it holds; empty where the file does not tell.
+        Whose messages it holds; empty where the file does not say.
     """
 
     start: int

@@ -1,4 +1,4 @@
-"""Bags written: with the checksums that tell damaged chunks from whole ones, and of depth."""
+"""Writers of rosbag2: any messages, with checksums of chunks, and depth images."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ class DepthBagWriter:
     def write(self, depth: NDArray[np.uint16] | NDArray[np.float32], stamp: int) -> None:
         """Append an image, (H, W) uint16 millimetres or float32 metres, at `stamp` nanoseconds."""
         if not -(2**31) <= stamp // 10**9 < 2**31:
-            raise BagError(f'stamp of {stamp // 10**9} s, which ROS 2 cannot tell')
+            raise BagError(f'stamp of {stamp // 10**9} s is beyond the range of ROS 2')
         encodings = {np.dtype(np.uint16): '16UC1', np.dtype(np.float32): '32FC1'}
         if depth.shape != self.camera.shape or depth.dtype not in encodings:
             raise BagError(

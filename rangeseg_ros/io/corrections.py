@@ -1,4 +1,4 @@
-"""What files tell of one sensor, applied to its images: its distortion, and the robot's body."""
+"""Corrections of images by files of a sensor: distortion map, and mask of the robot's body."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rangeseg_ros.io.images import ImageFileError, read_mask
 
 
 def corrected(image: RangeImage, config: Config) -> RangeImage:
-    """`image` without the robot's body and the distortion that files of `config` tell.
+    """`image` without the robot's body and the distortion, by the files that `config` names.
 
     Itself where there are none.
 

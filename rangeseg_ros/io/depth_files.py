@@ -44,7 +44,7 @@ def files_in(path: Path) -> list[Path]:
 
 
 def scale_of(path: Path) -> float | None:
-    """Metres per unit of the images of a folder, where its layout tells."""
+    """Metres per unit of the images of a folder, where its layout implies it."""
     return _TUM_SCALE if any((path / name).is_file() for name in _TUM) else None
 
 

@@ -2,7 +2,7 @@
 
 The description tag of the first page holds, as JSON, the camera; other programs' maps, of one page
 and without a description, are read as well. The third page is the slope of an offset at 1/z = 0.
-Where the offset holds at another inverse depth, which the description tells, the third page is
+Where the offset holds at another inverse depth, which the description states, the third page is
 zero and the slope the fourth: those who read the offset alone, or add the third page times 1/z,
 have the map that is right at that distance.
 """

@@ -118,7 +118,7 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     except OSError as error:
         raise ImageFileError(f'{path}: {error.strerror}') from None
     size, pages = png_shape(data), 1
-    # What is damaged is told from its frame, of which the libraries would complain in many lines.
+    # Damage is found before decoding: the libraries would print many lines about it.
     whole = size is not None and png_is_whole(data)
     if size is None:
         size, pages = tiff_shape(data)

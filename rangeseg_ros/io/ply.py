@@ -13,7 +13,7 @@ _TYPES = {
     **{'int8': 'i1', 'uint8': 'u1', 'int16': 'i2', 'uint16': 'u2', 'int32': 'i4'},
     **{'uint32': 'u4', 'float': 'f4', 'double': 'f8', 'float32': 'f4', 'float64': 'f8'},
 }
-# Words by which writers tell the size of the image.
+# Keywords of writers for the size of the image.
 _SIZES = ('width', 'num_cols', 'cols'), ('height', 'num_rows', 'rows')
 
 
@@ -28,7 +28,7 @@ def read_ply(path: Path, shape: tuple[int, int] | None = None) -> NDArray[np.flo
     ----------
     path : Path
     shape : (int, int), optional
-        (H, W) where the header does not tell it, as `obj_info num_cols 640` does.
+        (H, W) where the header does not state it, as `obj_info num_cols 640` does.
 
     Raises
     ------

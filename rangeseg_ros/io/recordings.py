@@ -144,7 +144,7 @@ class Recording:
             self._reader.close()
 
     def _files(self) -> list[tuple[Path, Channels]]:
-        """Files that hold the messages, and what their indices tell of the topics."""
+        """Files that hold the messages, and their topics by the index."""
         if self._reader is None:
             if not self.path.is_dir():
                 return [(self.path, {})]

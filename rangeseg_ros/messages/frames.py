@@ -57,7 +57,7 @@ class DepthFrame:
     def range_image(self) -> RangeImage:
         """Range image of the message; ValueError says what is wrong with it."""
         if self.stamp // 10**9 >= 2**31:  # ROS 1 has one bit more
-            raise ValueError(f'stamp of {self.stamp // 10**9} s, which ROS 2 cannot tell')
+            raise ValueError(f'stamp of {self.stamp // 10**9} s is beyond the range of ROS 2')
         if self.camera is None:
             return RangeImage.from_points(points_from_message(self.message))
         return RangeImage.from_depth(self.depth, self.camera)

@@ -1,4 +1,4 @@
-"""How messages are made, whoever implements their classes: rclpy or rosbags.
+"""Constructors of messages, with the classes of rclpy or of rosbags.
 
 Messages are read by their fields and made by a `Make`, so that the node and an offline replay
 publish and write the same bytes, and this package imports without ROS.

@@ -119,7 +119,7 @@ def of_ramps(ramps: Sequence[Ramp]) -> list[Marker]:
 
 
 def _text(namespace: str, number: int, text: str, position: NDArray[np.floating]) -> Marker:
-    """White letters of 12 cm that face whoever looks."""
+    """White letters of 12 cm that face the viewer."""
     x, y, z = position.tolist()
     size, white = (0.0, 0.0, 0.12), (1.0, 1.0, 1.0, 1.0)
     return Marker(namespace, number, TEXT_VIEW_FACING, size, white, text=text, position=(x, y, z))

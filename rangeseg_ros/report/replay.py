@@ -19,7 +19,7 @@ from rangeseg_ros.drawing import normals_picture, plan
 from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import Picture, as_jpeg, common, spread, stage_table, write_page
 
-# Largest sine of the angle to upright of what the side of a map is told by.
+# Largest sine of the angle to upright of the planes that define the side view of a map.
 _UPRIGHT = 0.5
 # Frames whose normals are shown: up to twice as many, evenly spaced.
 _NORMALS = 6
@@ -136,7 +136,7 @@ class ReplayReport:
 def plans(planes: Sequence[MapPlane]) -> list[tuple[str, NDArray[np.uint8]]]:
     """Names and pictures of a map: from above, and from a side.
 
-    Where there is no floor, nobody knows where above is, and the largest plane is looked at.
+    Without a floor up is unknown, and the first view faces the largest plane.
     """
     if not planes:
         return []

@@ -1,4 +1,4 @@
-"""The command line of the node: what nobody would take is refused in one line."""
+"""The command line of the node: invalid arguments end it with one line."""
 
 from __future__ import annotations
 

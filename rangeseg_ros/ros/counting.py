@@ -49,14 +49,14 @@ class Window:
 
 
 class Losses:
-    """Messages that were sent and that nobody here has seen.
+    """Messages that were sent and did not arrive.
 
     Attributes
     ----------
     lost : Window
         Lost, as the middleware reports.
     nonsense : int
-        Reports whose count cannot be true and which count nothing: Fast DDS tells of 2147483647
+        Reports with an impossible count, which are ignored: Fast DDS reports 2147483647
         when best-effort messages become smaller after others were lost, besides the true losses.
     unseen : int or None
         Gaps in the numbers that the publisher gives to its messages: those that were lost, and

@@ -48,7 +48,7 @@ class DepthInput:
     accept : callable
         Gets every complete frame.
     losses : Losses
-        Is told of the depth messages that arrive and of those that do not.
+        Counts the depth messages that arrive and those that are lost.
 
     Attributes
     ----------

@@ -43,7 +43,7 @@ from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 _BAD_NAMES = (InvalidNodeNameException, InvalidNamespaceException)
 
 
-# Parameters that decide which frames the node subscribes to, and what tells where they are.
+# Parameters that decide about the subscriptions to frames, and to their poses.
 _frames = attrgetter('input', 'raw')
 _places = attrgetter('use_imu', 'gravity_frame', 'fixed_frame', 'target_frame')
 # Seconds until a listener is noticed while frames come: none that a person would.
@@ -74,7 +74,7 @@ class SegmentPlanes(LifecycleNode):
         self._statistics = FrameStatistics()
         self._throttled = ThrottledCallbackGroup(_EVENT_INTERVAL)
         newest = QoSProfile(depth=5)
-        # A map is for whoever comes, whenever that is.
+        # Late listeners get the last map.
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         self._outputs = {
             name: self._publisher(name, output.kind, newest) for name, output in OUTPUTS.items()
@@ -215,7 +215,7 @@ def _refuse(error: Exception) -> NoReturn:
 
 
 def main() -> None:
-    """Run the node until it is told to stop; bad arguments end it with one line, exit code 2."""
+    """Run the node until a signal stops it; bad arguments end it with one line, exit code 2."""
     started = False
 
     def on_interrupt(number: int, stack: object) -> None:

@@ -38,7 +38,7 @@ class NodeConfig(Config):
     use_imu: bool = option(
         False,
         'take up from the accelerometer on the topic imu, in the frame of the images or one that '
-        'tf leads from, where gravity_frame does not tell, instead of up_x, up_y, up_z',
+        'tf knows, where gravity_frame gives none, instead of up_x, up_y, up_z',
     )
     managed: bool = option(
         False,
@@ -47,7 +47,7 @@ class NodeConfig(Config):
     target_rate: float = option(
         0.0,
         'method planes: frames per second to be held by doing less of the work, down from '
-        'work_budget; 0 = off. ~/status tells with which share of the work each frame was made',
+        'work_budget; 0 = off. ~/status has the share of the work that each frame was made with',
         low=0.0,
         high=1000.0,
     )

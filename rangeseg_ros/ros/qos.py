@@ -31,7 +31,7 @@ class MatchedSubscription:
     callback : callable
         Gets every message.
     losses : Losses, optional
-        Is told of every message that arrives, and of those that do not.
+        Counts the messages that arrive and those that are lost.
     """
 
     def __init__(

@@ -1,6 +1,6 @@
 """Twins of the two scanners of the segmentation comparison of Hoover et al.
 
-The image sets tell what the noise does, not how large it is, so the levels here are choices:
+The published sets show the kind of the noise, not its level; the levels are chosen:
 
 ABW (structured light, 8 bits; one quantum is 1.3 mm). The thesis calls its noise much lower than
 the Perceptron's and describes flat steps, many pixels wide, on inclined planes (6.7.1). Such

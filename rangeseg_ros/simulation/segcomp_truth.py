@@ -12,7 +12,7 @@ from rangeseg_ros.simulation.scanners import Scan
 from rangeseg_ros.simulation.truth import TruePlane
 
 MIN_PIXELS = 100
-"""Smaller regions are left unlabelled, as nobody would have outlined them by hand."""
+"""Smaller regions are left unlabelled, as in truth that is drawn by hand."""
 MIN_CONTACT = 10
 """Pairs of neighbouring pixels from which two regions count as adjacent."""
 

@@ -56,7 +56,7 @@ def inverse_depth(depth: NDArray[np.float64]) -> NDArray[np.float64]:
 def slopes(inverse: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
     """Tangent of the angle of incidence of every pixel's surface.
 
-    A plane is theta . ray = 1/z, so the derivatives of 1/z along rows and columns tell its
+    A plane is theta . ray = 1/z, so the derivatives of 1/z along rows and columns give its
     normal; of the two one-sided differences the smaller one does not cross an edge.
     """
     rays = camera.rays.astype(np.float64)

@@ -47,7 +47,7 @@ from rangeseg_ros.simulation.sensors.sensor import (
 BASELINE = 0.050
 """Distance of the right imager of a D435 from the left one, metres."""
 STEPS = 32
-"""Disparities that are told apart, per pixel."""
+"""Steps of the disparity per pixel."""
 LARGEST = 126
 """Disparity searched for, pixels."""
 # Matching noise: kernel width in pixels, standard deviation and period in pixels of disparity.
