@@ -31,7 +31,7 @@ def command(
     The camera stays where it is on its robot, which may drive: the floor is the largest plane
     facing up that does not move. Prints both angles and the height with their standard deviations,
     a static_transform_publisher and the origin of a URDF joint. Yaw and the position over the
-    floor cannot be estimated from the floor. If the floor is uncertain, prints why and exits with 1.
+    floor cannot be estimated from the floor. If the floor is uncertain, says why; exit code 1.
     """
     config = options.read_parameters(params_file, exact=exact)
     # The frame is the camera's own, and its place in that has no error.
