@@ -76,17 +76,6 @@ def test_organised_clouds(kind, depth, tmp_path):
     np.testing.assert_allclose(halved.points, points / 2, atol=1e-5)
 
 
-def test_ply_of_another_library(depth, tmp_path):
-    plyfile = pytest.importorskip('plyfile')
-    points = RangeImage.from_depth(depth, CAMERA).points
-    rows = np.array([tuple(p) for p in points.reshape(-1, 3)], [(a, 'f4') for a in 'xyz'])
-    element = plyfile.PlyElement.describe(rows, 'vertex')
-    told = ['width 64', 'height 48']
-    plyfile.PlyData([element], obj_info=told).write(str(tmp_path / 'cloud.ply'))
-    image = read_frame(tmp_path / 'cloud.ply', Intrinsics())
-    np.testing.assert_allclose(image.points, points, atol=1e-5)
-
-
 def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
     points = RangeImage.from_depth(depth, CAMERA).points
     write_ply(tmp_path / 'unsized.ply', points, size=False)

@@ -290,15 +290,3 @@ def test_an_interrupted_replay_leaves_whole_files(folder):
     frames = {int(row['frame']) for row in rows}
     assert frames <= set(range(len(labels)))
     assert not [path for path in (folder / 'out').iterdir() if path.name.startswith('.')]
-
-
-def test_help_of_every_command(folder, run):
-    code, output, _ = run('--help')
-    assert code == 0
-    for name in ('segment', 'pack', 'replay'):
-        assert name in output
-        code, text, _ = run(name, '--help')
-        assert code == 0
-        assert '--output' in text
-    assert run('nonsense')[0] == 2
-    assert run('--version')[1].startswith('rangeseg')

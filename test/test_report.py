@@ -1,8 +1,6 @@
 """The pages of replay and evaluate: what they say, and what a browser makes of them."""
 
 import re
-import shutil
-import subprocess
 import sys
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -20,7 +18,6 @@ from rangeseg_ros.report.page import MAX_PICTURES, Picture, spread
 from rangeseg_ros.report.replay import ReplayReport
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
-CHROMIUM = shutil.which('chromium') or shutil.which('chromium-browser')
 
 
 class Page(HTMLParser):
@@ -176,40 +173,3 @@ def test_report_of_evaluate(tmp_path, monkeypatch):
     ]
     assert all(source.startswith('data:image/') for source in page.sources)
     assert 'Images at tolerance 0.8' in page.text
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason='Chromium is not installed')
-def test_a_browser_shows_the_pictures_and_enlarges_them(report, tmp_path):
-    probe = """
-    <script>
-    window.addEventListener('load', () => {
-      const press = (key) => document.dispatchEvent(new KeyboardEvent('keydown', { key }));
-      const large = () => sheet.findIndex((one) => one.classList.contains('large'));
-      const seen = [[...document.images].every((one) => one.naturalWidth > 0), large()];
-      const before = sheet[0].getBoundingClientRect().width;
-      sheet[0].click();
-      seen.push(large(), sheet[0].getBoundingClientRect().width > 3 * before);
-      press('ArrowLeft'); seen.push(large());
-      press('ArrowRight'); seen.push(large());
-      press('Escape'); seen.push(large());
-      sheet[2].click(); sheet[2].click(); seen.push(large());
-      document.title = 'seen ' + seen.join(' ');
-    });
-    </script>"""
-    copy = tmp_path / 'probe.html'
-    copy.write_text(report.read_text().replace('</body>', probe + '</body>'))
-    shown = subprocess.run(
-        [
-            CHROMIUM,
-            *('--headless', '--no-sandbox', '--disable-gpu', '--disable-quic', '--no-first-run'),
-            *('--disable-background-networking', '--disable-component-update', '--disable-sync'),
-            f'--user-data-dir={tmp_path / "profile"}',
-            '--window-size=1200,900',
-            '--dump-dom',
-            copy.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert '<title>seen true -1 0 true 7 0 -1 -1</title>' in shown.stdout, shown.stderr
