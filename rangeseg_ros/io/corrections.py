@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
-
-import numpy as np
-from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
-from rangeseg_ros.io import distortion
+from rangeseg_ros.io.distortion import read_distortion
+from rangeseg_ros.io.files import kept_while_unchanged
 from rangeseg_ros.io.images import ImageFileError, read_mask
+
+_load_mask = kept_while_unchanged(read_mask)
+_load_distortion = kept_while_unchanged(read_distortion)
 
 
 def corrected(image: RangeImage, config: Config) -> RangeImage:
@@ -31,11 +31,11 @@ def corrected(image: RangeImage, config: Config) -> RangeImage:
     if config.mask:
         path = Path(config.mask)
         try:
-            image = image.without(_mask(path))
+            image = image.without(_load_mask(path))
         except RangeImageError as error:
             raise RangeImageError(f'{path}: {error}') from None
     if config.distortion_map:
-        image = distortion.load(Path(config.distortion_map)).corrected(image)
+        image = _load_distortion(Path(config.distortion_map)).corrected(image)
     return image
 
 
@@ -48,8 +48,8 @@ def check_corrections(config: Config) -> None:
         One that cannot be read, and the parameter that names it.
     """
     for parameter, file, read in (
-        ('mask', config.mask, _mask),
-        ('distortion_map', config.distortion_map, distortion.load),
+        ('mask', config.mask, _load_mask),
+        ('distortion_map', config.distortion_map, _load_distortion),
     ):
         try:
             if file:
@@ -61,17 +61,3 @@ def check_corrections(config: Config) -> None:
 def correction_files(config: Config) -> list[Path]:
     """Files that `corrected` reads."""
     return [Path(name) for name in (config.distortion_map, config.mask) if name]
-
-
-def _mask(path: Path) -> NDArray[np.bool_]:
-    """Read a mask, once as long as the file does not change."""
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise ImageFileError(f'{path}: {error.strerror}') from None
-    return _kept(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=4)
-def _kept(path: Path, time: int, size: int) -> NDArray[np.bool_]:
-    return read_mask(path)

@@ -12,7 +12,6 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import asdict
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -26,20 +25,6 @@ from rangeseg_ros.io.files import replacing
 
 KIND = 'rangeseg_ros distortion map'
 _DESCRIPTION = 270
-
-
-def load(path: Path) -> DistortionMap:
-    """Read a map, once as long as the file does not change; as `read_distortion`."""
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise DistortionError(f'{path}: {error.strerror}') from None
-    return _kept(path, state.st_mtime_ns, state.st_size)
-
-
-@lru_cache(maxsize=4)
-def _kept(path: Path, time: int, size: int) -> DistortionMap:
-    return read_distortion(path)
 
 
 def read_distortion(path: Path) -> DistortionMap:

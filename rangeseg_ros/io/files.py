@@ -9,10 +9,14 @@ import os
 import re
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from tempfile import gettempdir
+from typing import TypeVar
+
+T = TypeVar('T')
 
 # Temporary folders of this process. A signal may come while one is made or removed, where no
 # `finally` helps; what is still there when the process exits goes then.
@@ -141,6 +145,23 @@ def clear_abandoned(path: Path) -> None:
         for folder in path.parent.iterdir():
             if pattern.fullmatch(folder.name) and abandoned(folder):
                 shutil.rmtree(folder, ignore_errors=True)
+
+
+def kept_while_unchanged(read: Callable[[Path], T]) -> Callable[[Path], T]:
+    """Make a function that reads a file keep its results as long as the file does not change."""
+
+    @lru_cache(maxsize=4)
+    def kept(path: Path, time: int, size: int) -> T:
+        return read(path)
+
+    def load(path: Path) -> T:
+        try:
+            state = path.stat()
+        except OSError:
+            return read(path)  # which says what is wrong
+        return kept(path, state.st_mtime_ns, state.st_size)
+
+    return load
 
 
 def natural_order(path: Path) -> list[str | int]:
