@@ -13,7 +13,8 @@ from PIL import Image, TiffImagePlugin
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.distortion import KIND, load, read_distortion, write_distortion
+from rangeseg_ros.io.corrections import load_distortion
+from rangeseg_ros.io.distortion import KIND, read_distortion, write_distortion
 from rangeseg_ros.io.images import write_image
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -128,9 +129,9 @@ def test_maps_of_other_programs_are_read(tmp_path):
 def test_a_changed_file_is_read_again(tmp_path):
     path = tmp_path / 'map.tiff'
     write_distortion(path, DistortionMap(smooth_map()))
-    assert load(path) is load(path)
+    assert load_distortion(path) is load_distortion(path)
     write_distortion(path, DistortionMap(smooth_map(0.02)))
-    assert np.array_equal(load(path).offset, smooth_map(0.02))
+    assert np.array_equal(load_distortion(path).offset, smooth_map(0.02))
 
 
 @given(data=st.data())

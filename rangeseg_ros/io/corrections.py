@@ -12,8 +12,8 @@ from rangeseg_ros.io.distortion import read_distortion
 from rangeseg_ros.io.files import kept_while_unchanged
 from rangeseg_ros.io.images import ImageFileError, read_mask
 
-_load_mask = kept_while_unchanged(read_mask)
-_load_distortion = kept_while_unchanged(read_distortion)
+load_mask = kept_while_unchanged(read_mask)
+load_distortion = kept_while_unchanged(read_distortion)
 
 
 def corrected(image: RangeImage, config: Config) -> RangeImage:
@@ -31,11 +31,11 @@ def corrected(image: RangeImage, config: Config) -> RangeImage:
     if config.mask:
         path = Path(config.mask)
         try:
-            image = image.without(_load_mask(path))
+            image = image.without(load_mask(path))
         except RangeImageError as error:
             raise RangeImageError(f'{path}: {error}') from None
     if config.distortion_map:
-        image = _load_distortion(Path(config.distortion_map)).corrected(image)
+        image = load_distortion(Path(config.distortion_map)).corrected(image)
     return image
 
 
@@ -48,8 +48,8 @@ def check_corrections(config: Config) -> None:
         One that cannot be read, and the parameter that names it.
     """
     for parameter, file, read in (
-        ('mask', config.mask, _load_mask),
-        ('distortion_map', config.distortion_map, _load_distortion),
+        ('mask', config.mask, load_mask),
+        ('distortion_map', config.distortion_map, load_distortion),
     ):
         try:
             if file:
