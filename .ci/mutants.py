@@ -178,10 +178,8 @@ class Selection:
 def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
     """What tests say of a copy of the package, perhaps changed, and which failed first."""
     with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
-        for name in ('rangeseg_ros', 'test', 'params', 'launch', 'rviz', 'examples', 'docs'):
-            shutil.copytree(ROOT / name, Path(folder, name))
-        for name in ('pyproject.toml', 'README.md', 'setup.py', 'package.xml', 'CHANGELOG.rst'):
-            shutil.copy(ROOT / name, folder)
+        left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
+        shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
         if mutant:
             target = Path(folder, mutant.path.relative_to(ROOT))
             lines = target.read_text().splitlines(keepends=True)
