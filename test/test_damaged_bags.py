@@ -238,6 +238,21 @@ def bomb(compression, count=48):
     return struct.pack('<BQ', 6, len(record) + 8 + len(data)) + record, data
 
 
+def without_index(whole):
+    """An mcap whose footer says that there is no index."""
+    place = 8
+    while whole[place] not in (2, 15):  # footer, or the end of the data
+        place += 9 + struct.unpack_from('<Q', whole, place + 1)[0]
+    return whole[:place] + struct.pack('<BQQQI', 2, 20, 0, 0, 0) + whole[-8:]
+
+
+def test_an_mcap_without_an_index_is_read_to_its_end(packed):
+    (file,) = packed.glob('*.mcap')
+    file.write_bytes(without_index(file.read_bytes()))
+    numbers, bag = read(file)
+    assert numbers == list(range(8)) and not bag.loss()
+
+
 @pytest.mark.parametrize('compression', ['zstd', 'lz4'])
 @pytest.mark.parametrize('index', ['damaged', 'missing'])
 def test_chunks_that_declare_far_more_than_they_store_are_not_unpacked(packed, compression, index):
@@ -246,16 +261,8 @@ def test_chunks_that_declare_far_more_than_they_store_are_not_unpacked(packed, c
     whole = file.read_bytes()
     front, data = bomb(compression)
     position = 8 + 9 + struct.unpack_from('<Q', whole, 9)[0]  # behind the header
-    # The last 37 bytes are the footer, which tells where the index begins, and the magic.
-    tail = whole[position:-8] if index == 'damaged' else b''
-    if index == 'missing':
-        place = position
-        while whole[place] not in (2, 15):  # footer, or the end of the data
-            end = place + 9 + struct.unpack_from('<Q', whole, place + 1)[0]
-            tail, place = tail + whole[place:end], end
-        tail += struct.pack('<BQQQI', 2, 20, 0, 0, 0) + whole[-8:]
-    bytes_of_bomb = front + struct.pack('<Q', len(data)) + data
-    file.write_bytes(whole[:position] + bytes_of_bomb + tail)
+    tail = whole[position:-8] if index == 'damaged' else without_index(whole)[position:]
+    file.write_bytes(whole[:position] + front + struct.pack('<Q', len(data)) + data + tail)
     with DepthBag(file) as bag, pytest.raises(DamagedBagError, match='compressed bytes declare'):
         assert len(list(bag)) == 8
 
