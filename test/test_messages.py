@@ -235,6 +235,7 @@ def test_markers_start_anew_and_draw_hull_normal_and_id_of_every_plane():
     start, tip = ((p.x, p.y, p.z) for p in normal.points)
     np.testing.assert_allclose(np.subtract(tip, start), (0, 0, -ARROW_LENGTH), atol=1e-12)
     assert number.text == '101 floor'
+    assert {getattr(number.color, part) for part in 'rgba'} == {1.0}
     rgb = np.array([hull.color.r, hull.color.g, hull.color.b]) * 255
     np.testing.assert_allclose(rgb, colours([101])[0])
 
