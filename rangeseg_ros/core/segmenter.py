@@ -17,6 +17,7 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
+from rangeseg_ros.core.runtime.first_use import with_kernels
 from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
@@ -74,8 +75,11 @@ class Segmenter:
                 f'an image is a RangeImage, not {type(image).__name__}: make one with '
                 'RangeImage.from_depth(depth, camera) or RangeImage.from_points(points)'
             )
+        return with_kernels(lambda: self._segment(image), self.config, image.camera is None)
+
+    def _segment(self, image: RangeImage) -> Segmentation:
         if cells := replication(image):
-            result = self.segment(cells.reduced(image))
+            result = self._segment(cells.reduced(image))
             labels = cells.enlarged(result.labels, image.shape)
             return replace(result, labels=labels, image=image, cells=cells)
         config = self.config
