@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
@@ -40,6 +41,7 @@ def discover(run: Callable[[], Any]) -> list[Kernel]:
 
     Afterwards the kernels of this process stay interpreted: for a process of its own.
     """
+    cv2.setNumThreads(1)  # what a kernel calls is told from the thread that it is called in
     found: dict[tuple[Any, ...], Kernel] = {}
     for name, module in list(sys.modules.items()):
         if name.startswith(PACKAGE):

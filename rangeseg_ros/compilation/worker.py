@@ -16,8 +16,6 @@ from importlib import import_module
 from multiprocessing import get_context
 from pathlib import Path
 
-import cv2
-
 from rangeseg_ros.compilation.discovery import Kernel, discover
 from rangeseg_ros.compilation.rehearsal import rehearse
 from rangeseg_ros.core.runtime import cache
@@ -31,7 +29,6 @@ def main() -> None:
     answers = os.fdopen(os.dup(sys.stdout.fileno()), 'w')
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     rehearsed = partial(rehearse, *pickle.load(sys.stdin.buffer))
-    cv2.setNumThreads(1)
     # Those of a fork have imported all there is, and share its memory.
     context = get_context('fork')
     with _alone():
