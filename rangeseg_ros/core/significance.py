@@ -44,8 +44,8 @@ def f_quantile(freedom: float, others: float, level: float = LEVEL) -> float:
 def _series(ratio: Callable[[int], float]) -> float:
     """Sum of positive terms from 1 on, each `ratio` times the one before.
 
-    The incomplete gamma and beta functions are made of these (Abramowitz and Stegun 6.5.29, 26.5.4):
-    SciPy has both, and takes as long to import as all the rest of the core.
+    The incomplete gamma and beta functions are made of these (Abramowitz and Stegun 6.5.29 and
+    26.5.4): SciPy has both, and takes as long to import as all the rest of the core.
     """
     total = term = 1.0
     n = 1
