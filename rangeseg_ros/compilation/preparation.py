@@ -19,6 +19,8 @@ from rangeseg_ros.messages.outputs import OUTPUTS
 Report = Callable[[str], None]
 _BEGIN = 'compiling kernels'
 _WIDTH = 30
+# Of frames that have all that is compiled run, see `rehearse`.
+_SIZE = 10
 
 
 def needs(config: Config) -> tuple[Any, ...]:
@@ -54,13 +56,13 @@ def prepare(
     with not_ahead():
         try:
             with nothing_compiled():
-                rehearse(config, kinds, outputs)
+                rehearse(config, kinds, outputs, _SIZE)
             return
         except NotCompiledError:
             pass
         report(_BEGIN)
         _compile(report, config, kinds, outputs)
-        rehearse(config, kinds, outputs)
+        rehearse(config, kinds, outputs, _SIZE)
 
 
 def show(progress: str) -> None:
