@@ -10,7 +10,7 @@ SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-s
 # Most tests keep one core busy. All tests of a file run in the same process.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 
-.PHONY: test quick mutants demo demo-ros lint docs release-check clean
+.PHONY: test quick mutants demo demo-ros lint docs wheel release-check clean
 
 test: $(VENV)/installed
 	$(PYTEST)
@@ -55,6 +55,16 @@ docs: $(VENV)/writers
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 	! grep -rE 'src="https?:' site --include='*.html'  # nothing that is loaded from the network
 	@echo 'The site is in $(CURDIR)/site'
+
+# With the kernels compiled, for this version of Python and any processor of the kind: after pip
+# install nothing is compiled.
+MACHINE := $(shell uname -m)
+CPU ?= $(if $(filter x86_64,$(MACHINE)),x86-64-v3,generic)
+wheel: $(VENV)/installed
+	rm -rf build
+	$(BIN)/pip install --quiet setuptools
+	RANGESEG_WHEEL=$(CPU) NUMBA_CPU_NAME=$(CPU) NUMBA_CPU_FEATURES= \
+	  $(BIN)/pip wheel --no-deps --no-build-isolation --wheel-dir dist .
 
 release-check: $(VENV)/installed
 	.ci/release-check $(BIN)/python

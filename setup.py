@@ -1,9 +1,12 @@
+import json
 import os
 import re
 import subprocess
 import sys
+import sysconfig
 from contextlib import suppress
 from glob import glob
+from importlib import metadata
 from pathlib import Path
 
 from setuptools import find_packages, setup
@@ -18,6 +21,10 @@ share = f'share/{package_name}'
 )
 
 
+# Processor of a wheel that carries the kernels (`make wheel`), as NUMBA_CPU_NAME; else empty.
+cpu = os.environ.get('RANGESEG_WHEEL', '')
+
+
 def compile_kernels(folder):
     """Have the package in `folder` compile its kernels, so that its first start need not.
 
@@ -25,6 +32,10 @@ def compile_kernels(folder):
     """
     if os.environ.get('RANGESEG_COMPILE') == '0':
         return
+    if cpu:
+        target = Path(folder, package_name, 'core', '__pycache__', 'compiled_for.json')
+        target.parent.mkdir(exist_ok=True)
+        target.write_text(json.dumps({'cpu': cpu, 'numba': metadata.version('numba')}))
     start = 'from rangeseg_ros.start import rangeseg; rangeseg()'
     # There, as Python looks for packages first where it is started: not beside the sources.
     made = subprocess.run(
@@ -33,6 +44,8 @@ def compile_kernels(folder):
         stderr=subprocess.PIPE,
         text=True,
     )
+    if made.returncode and cpu:
+        sys.exit(made.stderr)
     if made.returncode:
         *_, why = made.stderr.strip().splitlines() or [f'exit code {made.returncode}']
         print(f'kernels are left for the first start to compile: {why}', file=sys.stderr)
@@ -48,6 +61,22 @@ class Install(install):
 
 
 commands = {'install': Install}
+if cpu:
+    from setuptools.command.bdist_wheel import bdist_wheel
+    from setuptools.command.build_py import build_py
+
+    class BuildWithKernels(build_py):
+        def run(self):
+            super().run()
+            compile_kernels(self.build_lib)
+
+    class PlatformWheel(bdist_wheel):
+        def get_tag(self):
+            """Of kernels for one version of Python, whose bytecode numba compares."""
+            python = f'cp{sys.version_info.major}{sys.version_info.minor}'
+            return python, 'none', sysconfig.get_platform().replace('-', '_')
+
+    commands |= {'build_py': BuildWithKernels, 'bdist_wheel': PlatformWheel}
 # Deprecated: a setuptools without it, with which colcon makes no links, must not end every build.
 with suppress(ImportError):
     from setuptools.command.develop import develop
@@ -110,8 +139,8 @@ setup(
     install_requires=[
         'click>=8.0',
         'mapbox-earcut>=1.0,<3',
-        # core/runtime/loading.py and compilation/worker.py use what it keeps to itself.
-        'numba>=0.58.1,<0.69',
+        # core/runtime/loading.py uses what it keeps to itself.
+        f'numba=={metadata.version("numba")}' if cpu else 'numba>=0.58.1,<0.69',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',

@@ -62,11 +62,15 @@ _HOMES = {
     'messages.clouds': ('planes_from_message',),
     'notebook': ('segment',),
 }
+# Of which the first frame has kernels compiled.
+_WITH_KERNELS = ('core.segmenter', 'core.sequence', 'notebook')
 
 
 def __getattr__(name: str) -> Any:
     for home, names in _HOMES.items():
         if name in names:
+            if home in _WITH_KERNELS:
+                import_module('rangeseg_ros.compilation')
             return getattr(import_module(f'rangeseg_ros.{home}'), name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 

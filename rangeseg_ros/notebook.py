@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import html
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.segmentation import Segmentation
@@ -61,14 +59,8 @@ def segment(
     else:
         image = RangeImage.from_depth(depth, camera, scale)
     image = corrected(image, config)
-    prepare(config, ('points' if image.camera is None else 'image',), _report, ())
     result = Segmenter(config).segment(image)
     return replace(result, planes=with_roles(result.planes, config, result.up))
-
-
-def _report(progress: str) -> None:
-    # One line, on terminals as in notebooks.
-    print(f'{progress:40} (once, for a minute or two)', end='\r', file=sys.stderr, flush=True)
 
 
 def picture(result: Segmentation) -> NDArray[np.uint8]:

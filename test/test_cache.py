@@ -49,7 +49,7 @@ CODE_IN_A_PICKLE = pickle.dumps(Poison()) * 2
 
 def run_restricted(code, allowed='', **environment):
     """Run Python where only one folder can be written to, or none."""
-    inherited = {k: v for k, v in os.environ.items() if k not in ('NUMBA_CACHE_DIR', 'ROS_HOME')}
+    inherited = {k: v for k, v in os.environ.items() if k != 'NUMBA_CACHE_DIR'}
     return subprocess.run(
         [sys.executable, '-c', RESTRICT + code, os.fspath(allowed)],
         capture_output=True,
@@ -59,27 +59,16 @@ def run_restricted(code, allowed='', **environment):
     )
 
 
-def test_without_a_home_kernels_are_kept_in_a_private_temporary_folder(tmp_path):
+def test_where_nothing_can_be_kept_kernels_last_as_long_as_the_process(tmp_path):
     run = run_restricted(KERNEL, tmp_path)
-    assert (run.returncode, run.stderr) == (0, '')
-    (kept,) = tmp_path.iterdir()
-    assert kept.name == f'rangeseg_ros-{os.getuid()}'
-    assert kept.stat().st_mode & 0o777 == 0o700 and kept.stat().st_uid == os.getuid()
-    assert list(kept.rglob('*.nbi'))
-
-
-def test_without_a_temporary_folder_kernels_are_kept_in_shared_memory(monkeypatch):
-    def none():
-        raise FileNotFoundError
-
-    monkeypatch.setattr(cache.tempfile, 'gettempdir', none)
-    monkeypatch.setattr(cache, '_private', lambda folder: True)
-    assert list(cache._roots())[-1] == Path(f'/dev/shm/rangeseg_ros-{os.getuid()}')
+    assert run.returncode == 0, run.stderr
+    assert run.stderr.count('CacheWarning') == 1 and 'NUMBA_CACHE_DIR' in run.stderr
+    assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize(
     'variable, folder',
-    [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros'), ('ROS_HOME', 'rangeseg_ros')],
+    [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')],
 )
 def test_folders_that_the_user_names_come_first(tmp_path, variable, folder):
     named = tmp_path / 'named'
@@ -95,14 +84,6 @@ def test_where_nothing_can_be_written_one_line_says_so(start):
     assert run.returncode == 2
     assert run.stderr.startswith(start) and run.stderr.count('\n') == 1
     assert 'NUMBA_CACHE_DIR' in run.stderr
-
-
-def test_where_no_folder_is_the_users_alone_nothing_is_kept(tmp_path):
-    tmp_path.chmod(0o777)
-    run = run_restricted(KERNEL, tmp_path)
-    assert run.returncode == 0, run.stderr
-    assert run.stderr.count('CacheWarning') == 1 and 'NUMBA_CACHE_DIR' in run.stderr
-    assert not [*tmp_path.rglob('*.nbi')]
 
 
 @pytest.mark.parametrize('mode', [0o777, 0o1777, 0o755])
@@ -189,7 +170,7 @@ MODULES = {
 }
 CALL = """
 from pathlib import Path
-from rangeseg_ros.core.runtime.outdated import drop_outdated
+from rangeseg_ros.core.runtime.cache import drop_outdated
 drop_outdated(Path('pack'))
 from pack.core.c import h
 from pack.core.d import k

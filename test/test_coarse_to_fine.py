@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_normals import coarse_to_fine, exact
+from rangeseg_ros.core.by_normals import coarse_to_fine
 from rangeseg_ros.core.by_normals.angles import angle, degrees
 from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.method import minimise_exactly
 from rangeseg_ros.core.graphcut.energy import energy
 from rangeseg_ros.core.sensing.grid import Grid
 
@@ -54,7 +55,7 @@ def test_energy_is_close_to_that_of_the_full_expansion(seed):
     """1 % is the package's promise."""
     arguments, _ = problem(seed)
     fast = value(coarse_to_fine.minimise(*arguments), *arguments)
-    full = value(exact.minimise(*arguments), *arguments)
+    full = value(minimise_exactly(*arguments), *arguments)
     assert fast <= 1.01 * full
 
 
@@ -62,7 +63,7 @@ def test_noise_free_patches_are_found_to_the_pixel():
     arguments, label = problem(3, noise=0.0)
     found = coarse_to_fine.minimise(*arguments)
     assert len(np.unique(np.stack([found.ravel(), label.ravel()]), axis=1).T) <= 7
-    assert np.mean(found == exact.minimise(*arguments)) > 0.999
+    assert np.mean(found == minimise_exactly(*arguments)) > 0.999
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (1, 30), (7, 9), (8, 16)])
@@ -100,32 +101,6 @@ def test_same_labels_every_time():
     arguments, _ = problem(2)
     first = coarse_to_fine.minimise(*arguments)
     assert np.array_equal(first, coarse_to_fine.minimise(*arguments))
-
-
-def scene(shift):
-    """Patches that move to the left, by whole pixels and with noise of their own."""
-    normals, _ = patches(7, 75, 131, 0.0)
-    seen = normals[:, shift : shift + 101]
-    noisy = seen + 0.15 * np.random.default_rng(shift).normal(size=seen.shape)
-    noisy = (noisy / np.linalg.norm(noisy, axis=2, keepdims=True)).astype(np.float32)
-    return noisy, DIRECTIONS, connected(75, 101), 40.0
-
-
-def test_warm_start_is_as_good_as_the_cold_one_in_a_sequence():
-    before = None
-    for shift in range(0, 30, 2):
-        arguments = scene(shift)
-        before = coarse_to_fine.minimise(*arguments, before)
-        cold = value(coarse_to_fine.minimise(*arguments), *arguments)
-        assert value(before, *arguments) <= 1.005 * cold
-
-
-@pytest.mark.parametrize('seed', range(5))
-def test_warm_start_from_another_scene_does_no_harm(seed):
-    arguments, _ = problem(seed)
-    other = coarse_to_fine.minimise(*problem(seed + 20)[0])
-    warm = coarse_to_fine.minimise(*arguments, other)
-    assert np.array_equal(warm, coarse_to_fine.minimise(*arguments))
 
 
 def labels_of_a_small_problem():

@@ -4,16 +4,18 @@ Of a named tuple the compiled code makes an object by calls of Python, in which 
 run. Where one raises, as that of Ctrl-C does, Python 3.12 and later crash.
 """
 
-import pickle
 import subprocess
 import sys
+from functools import partial
 from importlib import import_module
+from multiprocessing import get_context
 
 import pytest
 from numba import types
 
 from rangeseg_ros import Config
-from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
+from rangeseg_ros.compilation.discovery import discover
+from rangeseg_ros.compilation.rehearsal import rehearse
 
 CODE = """
 import re
@@ -80,19 +82,12 @@ def named(kind):
 def test_no_kernel_returns_a_named_tuple_to_python(method):
     config = Config(method=method)
     rehearse(config)
-    with subprocess.Popen(
-        [sys.executable, '-m', 'rangeseg_ros.compilation.worker'],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-    ) as worker:
-        pickle.dump(('discover', (config, KINDS)), worker.stdin)
-        worker.stdin.flush()
-        called = list(iter(lambda: pickle.load(worker.stdout), None))
-        worker.kill()
+    with get_context('spawn').Pool(1) as pool:
+        called = pool.apply(discover, (partial(rehearse, config),))
     assert called
     for kernel in called:
         dispatcher = getattr(import_module(kernel.module), kernel.name)
-        compiled = dispatcher.overloads[pickle.loads(kernel.signature)]
+        compiled = dispatcher.overloads[kernel.signature]
         assert not named(compiled.signature.return_type), kernel.name
 
 

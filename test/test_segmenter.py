@@ -11,10 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -185,9 +183,6 @@ def test_a_result_can_be_pickled_with_its_energy(config):
     assert replace(copy, planes=[]).energy == result.energy
 
 
-WARM = replace(NORMALS, warm_start=True)
-
-
 def noisy(seed):
     return corner() + 0.01 * np.random.default_rng(seed).normal(size=CAMERA.shape)
 
@@ -196,41 +191,10 @@ def image(seed, camera=CAMERA):
     return RangeImage.from_depth(noisy(seed), camera)
 
 
-def test_without_warm_start_frames_do_not_depend_on_each_other():
+def test_frames_do_not_depend_on_each_other():
     segmenter = Segmenter(NORMALS)
     for seed in (1, 2, 1):
         assert np.array_equal(segmenter.segment(image(seed)).labels, segment(noisy(seed)).labels)
-
-
-def test_warm_start_begins_anew_with_the_first_frame_a_reset_and_another_camera():
-    cold = Segmenter(NORMALS).segment(image(1)).energy
-    segmenter = Segmenter(WARM)
-    assert segmenter.segment(image(1)).energy == cold
-    warm = [segmenter.segment(image(seed)).energy for seed in (2, 3, 1)]
-    assert warm[-1] <= 1.02 * cold
-    segmenter.reset()
-    assert segmenter.segment(image(1)).energy == cold
-    other = Camera(64, 48, 61.0, 61.0, 31.5, 23.5)
-    assert segmenter._labels_before(image(1)) is not None
-    assert segmenter._labels_before(image(1, other)) is None
-    cold = Segmenter(NORMALS).segment(image(1, other)).energy
-    assert segmenter.segment(image(1, other)).energy == cold
-
-
-def test_warm_start_begins_anew_with_a_cloud_of_another_size():
-    """Clouds have no camera that could tell."""
-    whole = cloud_of(image(1).points)
-    part = cloud_of(image(1).points[:40, :50])
-    cold = Segmenter(NORMALS).segment(part).labels
-    segmenter = Segmenter(WARM)
-    segmenter.segment(whole)
-    assert np.array_equal(segmenter.segment(part).labels, cold)
-
-
-@pytest.mark.parametrize('options', [{'method': 'planes'}, {'method': 'normals', 'exact': True}])
-def test_warm_start_is_refused_where_nothing_could_begin_from_labels(options):
-    with pytest.raises(ConfigError, match='warm_start'):
-        Config(warm_start=True, **options)
 
 
 def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():

@@ -46,19 +46,6 @@ def test_strips_are_worked_on_at_the_same_time(threads):
     run_rows(lambda first, after: barrier.wait(), 1000)
 
 
-def test_strips_are_as_many_for_each_thread_as_asked_for(threads):
-    visits = np.zeros(1000, int)
-    begun = []
-
-    def kernel(first, after):
-        begun.append(first)
-        visits[first:after] += 1
-
-    run_rows(kernel, 1000, strips=1)
-    assert len(begun) == min(threads, 4)
-    assert (visits == 1).all()
-
-
 @pytest.mark.parametrize('threads', [2], indirect=True)
 def test_a_thread_that_is_done_takes_more_strips(threads):
     """The caller's first one takes as long as all others together."""
@@ -75,20 +62,13 @@ def test_a_thread_that_is_done_takes_more_strips(threads):
     run_rows(kernel, 1000)
 
 
-@pytest.mark.parametrize('threads', [1], indirect=True)
-def test_one_thread_is_the_callers_own(threads):
-    workers = set()
-    run_rows(lambda first, after: workers.add(threading.get_ident()), 100)
-    assert workers == {threading.get_ident()}
-
-
 @pytest.mark.parametrize('threads', [2], indirect=True)
 def test_frames_with_a_core_each_have_no_helpers(threads):
     def worker():
-        """Who has done a task that nobody has asked for yet."""
-        done = threading.Event()
-        task = submit(lambda: (threading.get_ident(), done.set()))
-        assert done.wait(20)
+        """Who does a task: another thread, given the time to begin it."""
+        begun = threading.Event()
+        task = submit(lambda: (threading.get_ident(), begun.set()))
+        begun.wait(0.5)
         return task.result()[0]
 
     me = threading.get_ident()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -211,12 +210,6 @@ def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
         for item in bar:
             yield item
             interrupts.check()
-
-
-def show_compilation(progress: str) -> None:
-    """Show how far a compilation is on a terminal, in one line, and nothing elsewhere."""
-    if sys.stderr.isatty():
-        print(f'{progress:40}', end='\r', file=sys.stderr, flush=True)
 
 
 def read_parameters(params_file: Path | None, **given: Any) -> Config:

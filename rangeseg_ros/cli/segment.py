@@ -10,7 +10,7 @@ import click
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
-from rangeseg_ros.compilation.preparation import prepare
+from rangeseg_ros.compilation.preparation import prepare, show
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.core.sensing.distortion import DistortionError
@@ -82,7 +82,7 @@ def command(
     options.check_new(outputs, inputs, overwrite)
     clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
     kinds = ('image', 'points') if clouds else ('image',)
-    prepare(segmenter.config, kinds, options.show_compilation, _SHOWN)
+    prepare(segmenter.config, kinds, show, _SHOWN)
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), segmenter.config)

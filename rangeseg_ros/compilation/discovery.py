@@ -1,16 +1,16 @@
 """Which kernels a run needs, and for which types, without compiling any.
 
 Every kernel is a Python function as well. A run in which they are called as such, on small
-frames, takes a second and shows what has to be compiled.
+frames, takes seconds and shows what has to be compiled.
 """
 
 from __future__ import annotations
 
-import pickle
 import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
@@ -24,67 +24,58 @@ class Kernel(NamedTuple):
     ----------
     module, name : str
         Where its dispatcher is.
-    signature : bytes
-        Pickled tuple of the types of its arguments.
+    signature : tuple
+        Types of its arguments.
     size : int
         Bytes of Python bytecode of it and of all it calls: what compiling it costs, roughly.
     """
 
     module: str
     name: str
-    signature: bytes
+    signature: tuple[Any, ...]
     size: int
 
 
-def discover(run: Callable[[], Any], found: Callable[[Kernel], None]) -> None:
-    """Tell `found` of every kernel that `run` calls from Python, once for each signature.
+def discover(run: Callable[[], Any]) -> list[Kernel]:
+    """Kernels that `run` calls from Python, once for each signature, largest first.
 
     Afterwards the kernels of this process stay interpreted: for a process of its own.
     """
-    interpreter = _Interpreter(found)
+    cv2.setNumThreads(1)  # what a kernel calls is told from the thread that it is called in
+    found: dict[tuple[Any, ...], Kernel] = {}
     for name, module in list(sys.modules.items()):
         if name.startswith(PACKAGE):
             for key, value in list(vars(module).items()):
                 if isinstance(value, Dispatcher):
-                    setattr(module, key, _Interpreted(value, interpreter))
+                    setattr(module, key, _Interpreted(value, found))
     with np.errstate(all='ignore'):
         run()
-
-
-class _Interpreter:
-    """Runs kernels as Python functions and notes what was asked for."""
-
-    def __init__(self, found: Callable[[Kernel], None]) -> None:
-        self._found = found
-        self._known: set[tuple[Any, ...]] = set()
-        self._inside = False
-
-    def call(self, kernel: Dispatcher, arguments: tuple[Any, ...]) -> Any:
-        # What kernels call is compiled with them; the types here would be those of Python.
-        if self._inside:
-            return kernel.py_func(*arguments)
-        signature = tuple(kernel.typeof_pyval(argument) for argument in arguments)
-        name = kernel.py_func.__module__, kernel.py_func.__qualname__
-        if (*name, signature) not in self._known:
-            self._known.add((*name, signature))
-            self._found(Kernel(*name, pickle.dumps(signature), _size(kernel, set())))
-        self._inside = True
-        try:
-            return _as_compiled(kernel.py_func(*arguments))
-        finally:
-            self._inside = False
+    return sorted(found.values(), key=lambda kernel: -kernel.size)
 
 
 class _Interpreted:
-    """Takes the place of a kernel; for kernels that are compiled it still is one."""
+    """Takes the place of a kernel: calls it as a Python function and notes for which types."""
 
-    def __init__(self, kernel: Dispatcher, interpreter: _Interpreter) -> None:
+    _inside = False
+
+    def __init__(self, kernel: Dispatcher, found: dict[tuple[Any, ...], Kernel]) -> None:
         self._kernel = kernel
-        self._interpreter = interpreter
-        self._numba_type_ = kernel._numba_type_
+        self._found = found
 
     def __call__(self, *arguments: Any) -> Any:
-        return self._interpreter.call(self._kernel, arguments)
+        kernel = self._kernel
+        # What kernels call is compiled with them; the types here would be those of Python.
+        if _Interpreted._inside:
+            return kernel.py_func(*arguments)
+        signature = tuple(kernel.typeof_pyval(argument) for argument in arguments)
+        name = kernel.py_func.__module__, kernel.py_func.__qualname__
+        if (*name, signature) not in self._found:
+            self._found[(*name, signature)] = Kernel(*name, signature, _size(self, set()))
+        _Interpreted._inside = True
+        try:
+            return _as_compiled(kernel.py_func(*arguments))
+        finally:
+            _Interpreted._inside = False
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._kernel, name)
@@ -99,14 +90,10 @@ def _as_compiled(value: Any) -> Any:
     return value
 
 
-def _size(kernel: Any, seen: set[int]) -> int:
-    if id(kernel) in seen:
+def _size(kernel: _Interpreted, counted: set[Any]) -> int:
+    if kernel.py_func in counted:
         return 0
-    seen.add(id(kernel))
+    counted.add(kernel.py_func)
     code, names = kernel.py_func.__code__, kernel.py_func.__globals__
-    called = [names[name] for name in code.co_names if name in names]
-    return len(code.co_code) + sum(
-        _size(getattr(other, '_kernel', other), seen)
-        for other in called
-        if isinstance(other, (Dispatcher, _Interpreted))
-    )
+    called = [names[name] for name in code.co_names if isinstance(names.get(name), _Interpreted)]
+    return len(code.co_code) + sum(_size(other, counted) for other in called)

@@ -22,7 +22,6 @@ KINDS = ('image', 'points')
 FIRST = ('labels', 'planes')
 """Outputs that need the fewest kernels: most listeners have no other."""
 
-CAMERA = Camera(64, 48, 55.0, 55.0, 31.5, 23.5)
 _HEADER = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0), frame_id='')
 
 
@@ -30,8 +29,13 @@ def rehearse(
     config: Config,
     kinds: tuple[str, ...] = KINDS,
     outputs: Collection[str] = tuple(OUTPUTS),
+    size: int = 1,
 ) -> None:
-    """Segment small frames of each of `kinds` as `config` says, and make `outputs` of them."""
+    """Segment frames of each of `kinds` as `config` says, and make `outputs` of them.
+
+    Frames of 64 x 48 pixels times `size`: small ones where kernels are interpreted, of 640 x 480,
+    which take another path, where they are compiled.
+    """
     # The room has a few hundred pixels per plane. Few directions, once round: exact solutions with
     # all of them take minutes, and run the same kernels.
     few = 25 if config.directions == 'regular' else 17
@@ -39,37 +43,43 @@ def rehearse(
     config = replace(
         config, min_pixels=min(config.min_pixels, 50), direction_count=count, cycles=1
     )
+    # What is measured in a small frame decides between paths; the stated sensor takes the other.
+    stated = replace(config, sensor_model='fixed')
     for kind in kinds:
-        sequence = SequenceSegmenter(config)
-        for number, image in enumerate(_frames(kind)):
-            result = sequence.segment(image, number)
-            for name in outputs:
-                OUTPUTS[name].message(_make, _HEADER, image, result)
+        for each in dict.fromkeys((config, stated)):
+            sequence = SequenceSegmenter(each)
+            for number, image in enumerate(_frames(kind, size)):
+                result = sequence.segment(image, number)
+                for name in outputs:
+                    OUTPUTS[name].message(_make, _HEADER, image, result)
 
 
-def _frames(kind: str) -> Iterator[RangeImage]:
+def _frames(kind: str, size: int) -> Iterator[RangeImage]:
+    camera = Camera(64 * size, 48 * size, 55.0 * size, 55.0 * size, 31.5 * size, 23.5 * size)
     # The second frame finds the planes of the first, the third has many that do not last.
     for noise in (0.001, 0.001, 0.03):
-        image = RangeImage.from_depth(_room(noise), CAMERA)
+        image = RangeImage.from_depth(_room(noise, camera, size), camera)
         # From here on it is a cloud that no camera took.
         image = image if kind == 'image' else replace(image, camera=None)
         # Maps of distortion and masks are for images of another size.
         yield replace(image, corrected=True, body=np.zeros(image.shape, np.bool_))
 
 
-def _room(noise: float) -> NDArray[np.uint16]:
+def _room(noise: float, camera: Camera, size: int) -> NDArray[np.uint16]:
     """Depth (H, W), mm: walls and floor, a box and a ball before them, noise, holes."""
-    x, y = CAMERA.rays[..., 0], CAMERA.rays[..., 1]
+    x, y = camera.rays[..., 0], camera.rays[..., 1]
     depth = 2 / (1 + np.abs(x))
     floor = np.where(y > 0.1, 0.6 / np.maximum(y, 0.1), np.inf)
     depth = np.minimum(depth, floor)
-    depth[24:40, 8:24] = 1.0
+    box = np.s_[24 * size : 40 * size, 8 * size : 24 * size]
+    depth[box] = 1.0
     ball = (x - 0.3) ** 2 + (y + 0.15) ** 2 < 0.03
     depth[ball] = 1.2 + 2 * ((x - 0.3) ** 2 + (y + 0.15) ** 2)[ball]
     depth = depth + noise * np.random.default_rng(0).normal(size=depth.shape) * depth**2
-    depth[:3, 10:20] = depth[30:34, 40:44] = 0
+    depth[: 3 * size, 10 * size : 20 * size] = 0
+    depth[30 * size : 30 * size + 4, 40 * size : 40 * size + 4] = 0
     # A bar that parts the left wall without touching it.
-    depth[10:13, :28] = 0.7
+    depth[10 * size : 13 * size, : 28 * size] = 0.7
     millimetres: NDArray[np.uint16] = np.round(1000 * depth).astype(np.uint16)
     return millimetres
 

@@ -138,11 +138,6 @@ class Config:
         low=0.0,
         high=1.0,
     )
-    warm_start: bool = option(
-        False,
-        'method normals: begin from the labels of the frame before, where its size and camera '
-        'are the same; a little faster, but results then depend on the frames before',
-    )
     noise_regions: str = option(
         'identify',
         'regions of less than two pixels per pixel of their perimeter: leave them, mark them as '
@@ -372,8 +367,6 @@ class Config:
         check_directions(self.directions, self.direction_count)
         if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
             raise ConfigError('parameter moves: swap is for method normals with exact')
-        if self.warm_start and (self.method != 'normals' or self.exact):
-            raise ConfigError('parameter warm_start is for method normals, without exact')
         if self.work_budget < 1 and (self.method != 'planes' or self.exact):
             raise ConfigError('parameter work_budget is for method planes, without exact')
         if self.odometry and not self.odometry_frame:
@@ -446,16 +439,22 @@ def _frames_in_seconds(frames: object) -> object:
 RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     'track_memory': ('track_time', _frames_in_seconds),
 }
+# Former parameters that nothing reads any more.
+DROPPED = ('warm_start',)
 
 
 def known_name(name: object) -> bool:
     """Whether a parameter is, or was, called so."""
-    return name in RENAMED or any(name == option_field.name for option_field in fields(Config))
+    return name in (*RENAMED, *DROPPED, *Config.__dataclass_fields__)
 
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
-    result = {name: value for name, value in mapping.items() if name not in RENAMED}
+    gone = (*RENAMED, *DROPPED)
+    result = {name: value for name, value in mapping.items() if name not in gone}
+    for name in DROPPED:
+        if name in mapping:
+            warnings.warn(f'parameter {name} is no longer read', FutureWarning, stacklevel=3)
     for former, (name, convert) in RENAMED.items():
         if former in mapping:
             result.setdefault(name, convert(mapping[former]))

@@ -1,4 +1,4 @@
-"""From a labelling to regions: what is large enough to be a plane (thesis 5.10, 6.1.4)."""
+"""Regions of a labelling: connected components (thesis 3.1.1) large enough for planes (5.10)."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.components import connected_components, measures
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Pixels of an image of the ABW set, which the thesis's experiments are about.
@@ -49,16 +48,140 @@ def plane_regions(
         0 = no plane, 1...M by falling size.
     """
     components = connected_components(labels, grid, valid)
-    area, perimeter = measures(components)
+    (upper, upper_rim), (lower, lower_rim) = map_halves(
+        _measure, len(components), components, int(components.max()) + 1
+    )
+    area, perimeter = upper + lower, upper_rim + lower_rim
     noise = _thin(area, perimeter, labels.shape)
     if noise_regions == 'merge':
-        regions = merge(components.image(), noise)
-        area = np.bincount(regions.ravel(), minlength=len(area))
+        components = merge(components, noise)
+        area = np.bincount(components.ravel(), minlength=len(area))
     if noise_regions != 'leave':
         area = np.where(noise, 0, area)
     area[0] = 0
-    table = by_falling_size(np.where(area < min_pixels, 0, area))
-    return relabel(regions, table) if noise_regions == 'merge' else components.renamed(table)
+    return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
+
+
+def connected_components(
+    labels: NDArray[np.integer], grid: Grid, valid: NDArray[np.bool_]
+) -> NDArray[np.int32]:
+    """4-connected components of like labels that cross no disconnected edge.
+
+    Parameters
+    ----------
+    labels : (H, W) int
+    grid : Grid
+    valid : (H, W) bool
+        Pixels to look at.
+
+    Returns
+    -------
+    (H, W) int32
+        1...M, 0 where not valid.
+    """
+    found = np.empty(labels.shape, np.int32)
+    parent = np.empty(labels.size + 1, np.int32)
+    counts = map_halves(_find_components, len(labels), labels, *grid, valid, found, parent)
+    number = _unite_halves(labels, grid.below, found, parent, *counts)
+    components = np.empty(labels.shape, np.int32)
+    run_rows(_relabel, len(labels), found, number, components)
+    return components
+
+
+@njit(cache=True, nogil=True)
+def _find_components(
+    first: int,
+    after: int,
+    labels: NDArray[np.integer],
+    right: NDArray[np.float32],
+    below: NDArray[np.float32],
+    valid: NDArray[np.bool_],
+    found: NDArray[np.int32],
+    parent: NDArray[np.int32],
+) -> int:
+    """The first pass over some rows, with a table of equivalent labels (thesis 3.1.1).
+
+    Numbers in `found` begin after that of the rows' first pixel; a number's `parent` is an
+    equivalent, lower one, or itself. Returns how many there are.
+    """
+    width = labels.shape[1]
+    start = first * width
+    count = 0
+    for i in range(first, after):
+        for j in range(width):
+            found[i, j] = 0
+            if not valid[i, j]:
+                continue
+            here = labels[i, j]
+            if j > 0 and right[i, j - 1] > 0 and labels[i, j - 1] == here:
+                found[i, j] = found[i, j - 1]
+            if i > first and below[i - 1, j] > 0 and labels[i - 1, j] == here:
+                above = found[i - 1, j]
+                if found[i, j] == 0:
+                    found[i, j] = above
+                elif above > 0 and found[i, j] != above:
+                    _unite(int(found[i, j]), int(above), parent)
+            if found[i, j] == 0:
+                count += 1
+                parent[start + count] = found[i, j] = start + count
+    return count
+
+
+@njit(cache=True)
+def _unite(a: int, b: int, parent: NDArray[np.int32]) -> None:
+    while parent[a] != a:
+        a = parent[a]
+    while parent[b] != b:
+        b = parent[b]
+    parent[max(a, b)] = min(a, b)
+
+
+@njit(cache=True, nogil=True)
+def _unite_halves(
+    labels: NDArray[np.integer],
+    below: NDArray[np.float32],
+    found: NDArray[np.int32],
+    parent: NDArray[np.int32],
+    upper: int,
+    lower: int,
+) -> NDArray[np.int32]:
+    """Component 1...M of each number in `found`, of which the halves have so many; of 0 none."""
+    height, width = labels.shape
+    middle = height // 2
+    for j in range(width if middle > 0 else 0):
+        a, b = int(found[middle - 1, j]), int(found[middle, j])
+        alike = a > 0 and b > 0 and labels[middle - 1, j] == labels[middle, j]
+        if alike and below[middle - 1, j] > 0:
+            _unite(a, b, parent)
+    # A parent has a lower number than its children, so that one pass resolves and renumbers.
+    number = np.empty(len(parent), np.int32)
+    number[0] = last = 0
+    for start, count in ((0, upper), (middle * width, lower)):
+        for k in range(start + 1, start + count + 1):
+            if parent[k] == k:
+                last += 1
+                number[k] = last
+            else:
+                number[k] = number[parent[k]]
+    return number
+
+
+@njit(cache=True, nogil=True)
+def _measure(
+    first: int, after: int, regions: NDArray[np.int32], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pixels of each region in some rows, and of those at another one or the image's border."""
+    height, width = regions.shape
+    area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    for i in range(first, after):
+        for j in range(width):
+            here = regions[i, j]
+            area[here] += 1
+            inner = 0 < i < height - 1 and 0 < j < width - 1
+            inner = inner and here == regions[i, j - 1] == regions[i, j + 1]
+            inner = inner and here == regions[i - 1, j] == regions[i + 1, j]
+            perimeter[here] += not inner
+    return area, perimeter
 
 
 def _thin(
@@ -143,10 +266,10 @@ def _relabel(
     first: int,
     after: int,
     regions: NDArray[np.integer],
-    table: NDArray[np.uint16],
-    result: NDArray[np.uint16],
+    table: NDArray[np.integer],
+    result: NDArray[np.integer],
 ) -> None:
-    """The same of some rows."""
+    """Give regions of some rows the numbers that `table` has for them."""
     for i in range(first, after):
         for j in range(regions.shape[1]):
             result[i, j] = table[regions[i, j]]

@@ -17,6 +17,7 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
+from rangeseg_ros.core.runtime.first_use import with_kernels
 from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
@@ -25,7 +26,6 @@ from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
-from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import GridEdges, weights
 from rangeseg_ros.core.sensing.jump_edges import edges_of_all, jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
@@ -44,7 +44,6 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self.reset()
         keep_freed_memory()
         load_lazily()
 
@@ -55,10 +54,6 @@ class Segmenter:
             if (value := getattr(self.config, f.name)) != f.default
         )
         return f'<Segmenter {", ".join(changed) or "with default parameters"}>'
-
-    def reset(self) -> None:
-        """Forget the frame before, from which `warm_start` begins."""
-        self._before: tuple[Camera | None, NDArray[np.integer]] | None = None
 
     def segment(self, image: RangeImage) -> Segmentation:
         """Label every pixel of `image` with the plane it belongs to.
@@ -74,8 +69,11 @@ class Segmenter:
                 f'an image is a RangeImage, not {type(image).__name__}: make one with '
                 'RangeImage.from_depth(depth, camera) or RangeImage.from_points(points)'
             )
+        return with_kernels(lambda: self._segment(image), self.config, image.camera is None)
+
+    def _segment(self, image: RangeImage) -> Segmentation:
         if cells := replication(image):
-            result = self.segment(cells.reduced(image))
+            result = self._segment(cells.reduced(image))
             labels = cells.enlarged(result.labels, image.shape)
             return replace(result, labels=labels, image=image, cells=cells)
         config = self.config
@@ -128,21 +126,11 @@ class Segmenter:
     ) -> tuple[NDArray[np.uint16], Labelling]:
         """Regions by discretised normals as labels, and the labelling they are made from."""
         image, grid = view.whole, view.grid
-        before = self._labels_before(image)
-        labelling = by_normals.segment(image, grid, config, before, watch.lap)
-        if config.warm_start:
-            self._before = image.camera, labelling.labels
+        labelling = by_normals.segment(image, grid, config, watch.lap)
         valid, least = image.valid, view.least
         regions = plane_regions(labelling.labels, valid, grid, config.noise_regions, least)
         watch.lap('regions')
         return regions, labelling
-
-    def _labels_before(self, image: RangeImage) -> NDArray[np.integer] | None:
-        """Directions of the frame before, if it was taken like this one."""
-        if self._before is None:
-            return None
-        camera, labels = self._before
-        return labels if camera == image.camera and labels.shape == image.shape else None
 
 
 def _for_every(step: int, config: Config) -> Config:

@@ -96,8 +96,6 @@ class SequenceSegmenter:
             Of the origin of the frame of the image above the ground, metres, where the parameter
             `sensor_height` is 0.
         """
-        if stamp < self._stamp:
-            self._segmenter.reset()
         return self.follow(self._segmenter.segment(image), image, stamp, up, pose, height)
 
     def follow(

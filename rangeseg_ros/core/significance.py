@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from scipy.special import fdtri, gammaincinv
+import math
+from collections.abc import Callable
 
 LEVEL = 0.999
 """Quantile that noise stays below: where it does not, something else is there."""
@@ -17,10 +18,47 @@ SAMPLES = 12
 
 
 def chi2_quantile(freedom: float, level: float = LEVEL) -> float:
-    """Quantile of chi-squared with so many degrees of freedom."""
-    return 2 * float(gammaincinv(freedom / 2, level))
+    """Quantile of chi-squared with so many degrees of freedom, few."""
+    a = freedom / 2
+
+    def probability(x: float) -> float:
+        return math.exp(a * math.log(x) - x - math.lgamma(a + 1)) * _series(lambda n: x / (a + n))
+
+    return 2 * _solve(probability, level, a + 10 * math.sqrt(a) + 20)
 
 
 def f_quantile(freedom: float, others: float, level: float = LEVEL) -> float:
-    """Quantile of the ratio of two mean squares with so many degrees of freedom (F)."""
-    return float(fdtri(freedom, others, level))
+    """Quantile of the ratio of two mean squares with so many degrees of freedom (F), few."""
+    a, b = freedom / 2, others / 2
+    scale = math.lgamma(a + b) - math.lgamma(a + 1) - math.lgamma(b)
+
+    def probability(x: float) -> float:
+        return math.exp(scale + a * math.log(x) + b * math.log1p(-x)) * _series(
+            lambda n: x * (a + b + n - 1) / (a + n)
+        )
+
+    x = _solve(probability, level, 1 - 1e-9)
+    return x * others / ((1 - x) * freedom)
+
+
+def _series(ratio: Callable[[int], float]) -> float:
+    """Sum of positive terms from 1 on, each `ratio` times the one before.
+
+    The incomplete gamma and beta functions are made of these (Abramowitz and Stegun 6.5.29 and
+    26.5.4): SciPy has both, and takes as long to import as all the rest of the core.
+    """
+    total = term = 1.0
+    n = 1
+    while term > 1e-17 * total:
+        term *= ratio(n)
+        total += term
+        n += 1
+    return total
+
+
+def _solve(probability: Callable[[float], float], level: float, most: float) -> float:
+    """Where a rising function between 0 and `most` reaches a level."""
+    low, high = 0.0, most
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if probability(middle) < level else (low, middle)
+    return middle

@@ -44,10 +44,10 @@ class Work(NamedTuple):
 
 
 class Segmented(NamedTuple):
-    """What is known of a frame without those before; `found` is None where that is nothing."""
+    """What is known of a frame without those before."""
 
     image: RangeImage
-    found: Segmentation | None
+    found: Segmentation
     at: Placement
     start: int
     ticks: list[float]
@@ -164,8 +164,7 @@ class Pipeline:
         ticks.append(time.perf_counter())
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(config, frame)
-        # Which begins with the result of the frame before.
-        found = None if config.warm_start else work.segmenter.segment(image)
+        found = work.segmenter.segment(image)
         return Segmented(image, found, at, start, ticks)
 
     def _finish(self, work: Work, segmented: Segmented | Exception) -> None:
@@ -198,10 +197,7 @@ class Pipeline:
             self._sequence.config = config
         sequence = self._sequence
         placed = work.frame.stamp, at.up, at.pose, at.height
-        if found is None:
-            found = sequence.segment(image, *placed)
-        else:
-            found = sequence.follow(found, image, *placed)
+        found = sequence.follow(found, image, *placed)
         self._tell(sequence, at)
         ticks.append(time.perf_counter())
         target = (config.target_frame, at.target) if at.target else None

@@ -7,11 +7,12 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals import coarse_to_fine, exact
-from rangeseg_ros.core.by_normals.angles import angle
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.angles import AngularCost, angle
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.graphcut import moves as graphcut
 from rangeseg_ros.core.graphcut.energy import energy
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -56,7 +57,6 @@ def segment(
     image: RangeImage,
     grid: Grid,
     config: Config,
-    before: NDArray[np.integer] | None,
     lap: Callable[[str], None],
 ) -> Labelling:
     """Give every pixel a direction.
@@ -69,8 +69,6 @@ def segment(
         Of the image.
     config : Config
         All that is said to be of method normals is read.
-    before : (H, W) integer or None
-        Labels to begin from, those of the frame before; not with `exact`.
     lap : callable
         Told the name of every stage that ends.
     """
@@ -80,8 +78,28 @@ def segment(
     labels_of = labels_of @ image.axes.T
     problem = normals, labels_of, grid, config.smoothness
     if config.exact:
-        labels = exact.minimise(*problem, config.moves, config.cycles)
+        labels = minimise_exactly(*problem, config.moves, config.cycles)
     else:
-        labels = coarse_to_fine.minimise(*problem, before)
+        labels = coarse_to_fine.minimise(*problem)
     lap('labels')
     return Labelling(labels, labels_of, normals, grid, config.smoothness)
+
+
+def minimise_exactly(
+    normals: NDArray[np.float32],
+    directions: NDArray[np.floating],
+    grid: Grid,
+    smoothness: float,
+    moves: str = 'expansion',
+    cycles: int = 0,
+) -> NDArray[np.int32]:
+    """Labelling that no move of a label improves, from the nearest direction at every pixel.
+
+    Parameters and result as in `coarse_to_fine.minimise`; `moves` and `cycles` as in
+    `moves.Labelling.minimise` (thesis 4.8).
+    """
+    cost = AngularCost(normals, directions)
+    nearest = cost.nearest().reshape(normals.shape[:2])
+    labelling = graphcut.Labelling(nearest, cost, grid, smoothness)
+    labelling.minimise(len(directions), moves, cycles)
+    return labelling.image

@@ -11,10 +11,8 @@ so that it becomes an n-link of w/2 and a cost w/2 of staying at each end: no au
 is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the n-link becomes a
 cost of staying or of switching.
 
-Most nodes need no search: one whose excess outweighs its edges together is decided, whatever its
-neighbours choose, and what it decides often decides these (partial optimality, persistency). For
-the rest the cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such
-grids: a tree grows from either terminal over edges that are not saturated; where the two meet,
+The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
+tree grows from either terminal over edges that are not saturated; where the two meet,
 flow is pushed along the path, and the nodes that this cuts off look for another parent in their
 tree.
 """
@@ -92,7 +90,6 @@ def minimum_cut(
         seen from either end.
     """
     count = len(excess)
-    neighbour = neighbour.copy()
     flow = _Flow(
         neighbour,
         _sides(neighbour),
@@ -106,8 +103,6 @@ def minimum_cut(
         np.zeros(count, np.bool_),
     )
     orphans = np.empty(count, np.int32)
-    _decide(flow)
-    _push_between_neighbours(flow)
     first = last = waiting = 0
     for p in range(count):
         if flow.terminal[p] != 0:
@@ -201,48 +196,6 @@ def _sides(neighbour: NDArray[np.int32]) -> NDArray[np.uint8]:
 def _next(place: int, count: int) -> int:
     """Place after another in a ring."""
     return place + 1 if place + 1 < count else 0
-
-
-@njit(cache=True, nogil=True)
-def _decide(flow: _Flow) -> None:
-    """Take nodes that outweigh their edges out of the graph, and what these cost to the others."""
-    neighbour, residual, terminal = flow.neighbour, flow.residual, flow.terminal
-    waiting, queued = np.arange(len(terminal)), np.ones(len(terminal), np.bool_)
-    last = len(terminal)
-    while last > 0:
-        last -= 1
-        p = waiting[last]
-        queued[p] = False
-        edges = 0.0
-        for k in range(4):
-            edges += residual[p, k] if neighbour[p, k] >= 0 else 0.0
-        if -edges <= terminal[p] < edges:
-            continue
-        for k in range(4):
-            q = neighbour[p, k]
-            if q < 0:
-                continue
-            terminal[q] += residual[p, k] if terminal[p] >= 0 else -residual[p, k]
-            neighbour[p, k] = neighbour[q, flow.back[p, k]] = -1
-            if not queued[q]:
-                waiting[last], queued[q] = q, True
-                last += 1
-
-
-@njit(cache=True, nogil=True)
-def _push_between_neighbours(flow: _Flow) -> None:
-    """Push what the shortest paths can take: over one edge, which needs no trees."""
-    terminal, residual = flow.terminal, flow.residual
-    for p in range(len(terminal)):
-        for k in range(4):
-            q = flow.neighbour[p, k]
-            if q < 0 or terminal[p] <= 0 or terminal[q] >= 0:
-                continue
-            pushed = min(terminal[p], -terminal[q], residual[p, k])
-            terminal[p] -= pushed
-            terminal[q] += pushed
-            residual[p, k] -= pushed
-            residual[q, flow.back[p, k]] += pushed
 
 
 @njit(cache=True, nogil=True)

@@ -1,27 +1,31 @@
 """Where compiled kernels are kept: what is read from there is executed.
 
-numba keeps them beside the sources, or in the user's cache folder, and refuses to work where it
-may write to neither: in containers with a read-only root, for users without a home. And it takes
-whatever it finds there, also where others have put it.
+numba keeps them beside the sources, or in a folder that it is given. It takes whatever it finds
+there, also where others have put it, and does not notice when what a kernel calls has changed.
 """
 
 from __future__ import annotations
 
+import ast
 import atexit
 import hashlib
+import json
 import os
 import shutil
 import stat
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterator
-from contextlib import suppress
+from importlib import metadata
 from pathlib import Path
 
-from rangeseg_ros.core.runtime.outdated import drop_outdated, stamps
-
 PACKAGE = Path(__file__).parents[2]
+# Beside the kernels of the core: the sources that all kernels of the package were compiled from.
+_SOURCES = Path('core', '__pycache__', 'compiled_from.json')
+# The same of wheels with compiled kernels: their processor, and version of numba.
+_TARGET = Path('core', '__pycache__', 'compiled_for.json')
+# Instructions of llvm's processors for which wheels are compiled.
+_FEATURES = {'x86-64-v3': ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')}
 
 
 class CacheWarning(UserWarning):
@@ -32,9 +36,8 @@ def choose_cache() -> None:
     """Give numba a folder for compiled kernels, before the first kernel is defined.
 
     The first that can be written to, and not by other users: `NUMBA_CACHE_DIR`, the package
-    (whoever can write there can change the sources), the user's cache folder, `ROS_HOME`, a folder
-    of the user's own in the temporary directory or in shared memory, one there for this process
-    alone. Kernels that were compiled into a package which is read-only now are copied there.
+    (whoever can write there can change the sources), the user's cache folder, a temporary one for
+    this process. Kernels that were compiled into a package which is read-only are copied there.
 
     Warns
     -----
@@ -46,11 +49,12 @@ def choose_cache() -> None:
     OSError
         No folder can be written to.
     """
+    _choose_processor()
     given = os.environ.pop('NUMBA_CACHE_DIR', None)
+    if given and (folder := _own_folder(Path(given))):
+        _keep_in(folder)
+        return
     if given:
-        if folder := _own_folder(Path(given)):
-            _keep_in(folder)
-            return
         _warn(
             f'NUMBA_CACHE_DIR: {given} is not used: it cannot be written to, or others can write '
             'to it, and what is in it would be executed'
@@ -59,23 +63,45 @@ def choose_cache() -> None:
         drop_outdated(PACKAGE)
         _tell_numba('')
         return
-    for root in _roots():
-        if folder := _own_folder(root):
-            _keep_in(folder)
-            _copy_compiled(folder)
-            return
-    for temporary in _temporary_folders():
-        with suppress(OSError):
-            folder = Path(tempfile.mkdtemp(prefix='rangeseg_ros-', dir=temporary))
-            atexit.register(shutil.rmtree, folder, ignore_errors=True)
-            _warn(
-                'compiled kernels cannot be kept, so that every start compiles them: no folder '
-                'can be written to by this user alone; set NUMBA_CACHE_DIR to one that can'
-            )
-            _keep_in(folder)
-            _copy_compiled(folder)
-            return
-    raise OSError('no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one')
+    home = os.environ.get('HOME')
+    user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
+    folder = _own_folder(Path(user, 'rangeseg_ros')) if user else None
+    if folder is None:
+        try:
+            folder = Path(tempfile.mkdtemp(prefix='rangeseg_ros-'))
+        except OSError:
+            raise OSError(
+                'no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one'
+            ) from None
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        _warn(
+            'compiled kernels cannot be kept, so that every start compiles them: neither the '
+            'package nor a cache folder can be written to by this user alone; set NUMBA_CACHE_DIR '
+            'to one that can'
+        )
+    _keep_in(folder)
+    _copy_compiled(folder)
+
+
+def _choose_processor() -> None:
+    """Have numba compile for the processor of the kernels in the package, as numba names these."""
+    try:
+        target = json.loads((PACKAGE / _TARGET).read_text())
+    except (OSError, ValueError):
+        return
+    if 'NUMBA_CPU_NAME' in os.environ:
+        return
+    from llvmlite import binding
+
+    has = binding.get_host_cpu_features()
+    if not all(has.get(feature) for feature in _FEATURES.get(target['cpu'], ())):
+        _warn(f'the compiled kernels are for a {target["cpu"]}: they are compiled anew')
+    elif target['numba'] != (found := metadata.version('numba')):
+        _warn(f'the compiled kernels are of numba {target["numba"]}: {found} compiles them anew')
+    else:
+        os.environ.update(NUMBA_CPU_NAME=target['cpu'], NUMBA_CPU_FEATURES='')
+        if 'numba' in sys.modules:
+            sys.modules['numba'].config.reload_config()
 
 
 def writable(folder: Path) -> bool:
@@ -88,9 +114,62 @@ def writable(folder: Path) -> bool:
     return True
 
 
+def drop_outdated(package: Path) -> None:
+    """Remove kernels compiled beside sources that have changed, or that import such sources.
+
+    Parameters
+    ----------
+    package : Path
+        With the compiled kernels, and a note of what they were compiled from.
+    """
+    note = package / _SOURCES
+    now = _digests(package)
+    try:
+        before = json.loads(note.read_text())
+    except (OSError, ValueError):
+        before = {}
+    if now == before:
+        return
+    changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
+    for module in _dependents(package, changed):
+        for compiled in (module.parent / '__pycache__').glob(f'{module.stem}.*.nb[ic]'):
+            compiled.unlink(missing_ok=True)
+    part = note.with_name(f'{note.name}.{os.getpid()}')
+    part.write_text(json.dumps(now))
+    os.replace(part, note)
+
+
+def _digests(package: Path) -> dict[str, str]:
+    """Digests of the sources of the core, by name: times of change may be those of an archive."""
+    return {
+        path.relative_to(package).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((package / 'core').rglob('*.py'))
+    }
+
+
+def _dependents(package: Path, changed: set[str]) -> set[Path]:
+    """The changed modules and all that import one of them, or one that does."""
+    imports = {path: _imported(path) for path in (package / 'core').rglob('*.py')}
+    modules = {package / name for name in changed}
+    while True:
+        names = {'.'.join(p.relative_to(package.parent).with_suffix('').parts) for p in modules}
+        more = {path for path, imported in imports.items() if imported & names} - modules
+        if not more:
+            return modules
+        modules |= more
+
+
+def _imported(path: Path) -> set[str]:
+    """Modules that a source imports; names imported from them, too, as they may be modules."""
+    nodes = ast.walk(ast.parse(path.read_bytes()))
+    found = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
+    names = {f'{node.module}.{item.name}' for node in found for item in node.names}
+    return names | {str(node.module) for node in found}
+
+
 def _own_folder(root: Path) -> Path | None:
     """Folder within `root` for this state of the sources; None where it is not ours alone."""
-    state = hashlib.sha256(repr(stamps(PACKAGE)).encode()).hexdigest()
+    state = hashlib.sha256(repr(_digests(PACKAGE)).encode()).hexdigest()
     name = f'rangeseg_ros-{state[:16]}'
     # Other than a process that was told of it by the one that started it.
     folder = root if root.name == name else root / name
@@ -138,31 +217,6 @@ def _tell_numba(folder: str) -> None:
 
 def _warn(text: str) -> None:
     warnings.warn(text, CacheWarning, stacklevel=3)
-
-
-def _roots() -> Iterator[Path]:
-    cache = os.environ.get('XDG_CACHE_HOME')
-    home = os.environ.get('HOME')
-    if cache or home:
-        yield (Path(cache) if cache else Path(home or '', '.cache')) / 'rangeseg_ros'
-    if ros_home := os.environ.get('ROS_HOME'):
-        yield Path(ros_home) / 'rangeseg_ros'
-    for temporary in _temporary_folders():
-        # Not in a folder that somebody else has made there.
-        own = temporary / f'rangeseg_ros-{os.getuid()}'
-        with suppress(OSError):
-            own.mkdir(mode=0o700, exist_ok=True)
-            if _private(own):
-                yield own
-
-
-def _temporary_folders() -> Iterator[Path]:
-    if not hasattr(os, 'getuid'):
-        return
-    with suppress(FileNotFoundError):
-        yield Path(tempfile.gettempdir())
-    # Memory: containers with a read-only root have it, too, and it lasts as long as they do.
-    yield Path('/dev/shm')
 
 
 def _copy_compiled(folder: Path) -> None:

@@ -17,10 +17,9 @@ _HEADROOM = 1.15
 # What more work will take is foreseen no better than this: of the shares that `Work` states and
 # those measured (docs/benchmark.md), and of the times of frames after one time constant.
 _DOUBT = 1.1
-# Seconds for which more work must seem possible before it is tried: then 95 % of what is known is
-# of the work that is done. After a trial that fails, twice as long, up to a minute: the time
-# constant that a failure takes is then a share of 2 %.
-_PATIENCE, _MOST_PATIENCE = 3 * _TIME_CONSTANT, 60 * _TIME_CONSTANT
+# Seconds for which more work must seem possible before it is done: then 95 % of what is known is
+# of the work that is done.
+_PATIENCE = 3 * _TIME_CONSTANT
 
 
 class Pace:
@@ -30,10 +29,7 @@ class Pace:
     all the same, would just have lasted the period P with the share b (P - o) / r. Its logarithm,
     as a median of three and through a low-pass filter of first order, is what the share is told
     from: the largest of a few steps that is enough at once where that is less, one step more when
-    it has been well possible for some time. The share that was foreseen does not depend on the
-    step that is taken, so that nothing winds up where none is small enough. That patience grows
-    with trials that fail is how wireless links choose their rate (Lacage, Manshaei and Turletti,
-    IEEE 802.11 rate adaptation: a practical approach, MSWiM 2004).
+    it has been well possible for some time.
 
     Parameters
     ----------
@@ -53,10 +49,7 @@ class Pace:
         self._bounds = _share(self._steps[-1]) / 2, 2 * _share(most)
         self._latest: deque[float] = deque(maxlen=3)
         self._enough = self._bounds[1]
-        self._patience = _PATIENCE
-        # Seconds for which more work has seemed possible, and for which it is on trial.
-        self._possible = 0.0
-        self._trial: float | None = None
+        self._possible = 0.0  # seconds for which more work has seemed so
 
     @property
     def budget(self) -> float:
@@ -72,31 +65,16 @@ class Pace:
         seconds = max(refining + other, self._period)
         kept = math.exp(-seconds / _TIME_CONSTANT)
         self._enough = self._enough**kept * median(self._latest) ** (1 - kept)
-        if self._enough < _share(self.budget):
-            self._do_less()
-        else:
-            self._do_more(seconds)
-
-    def _do_less(self) -> None:
-        """Take the largest step that is small enough, or the smallest."""
-        if self._trial is not None:
-            self._patience = min(2 * self._patience, _MOST_PATIENCE)
+        above = self._steps[max(self._step - 1, 0)]
+        if self._enough <= _DOUBT * _share(above):
+            self._possible = 0.0
+        elif self._step > 0:
+            self._possible += seconds
+        if self._possible > _PATIENCE:
+            self._step -= 1
+            self._possible = 0.0
         while self._step + 1 < len(self._steps) and self._enough < _share(self.budget):
             self._step += 1
-        self._possible, self._trial = 0.0, None
-
-    def _do_more(self, seconds: float) -> None:
-        """Try the next step once it has seemed possible for long; what lasts so long works."""
-        if self._trial is not None:
-            self._trial += seconds
-            if self._trial > self._patience:
-                self._patience, self._trial = _PATIENCE, None
-        above = _share(self._steps[max(self._step - 1, 0)])
-        possible = self._step > 0 and self._enough > _DOUBT * above
-        self._possible = self._possible + seconds if possible else 0.0
-        if self._possible > self._patience:
-            self._step -= 1
-            self._possible, self._trial = 0.0, 0.0
 
 
 def _share(budget: float) -> float:

@@ -99,10 +99,7 @@ class Camera:
                 raise CameraError(
                     f'focal length {name} must be positive, not {getattr(self, name)}'
                 )
-        if self.distortion_model != 'equidistant':
-            self._check_slopes()
-        if self.distortion_model:
-            self._check_lens()
+        self._check_rays()
 
     @classmethod
     def from_fov(cls, width: int, height: int, degrees: float) -> Camera:
@@ -125,18 +122,13 @@ class Camera:
         focal = width / (2 * math.tan(math.radians(degrees) / 2))
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
-    def _check_slopes(self) -> None:
-        corners = np.array([(u, v) for u in (0, self.width - 1) for v in (0, self.height - 1)])
-        with np.errstate(over='ignore', invalid='ignore'):
-            steepest = np.abs(self._distorted(corners[:, 0], corners[:, 1])).max()
-        if not steepest <= _STEEPEST:
+    def _check_rays(self) -> None:
+        shown = _shown(self)
+        if not self.distortion_model and not shown.all():
             raise CameraError(
                 f'focal lengths {self.fx:g}, {self.fy:g} and principal point {self.cx:g}, '
                 f'{self.cy:g} do not fit {self.width}x{self.height} pixels'
             )
-
-    def _check_lens(self) -> None:
-        shown = _shown(self)
         if shown.sum() < 3:  # that a plane could be seen in
             raise CameraError('lens distortion D fits no lens: hardly any pixel has a ray')
         if not shown.all() and self.distortion_model != 'equidistant':
@@ -197,24 +189,16 @@ class Camera:
         Returns
         -------
         (..., 3) float64
-            NaN where a lens shows no ray.
+            NaN where there is no ray.
         """
-        x, y = self._distorted(np.asarray(u, float), np.asarray(v, float))
-        z: float | NDArray[np.float64] = 1.0
+        with np.errstate(over='ignore', invalid='ignore'):
+            y = (np.asarray(v, float) - self.cy) / self.fy
+            x = (np.asarray(u, float) - self.cx - self.skew * y) / self.fx
         if self.distortion_model:
             x, y = undistort(x, y, self.distortion_model, self.d)
-            shown = (np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST)
-            x, y, z = (np.where(shown, value, np.nan) for value in (x, y, z))
-        rays = np.empty((*x.shape, 3))
-        rays[..., 0], rays[..., 1], rays[..., 2] = x, y, z
+        rays = np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
+        rays[~((np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST))] = np.nan
         return rays if self.turn == OPTICAL else rays @ self.axes.T
-
-    def _distorted(
-        self, u: NDArray[np.floating], v: NDArray[np.floating]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Places in the plane z = 1 behind the lens."""
-        y = (v.astype(np.float64) - self.cy) / self.fy
-        return (u - self.cx - self.skew * y) / self.fx, y
 
 
 def whole(name: str, value: Any) -> int:

@@ -1,0 +1,69 @@
+"""Kernels that are not compiled when they are first needed.
+
+numba would compile them one after the other, in silence. What compiles all of them ahead, in
+several processes, is above the core: it says here what is to be called.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from pathlib import Path
+from typing import Any, TypeVar
+
+from numba.core import event
+
+T = TypeVar('T')
+
+_PACKAGE = f'{Path(__file__).parents[2].name}.'
+_ahead: Callable[..., None] | None = None
+_inside = ContextVar('inside', default=False)
+
+
+class NotCompiledError(Exception):
+    """A kernel is not in the cache."""
+
+
+def compile_ahead_by(ahead: Callable[..., None]) -> None:
+    """Have `ahead` called where a frame needs kernels that are not compiled."""
+    global _ahead
+    _ahead = ahead
+
+
+def with_kernels(run: Callable[[], T], *needed: Any) -> T:
+    """Result of run(); where kernels are not compiled, after ahead(*needed) has compiled them."""
+    if _ahead is None or _inside.get():
+        return run()
+    try:
+        with nothing_compiled():
+            return run()
+    except NotCompiledError:
+        _ahead(*needed)
+    return run()
+
+
+@contextmanager
+def not_ahead() -> Iterator[None]:
+    """Compile nothing ahead in this thread: for what does that, and runs frames itself."""
+    token = _inside.set(True)
+    try:
+        yield
+    finally:
+        _inside.reset(token)
+
+
+@contextmanager
+def nothing_compiled() -> Iterator[None]:
+    """Raise `NotCompiledError` where a kernel of the package would be compiled."""
+
+    class Refuse(event.Listener):
+        def on_start(self, event: Any) -> None:
+            if event.data['dispatcher'].py_func.__module__.startswith(_PACKAGE):
+                raise NotCompiledError(event.data['dispatcher'], event.data['args'])
+
+        def on_end(self, event: Any) -> None:
+            pass
+
+    with event.install_listener('numba:compile', Refuse()):
+        yield
