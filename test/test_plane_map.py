@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
-from rangeseg_ros.core.mapping.observations import LASTING, RESIDUE, PoseNoise, observations
+from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, observations
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
