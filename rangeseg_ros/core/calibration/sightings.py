@@ -8,6 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import SAMPLES
@@ -50,6 +51,13 @@ class Sightings(NamedTuple):
     def plane(self) -> NDArray[np.intp]:
         """Plane (N,) that each cell belongs to."""
         return np.repeat(np.arange(len(self.frame)), np.diff(self.start))
+
+    def rays(self) -> sparse.csr_array:
+        """Matrix (N, 3 P) from the planes' theta to the inverse depths of their cells."""
+        columns = 3 * self.plane()[:, None] + np.arange(3)
+        pointers = np.arange(0, 3 * len(self.cell) + 1, 3)
+        shape = len(self.cell), 3 * len(self.frame)
+        return sparse.csr_array((self.ray.ravel(), columns.ravel(), pointers), shape)
 
     def of_frames(self, chosen: NDArray[np.bool_]) -> Sightings:
         """Those of the frames that are chosen, (F,); the frames keep their numbers."""
