@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
-from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, observations
+from rangeseg_ros.core.mapping.observations import LASTING, RESIDUE, PoseNoise, observations
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -47,6 +47,7 @@ def observed(random, pose, truth, root, lasting):
         confidence=1.0,
         rms=0.0,
         area=1.0,
+        extents=np.ones(2),
     )
 
 
@@ -77,9 +78,7 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
                 first = np.array([0])
                 filters.update(filters.expected(first, seen, first), seen)
         error = np.append(filters.normal[0], filters.distance[0]) - truth
-        values.append(
-            error @ np.linalg.pinv(filters.plane_covariance(np.array([0]))[0], 1e-10) @ error / 3
-        )
+        values.append(error @ np.linalg.pinv(filters.plane_covariance[0], 1e-10) @ error / 3)
         errors.append(np.linalg.norm(error[:3]))
     assert 0.7 < np.mean(values) < 1.5
     assert np.median(errors) < np.radians(0.4)

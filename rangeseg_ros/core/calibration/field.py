@@ -12,8 +12,8 @@ C = B^T W R and Q = R^T W R. They are solved by conjugate gradients, preconditio
 planes. S are squared second differences of the cells (bending energy; of a slope the first
 differences), with a smoothness for each coefficient. Weights fall as 1 / s^2 with the robust
 standard deviation s of a plane's residuals (where ranges err, near planes are much noisier in
-inverse depth), and as 1 / (1 + (e / (k s))^2) with the residual e (Cauchy), so that wrong regions do
-not bend the field.
+inverse depth), and as 1 / (1 + (e / (k s))^2) with the residual e (Cauchy), so that wrong regions
+do not bend the field.
 
 A plane in inverse depth over the whole image is in the null space of the planes, and of S: any of
 it may be added to m, which makes the field no less smooth. So is a slope that is the same

@@ -2,9 +2,9 @@
 
 The frames are cut into blocks of consecutive ones, as neighbours in time see almost the same. Each
 block is left out once, and the field of the others, which is almost that of all frames, is tried
-on it. This decides how smooth the field is, and whether it has a slope over the inverse depth, and
-tells how much of the residual is explained, by how much the field is scaled down where little of
-it holds, and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth
+on it. This decides how smooth the field is, and whether it depends on the distance, and tells
+how much of the residual is explained, by how much the field is scaled down where little of it
+holds, and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth
 field is added).
 
 Cells count by robust weights, as in the solution: a few wrong regions would outvote the field.
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.calibration.bands import column_profile
 from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
@@ -113,19 +113,29 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     # Of the planes, not of the measurements: a slope that is the same everywhere is then free, as
     # it only scales the planes, and cannot explain the noise away.
     change = (seen.inverse - residuals(seen, seen.inverse) - reference) / spread
-    basis = np.stack([np.ones(len(change)), change])
+    one, square = np.ones(len(change)), (1 + spread / reference * change) ** 2
     splits, grid = _splits(seen, shape), cell_grid(shape)
 
-    def best(tried: list[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
-        found = [_folds(split, basis[: len(tried[0])], grid, tried) for split in splits]
+    def best(
+        basis: NDArray[np.float64], linear: ArrayLike, tried: Sequence[tuple[float, ...]]
+    ) -> _Model:
+        found = [_folds(split, basis, grid, tried) for split in splits]
         pairs = zip(tried, map(list, zip(*found, strict=True)), strict=True)
-        return min(pairs, key=lambda pair: _left(pair[1]))
+        smoothness, folds = min(pairs, key=lambda pair: _left(pair[1]))
+        return _Model(basis, np.array(linear), smoothness, folds)
 
-    smoothness, folds = best([(value,) for value in _SMOOTHNESS])
-    sloped = best([(*smoothness, value) for value in _SLOPES])
-    if _left(sloped[1]) < (1 - _WORTH) * _left(folds):
-        smoothness, folds = sloped
-    basis = basis[: len(smoothness)]
+    alone = [(value,) for value in _SMOOTHNESS]
+    model = best(one[None], [[1.0]], alone)
+    least = (1 - _WORTH) * _left(model.folds)
+    # An error dr of the range is one of -y^2 dr of the inverse depth y: its tangent, as a line
+    # through what was seen would follow the few nearest planes. Else a slope of its own.
+    ranged = best(square[None], [[1.0], [2 / reference]], alone)
+    slopes = [(*model.smoothness, value) for value in _SLOPES]
+    sloped = best(np.stack([one, change]), np.diag([1.0, 1 / spread]), slopes)
+    other = min(ranged, sloped, key=lambda each: _left(each.folds))
+    if _left(other.folds) < least:
+        model = other
+    basis, linear, smoothness, folds = model
     weight, _ = _settled_weights(seen, grid)
     profile = column_profile(seen)
     banded = seen._replace(inverse=seen.inverse - _in_cells(profile, shape)[seen.cell])
@@ -133,13 +143,26 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
     gain = _gain([fold.projection for fold in folds])
     # What smoothing costs shows in a field that is less smooth.
     less = [value / _STEP for value in smoothness]
-    rough = solve(banded, basis, weight, grid, less, field)[0]
+    rough = solve(banded, basis, weight, grid, less, field)
+    offset, change = linear[0] @ field, linear[0] @ (rough - field)
     # What was scaled off may be true.
-    biases = [gain * (rough - field[0]), (1 - gain) * field[0]]
-    others = [gain * (fold.field[0] + fold.bands) for fold in folds]
+    biases = [gain * change, (1 - gain) * offset]
+    others = [gain * (linear[0] @ fold.field + fold.bands) for fold in folds]
     deviation = _deviation(others, biases, seen, grid)
-    scale = gain * np.array([1.0, 1 / spread])[: len(field), None]
-    return Learned(scale * field, gain * profile, deviation, reference, smoothness, gain, folds)
+    field = gain * linear @ field
+    return Learned(field, gain * profile, deviation, reference, smoothness, gain, folds)
+
+
+class _Model(NamedTuple):
+    """A field of K coefficients for the factors `basis` (K, N), and how well it holds.
+
+    `linear` turns them into the offset at the reference and, where there is one, the slope.
+    """
+
+    basis: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    smoothness: tuple[float, ...]
+    folds: list[Fold]
 
 
 class _Split(NamedTuple):

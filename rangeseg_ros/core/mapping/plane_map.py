@@ -118,10 +118,10 @@ class PlaneMap:
         self.drift.move(pose.shift)
         if planes:
             view = views(labels, planes, config.distortion_length)
-            if self._filters is not None:
-                # Where images are of another size, what comes is of other pixels than before.
-                if self._filters.view.shape[1] != view.shape[1]:
-                    self._filters.view = np.zeros((len(self._records), view.shape[1]))
+            known = self._filters
+            if known is not None and known.view.shape[1] != view.shape[1]:
+                # Of images of another size, what comes is of other pixels than before.
+                known.view = np.zeros((len(self._records), view.shape[1]))
             seen = observations(planes, view, pose, noise)
             match, step = self._associate(planes, seen)
             if jump:

@@ -18,7 +18,8 @@ OFFSET, ANGLE = 0.007, np.radians(1.0)
 """What planes of one surface differ by from frame to frame beyond their covariances.
 
 Their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
-distortion of a Kinect is there), and an angle, at least and for an offset over half of the plane's width.
+distortion of a Kinect is there), and an angle, at least and for an
+offset over half of the plane's width.
 """
 NARROWEST = 0.01
 """Half the width that a plane counts with at least, metres, so that what it tilts by is finite."""

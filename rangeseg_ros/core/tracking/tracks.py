@@ -32,8 +32,8 @@ class Tracks:
 
     `plane` (N, 4) are normals and distances. `footprint` and `owner` list the samples of the label
     image in which the planes were last seen and whose they were, 0...N-1; `unseen` is how many
-    seconds have passed since then. `width` (N,) and `reach` are half the width and half the diagonal
-    of the rectangle around each plane, metres.
+    seconds have passed since then. `width` (N,) and `reach` are half the width and half the
+    diagonal of the rectangle around each plane, metres.
     """
 
     id: NDArray[np.int64]
