@@ -29,7 +29,7 @@ def value_in(folder, constant):
     return float(value)
 
 
-@pytest.mark.parametrize('name', ['tracking/tracker._GATE', 'tracking/tracker._UNSEEN_OVERLAP'])
+@pytest.mark.parametrize('name', ['tracking/tracker.PERSISTENCE', 'tracking/tracker._UNSEEN_OVERLAP'])
 def test_one_constant_of_a_copy_is_changed(name, tmp_path):
     constant = CONSTANTS[name]
     sensitivity.write_changed([constant], 0.5, tmp_path)
@@ -98,7 +98,7 @@ def test_command_resumes(tmp_path, monkeypatch):
     table = tmp_path / 'method.md'
     table.write_text(
         '| module | name | value | kind | reason |\n'
-        '| `tracking/tracker` | `_GATE` | 20 | d | tried |\n'
+        '| `tracking/tracker` | `PERSISTENCE` | 0.5 | d | tried |\n'
         '| `calibration/sightings` | `_RIM` | 2 | d | tried |\n'
         '| `fitting/cells` | `MAX_CELLS` | 100 | c | memory |\n'
     )
@@ -107,14 +107,14 @@ def test_command_resumes(tmp_path, monkeypatch):
     assert CliRunner().invoke(command, [*map(str, arguments)]).exception
     done = CliRunner().invoke(command, [*map(str, arguments)])
     assert done.exit_code == 0, done.output
-    assert 'tracking/tracker._GATE: 0.5 to 1 times 20.0' in done.output
+    assert 'tracking/tracker.PERSISTENCE: 0.5 to 1 times 0.5' in done.output
     rows = (tmp_path / 'out/sensitivity.csv').read_text().splitlines()
     assert len(rows) == 3 and rows[0].startswith('constant,value,low,high,loss')
     # Unchanged once for both, every factor once for each, and the one that failed again.
     assert len(measured) == 1 + 4 + 1 and measured[3] == measured[4]
     done = CliRunner().invoke(command, [*map(str, arguments), '--together'])
     assert (
-        'calibration/sightings._RIM, tracking/tracker._GATE: 0.5 to 1 times 2, 20.0' in done.output
+        'calibration/sightings._RIM, tracking/tracker.PERSISTENCE: 0.5 to 1 times 2, 0.5' in done.output
     )
     assert len(measured) == 6 + 2 and all(len(constants) == 2 for constants, _ in measured[6:])
     unknown = CliRunner().invoke(command, [*map(str, arguments[:4]), '--constant', 'a._B'])
@@ -126,9 +126,9 @@ def test_command_resumes(tmp_path, monkeypatch):
     [
         (
             'import json\n'
-            'from rangeseg_ros.core.tracking.tracker import _GATE\n'
-            "print(json.dumps({'gate': _GATE}))",
-            {'gate': CONSTANTS['tracking/tracker._GATE'].value / 2},
+            'from rangeseg_ros.core.tracking.tracker import PERSISTENCE\n'
+            "print(json.dumps({'gate': PERSISTENCE}))",
+            {'gate': CONSTANTS['tracking/tracker.PERSISTENCE'].value / 2},
         ),
         ('print("no figures")', None),
         ('raise SystemExit(1)', None),
@@ -137,7 +137,7 @@ def test_command_resumes(tmp_path, monkeypatch):
 def test_script_measures_the_changed_package(program, found, tmp_path):
     script = tmp_path / 'figures.py'
     script.write_text(program)
-    trial = Trial((CONSTANTS['tracking/tracker._GATE'],), 0.5, (), (), tmp_path / 'cache', script)
+    trial = Trial((CONSTANTS['tracking/tracker.PERSISTENCE'],), 0.5, (), (), tmp_path / 'cache', script)
     assert trial.run() == found
     # Another program is another trial.
     script.write_text('print("{}")')

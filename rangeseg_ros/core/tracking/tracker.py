@@ -258,7 +258,7 @@ def _contradiction(
     if not len(t):
         return 0.0
     values = []
-    for motion, (turn, place) in zip(motions, (noise, (0.0, 0.0)), strict=True):
+    for motion, (turn, place) in zip(motions, (noise.tolist(), [0.0, 0.0]), strict=True):
         gap, spread, axes, point = differences(known.moved(*motion), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
         variance = np.repeat([turn, place], 3)
