@@ -29,7 +29,9 @@ def value_in(folder, constant):
     return float(value)
 
 
-@pytest.mark.parametrize('name', ['tracking/tracker.PERSISTENCE', 'tracking/tracker._UNSEEN_OVERLAP'])
+@pytest.mark.parametrize(
+    'name', ['tracking/tracker.PERSISTENCE', 'tracking/tracker._UNSEEN_OVERLAP']
+)
 def test_one_constant_of_a_copy_is_changed(name, tmp_path):
     constant = CONSTANTS[name]
     sensitivity.write_changed([constant], 0.5, tmp_path)
@@ -114,7 +116,8 @@ def test_command_resumes(tmp_path, monkeypatch):
     assert len(measured) == 1 + 4 + 1 and measured[3] == measured[4]
     done = CliRunner().invoke(command, [*map(str, arguments), '--together'])
     assert (
-        'calibration/sightings._RIM, tracking/tracker.PERSISTENCE: 0.5 to 1 times 2, 0.5' in done.output
+        'calibration/sightings._RIM, tracking/tracker.PERSISTENCE: 0.5 to 1 times 2, 0.5'
+        in done.output
     )
     assert len(measured) == 6 + 2 and all(len(constants) == 2 for constants, _ in measured[6:])
     unknown = CliRunner().invoke(command, [*map(str, arguments[:4]), '--constant', 'a._B'])
@@ -137,7 +140,9 @@ def test_command_resumes(tmp_path, monkeypatch):
 def test_script_measures_the_changed_package(program, found, tmp_path):
     script = tmp_path / 'figures.py'
     script.write_text(program)
-    trial = Trial((CONSTANTS['tracking/tracker.PERSISTENCE'],), 0.5, (), (), tmp_path / 'cache', script)
+    trial = Trial(
+        (CONSTANTS['tracking/tracker.PERSISTENCE'],), 0.5, (), (), tmp_path / 'cache', script
+    )
     assert trial.run() == found
     # Another program is another trial.
     script.write_text('print("{}")')
