@@ -47,7 +47,6 @@ def observed(random, pose, truth, root, lasting):
         confidence=1.0,
         rms=0.0,
         area=1.0,
-        extents=np.ones(2),
     )
 
 

@@ -19,7 +19,6 @@ from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import length_of_distortion
 from rangeseg_ros.core.tracking.plane_errors import (
-    NARROWEST,
     by_motion,
     congruent,
     from_errors,
@@ -56,8 +55,6 @@ class Observations(NamedTuple):
     centroid : (M, 3) float64
     range : (M,) float64
         Distance of the centroid from the camera, metres.
-    width : (M,) float64
-        Half of the width of the plane, metres.
     view : (M, C) float64
         Unit vectors: how many pixels of each cell of the image the plane had.
     """
@@ -67,7 +64,6 @@ class Observations(NamedTuple):
     fresh: NDArray[np.float64]
     centroid: NDArray[np.float64]
     range: NDArray[np.float64]
-    width: NDArray[np.float64]
     view: NDArray[np.float64]
 
     def where(self, chosen: ArrayLike) -> Observations:
@@ -111,7 +107,6 @@ def observations(
         fresh + congruent(by_pose * np.sqrt(variance), np.eye(6)),
         place + pose.shift,
         np.asarray(np.linalg.norm(centroid, axis=1)),
-        np.array([max(p.extents.min() / 2, NARROWEST) for p in planes]),
         view,
     )
 

@@ -81,8 +81,6 @@ class PlaneFilters:
         C, the derivative of x by beta.
     view : (N, C) float64
         Of the last observation.
-    width : (N,) float64
-        Half of the greatest width that was seen, metres.
     """
 
     normal: NDArray[np.float64]
@@ -91,7 +89,6 @@ class PlaneFilters:
     own: NDArray[np.float64]
     lasting: NDArray[np.float64]
     view: NDArray[np.float64]
-    width: NDArray[np.float64]
 
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
@@ -99,7 +96,7 @@ class PlaneFilters:
         normal, axes, point = seen.tangent_frame()
         local = to_errors(axes, point)
         own = congruent(local, seen.fresh)
-        return cls(normal, point, axes, own, -local @ seen.lasting, seen.view, seen.width)
+        return cls(normal, point, axes, own, -local @ seen.lasting, seen.view)
 
     @property
     def distance(self) -> NDArray[np.float64]:
@@ -158,9 +155,8 @@ class PlaneFilters:
     def gate(self, step: Step, seen: Observations) -> NDArray[np.float64]:
         """Chi-squared (K,), of three degrees of freedom, of observations being of planes."""
         which = step.observation
-        width = np.minimum(self.width[step.plane], seen.width[which])
         at = self.coordinates(step.plane, seen.centroid[which])
-        return _gate_at(at, step.gap, step.spread, seen.range[which], width)
+        return _gate_at(at, step.gap, step.spread, seen.range[which])
 
     def update(self, step: Step, seen: Observations) -> None:
         """Take in observations, each plane at most one, that are `expected` as it is now."""
@@ -173,7 +169,6 @@ class PlaneFilters:
         self.lasting[index] = rest @ step.before - gain @ step.lasting
         other = continuity(self.view[index], seen.view[which]) < 1
         self.view[index[other]] = seen.view[which[other]]
-        self.width[index] = np.maximum(self.width[index], seen.width[which])
         self._shift(index, (gain @ step.gap[..., None])[..., 0])
 
     def alike(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> list[tuple[int, int]]:
@@ -191,7 +186,7 @@ class PlaneFilters:
             return []
         gap, spread = self._apart(k, m)
         at = self.coordinates(k, self.point[m])
-        fits = _gate_at(at, gap, spread, reach[m], np.minimum(self.width[k], self.width[m])) < GATE
+        fits = _gate_at(at, gap, spread, reach[m]) < GATE
         return list(zip(k[fits].tolist(), m[fits].tolist(), strict=True))
 
     def absorb(self, k: int, m: int) -> None:
@@ -209,7 +204,6 @@ class PlaneFilters:
         information = [w * np.linalg.inv(c) for w, c in zip(weight, (own, other), strict=True)]
         self.own[k] = np.linalg.inv(information[0] + information[1])
         self.lasting[k] = self.view[k] = 0
-        self.width[k] = max(self.width[k], self.width[m])
         self._shift(index, (self.own[k] @ information[1] @ gap[0])[None])
 
     def variances(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -240,11 +234,10 @@ def _gate_at(
     gap: NDArray[np.float64],
     spread: NDArray[np.float64],
     reach: NDArray[np.float64],
-    width: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """Chi-squared (K,) of differences of planes `gap` (K, 3), at coordinates `at` (K, 2)."""
     there = np.broadcast_to(_IDENTITY, spread.shape).copy()
     there[:, 2, :2] = at
     return mahalanobis(
-        (there @ gap[..., None])[..., 0], with_floor(congruent(there, spread), reach, width)
+        (there @ gap[..., None])[..., 0], with_floor(congruent(there, spread), reach)
     )

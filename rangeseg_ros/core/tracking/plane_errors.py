@@ -54,7 +54,9 @@ def candidates(
 
 
 def with_floor(
-    spread: NDArray[np.float64], reach: NDArray[np.float64], width: NDArray[np.float64]
+    spread: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    width: NDArray[np.float64] | float = np.inf,
 ) -> NDArray[np.float64]:
     """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
 
@@ -65,7 +67,8 @@ def with_floor(
     reach : (K,) float64
         Distances from the camera, metres.
     width : (K,) float64
-        Half of that of the narrower plane, metres.
+        Half of that of the narrower plane, metres. Planes of a map are not as narrow as one frame
+        shows them.
     """
     result = spread.copy()
     offset = (OFFSET * reach) ** 2
