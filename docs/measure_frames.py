@@ -21,10 +21,10 @@ from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
-from rangeseg_ros.core.mapping.plane_errors import tangents
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.core.tracking.plane_errors import tangents
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -163,7 +163,7 @@ def measure_odometry(*seeds: str) -> None:
 
 def second(frames: list[Frame], most: int) -> tuple[float, ...]:
     """Error of the last frame's pose relative to the first's."""
-    odometry, first, motions = PlaneOdometry('odom'), frames[0].pose, []
+    odometry, first, motions = PlaneOdometry(CONFIG), frames[0].pose, []
     for frame in frames:
         planes = of_orientations(frame.planes, most)
         seen = views(frame.labels, planes, CONFIG.distortion_length)

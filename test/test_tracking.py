@@ -131,8 +131,8 @@ def test_the_largest_part_keeps_the_id_and_the_parts_theirs():
             (slice(90, 120), slice(0, 160), FLOOR),
         )
         assert ids(tracker, now) == [3, 1, 2]
-    # Merged again, the surface has its first id; split again, both parts have theirs.
-    assert ids(tracker, whole) == [1, 2]
+    # Merged, it is the part that overlaps most; split again, both parts have their ids.
+    assert ids(tracker, whole) == [3, 2]
     assert ids(tracker, now) == [3, 1, 2]
 
 
@@ -168,41 +168,11 @@ def test_surfaces_taken_for_one_come_apart_with_their_ids():
     assert surfaces(1, 2, 3) == [1, 2, 3]
 
 
-def test_scraps_of_a_face_that_come_and_go_keep_its_first_id():
-    left, right = ((slice(50, 80), slice(a, a + 24), BOX) for a in (50, 78))
-    tracker = Tracker()
-    assert ids(tracker, frame(*stay(), left)) == [1, 2, 3, 4]
-    for _ in range(12):
-        assert ids(tracker, frame(*stay(), left, right)) == [1, 2, 3, 4, 5]
-    # The right one alone is the face, and stays what it is when the left one is back.
-    for _ in range(2):
-        assert ids(tracker, frame(*stay(), right)) == [1, 2, 3, 4]
-    assert ids(tracker, frame(*stay(), left, right)) == [1, 2, 3, 5, 4]
-    assert ids(tracker, frame(*stay(), left)) == [1, 2, 3, 4]
-
-
 def test_parts_far_apart_are_not_renamed():
     left, right = ((slice(50, 80), slice(a, a + 24), BOX) for a in (10, 120))
     tracker = Tracker()
     assert ids(tracker, frame(*stay(), left, right)) == [1, 2, 3, 4, 5]
     assert ids(tracker, frame(*stay(), right)) == [1, 2, 3, 5]
-
-
-@pytest.mark.parametrize(('frames', 'known'), [(1, False), (9, False), (10, True)])
-def test_what_looks_like_a_new_plane_is_on_trial(frames, known):
-    # Two scraps of a face that the image takes for two surfaces, then only the newer one.
-    left, right = ((slice(50, 80), slice(a, a + 24), BOX) for a in (50, 78))
-    tracker = Tracker()
-
-    def apart(*regions):
-        labels, planes = frame(*stay(), *regions)
-        return ids(tracker, (labels, [replace(p, surface=p.label) for p in planes]))
-
-    for _ in range(10):
-        assert apart(left) == [1, 2, 3, 4]
-    for _ in range(frames):
-        assert apart(left, right) == [1, 2, 3, 4, 5]
-    assert apart(right) == [1, 2, 3, 5 if known else 4]
 
 
 def test_two_bad_pairs_are_not_worth_more_than_a_sure_one():

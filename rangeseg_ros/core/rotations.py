@@ -51,12 +51,18 @@ def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
     """Rotation (3, 3) about the vector `turn` (3,) by its length, radians (Rodrigues)."""
     x, y, z = np.asarray(turn, np.float64)
     angle = np.sqrt(x * x + y * y + z * z)
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    cross = cross_matrix(turn)
     # sin(a) / a and (1 - cos(a)) / a^2, right for the smallest angles as well.
     first = np.sinc(angle / np.pi)
     second = np.sinc(angle / (2 * np.pi)) ** 2 / 2
     rotation: NDArray[np.float64] = np.eye(3) + first * cross + second * (cross @ cross)
     return rotation
+
+
+def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:
+    """Matrix (3, 3) of cross products: cross_matrix(a) @ b = a x b."""
+    x, y, z = np.asarray(vector, np.float64)
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 def cross_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.plane_errors import tangents
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.tracking.plane_errors import tangents
 from rangeseg_ros.drawing import normals_picture, plan
 from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import Picture, as_jpeg, common, spread, stage_table, write_page

@@ -2,29 +2,29 @@ r"""One field over the image and the planes of all frames, solved jointly.
 
 A cell c that plane p covers has the inverse depth y = theta_p . r_c + b . m_c + noise, where m_c
 are the coefficients of the field at the cell and b its basis at this sighting: 1, and for a field
-that depends on the distance a second one. The planes are eliminated: with W the weights, R the
-rays of a plane's cells and P = W - W R (R^T W R)^-1 R^T W, the field solves
+that depends on the distance the deviation of the inverse depth from its median. With the sparse
+matrices B of the basis and R of the rays of the planes, W the weights and S the roughness of the
+field, the planes are eliminated from the normal equations:
 
-    (sum_p P_p + smoothness S) m = sum_p P_p y_p,
+    (B^T W B - C Q^-1 C^T + smoothness S) m = B^T W (y - R Q^-1 R^T W y),
 
-S the squared second differences of the cells (bending energy; of a slope the first differences),
-with a smoothness for each coefficient. It is solved by conjugate gradients, as no matrix but those
-of single planes is ever formed, preconditioned with W in place of P. Weights fall as 1 / s^2 with
-the robust standard deviation s of a plane's residuals (where ranges err, near planes are much
-noisier in inverse depth), and as 1 / (1 + (e / (k s))^2) with the residual e (Cauchy), so that
-wrong regions do not bend the field.
+C = B^T W R and Q = R^T W R. They are solved by conjugate gradients, preconditioned without the
+planes. S are squared second differences of the cells (bending energy; of a slope the first
+differences), with a smoothness for each coefficient. Weights fall as 1 / s^2 with the robust
+standard deviation s of a plane's residuals (where ranges err, near planes are much noisier in
+inverse depth), and as 1 / (1 + (e / (k s))^2) with the residual e (Cauchy), so that wrong regions
+do not bend the field.
 
-A plane in inverse depth over the whole image is in the null space of P, and of S: any of it may be
-added to m, which makes the field no less smooth. So is a slope that is the same everywhere.
+A plane in inverse depth over the whole image is in the null space of the planes, and of S: any of
+it may be added to m, which makes the field no less smooth. So is a slope that is the same
+everywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
@@ -68,45 +68,40 @@ def solve(
     (K, rows * columns) float64
         1/m for the basis 1.
     """
-    size = grid[0] * grid[1]
-    field = np.zeros((len(basis), size)) if start is None else start.copy()
-    inverses, residual = _planes(seen.start, seen.ray, seen.inverse, weight)
-    target: NDArray[np.float64] = np.stack(
-        [np.bincount(seen.cell, weight * b * residual, size) for b in basis]
+    size, count = grid[0] * grid[1], len(basis)
+    columns = np.concatenate([seen.cell + k * size for k in range(count)])
+    rows = np.tile(np.arange(len(weight)), count)
+    cells = sparse.csr_array((basis.ravel(), (rows, columns)), (len(weight), count * size))
+    weighted = (cells.T * weight).tocsr()
+    coupling = weighted @ seen.rays()
+    inverses = _plane_inverses(seen, weight)
+    target = weighted @ residuals(seen, seen.inverse, weight)
+    smoothing = sparse.block_diag(
+        [strength * _roughness(grid, place) for place, strength in enumerate(smoothness)]
     )
-    smoothing = [
-        strength * _roughness(grid, place) + _RIDGE * sparse.eye(size)
-        for place, strength in enumerate(smoothness)
-    ]
-    alone = [
-        splu((sparse.diags(np.bincount(seen.cell, weight * b * b, size)) + part).tocsc())
-        for b, part in zip(basis, smoothing, strict=True)
-    ]
+    own = (weighted @ cells + smoothing + _RIDGE * sparse.eye(count * size)).tocsc()
+    alone = splu(own)
 
     def product(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        result = np.stack([part @ image for part, image in zip(smoothing, vector, strict=True)])
-        sums = seen.start, seen.cell, seen.ray, weight, basis, inverses
-        _add_normal_product(*sums, vector, result)
-        return result
+        planes = (inverses @ (coupling.T @ vector).reshape(-1, 3, 1)).ravel()
+        return np.asarray(own @ vector - coupling @ planes)
 
-    def preconditioned(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.stack([part.solve(image) for part, image in zip(alone, vector, strict=True)])
-
+    field = np.zeros(count * size) if start is None else start.ravel().copy()
     rest = target - product(field)
-    step = preconditioned(rest)
-    direction, rest_size = step.copy(), float((rest * step).sum())
-    enough = _TOLERANCE**2 * float((target * preconditioned(target)).sum())
+    step = alone.solve(rest)
+    direction, rest_size = step.copy(), float(rest @ step)
+    enough = _TOLERANCE**2 * float(target @ alone.solve(target))
     for _ in range(_ITERATIONS):
         if rest_size <= enough:
             break
         image = product(direction)
-        length = rest_size / float((direction * image).sum())
+        length = rest_size / float(direction @ image)
         field += length * direction
         rest -= length * image
-        step = preconditioned(rest)
-        before, rest_size = rest_size, float((rest * step).sum())
+        step = alone.solve(rest)
+        before, rest_size = rest_size, float(rest @ step)
         direction = step + rest_size / before * direction
-    return field
+    return field.reshape(count, size)
 
 
 def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
@@ -136,76 +131,24 @@ def robust_weights(seen: Sightings, error: NDArray[np.float64]) -> NDArray[np.fl
     size = np.abs(residual)
     typical = max(float(np.median(size)), 1e-9)
     # A plane that looks better than most is as likely too small to show its errors.
-    middle = [max(float(np.median(size[a:b])), typical) for a, b in pairwise(seen.start)]
+    middle = [max(float(np.median(part)), typical) for part in np.split(size, seen.start[1:-1])]
     spread = 1.4826 * np.array(middle)[seen.plane()]
     weight: NDArray[np.float64] = (1.4826 * typical / spread) ** 2
     weight /= 1 + (residual / (_CAUCHY * spread)) ** 2
     return weight
 
 
-def residuals(seen: Sightings, inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+def residuals(
+    seen: Sightings, inverse: NDArray[np.float64], weight: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
     """What least-squares planes leave of inverse depths (N,), 1/m."""
-    residual: NDArray[np.float64]
-    _, residual = _planes(seen.start, seen.ray, inverse, np.ones(len(inverse)))
-    return residual
+    weight = np.ones(len(inverse)) if weight is None else weight
+    rays = seen.rays()
+    sums = (rays.T @ (weight * inverse)).reshape(-1, 3, 1)
+    return np.asarray(inverse - rays @ (_plane_inverses(seen, weight) @ sums).ravel())
 
 
-@njit(cache=True, nogil=True)
-def _planes(
-    start: NDArray[np.intp],
-    ray: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    weight: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inverses (P, 3, 3) of the planes' normal matrices, and residuals (N,)."""
-    inverses = np.zeros((len(start) - 1, 3, 3))
-    residual = np.empty(len(inverse))
-    for p in range(len(start) - 1):
-        matrix, vector = _RIDGE * np.eye(3), np.zeros(3)
-        for i in range(start[p], start[p + 1]):
-            for a in range(3):
-                vector[a] += weight[i] * ray[i, a] * inverse[i]
-                for b in range(3):
-                    matrix[a, b] += weight[i] * ray[i, a] * ray[i, b]
-        inverses[p] = np.linalg.inv(matrix)
-        theta = np.zeros(3)
-        for a in range(3):
-            for b in range(3):
-                theta[a] += inverses[p, a, b] * vector[b]
-        for i in range(start[p], start[p + 1]):
-            plane = theta[0] * ray[i, 0] + theta[1] * ray[i, 1] + theta[2] * ray[i, 2]
-            residual[i] = inverse[i] - plane
-    return inverses, residual
-
-
-@njit(cache=True, nogil=True)
-def _add_normal_product(
-    start: NDArray[np.intp],
-    cell: NDArray[np.intp],
-    ray: NDArray[np.float64],
-    weight: NDArray[np.float64],
-    basis: NDArray[np.float64],
-    inverses: NDArray[np.float64],
-    field: NDArray[np.float64],
-    result: NDArray[np.float64],
-) -> None:
-    """Add B^T P B m to `result` (K, G): eight arguments, as the sums run over all of them."""
-    count = len(basis)
-    for p in range(len(start) - 1):
-        a0 = a1 = a2 = 0.0
-        for i in range(start[p], start[p + 1]):
-            value = 0.0
-            for k in range(count):
-                value += basis[k, i] * field[k, cell[i]]
-            value *= weight[i]
-            a0, a1, a2 = a0 + value * ray[i, 0], a1 + value * ray[i, 1], a2 + value * ray[i, 2]
-        m = inverses[p]
-        t0 = m[0, 0] * a0 + m[0, 1] * a1 + m[0, 2] * a2
-        t1 = m[1, 0] * a0 + m[1, 1] * a1 + m[1, 2] * a2
-        t2 = m[2, 0] * a0 + m[2, 1] * a1 + m[2, 2] * a2
-        for i in range(start[p], start[p + 1]):
-            value = -(t0 * ray[i, 0] + t1 * ray[i, 1] + t2 * ray[i, 2])
-            for k in range(count):
-                value += basis[k, i] * field[k, cell[i]]
-            for k in range(count):
-                result[k, cell[i]] += weight[i] * basis[k, i] * value
+def _plane_inverses(seen: Sightings, weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverses (P, 3, 3) of the planes' normal matrices."""
+    products = weight[:, None, None] * seen.ray[:, :, None] * seen.ray[:, None]
+    return np.linalg.inv(np.add.reduceat(products, seen.start[:-1]) + _RIDGE * np.eye(3))

@@ -8,15 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from rangeseg_ros.core.calibration.sightings import fit_plane, plane_pixels
+from rangeseg_ros.core.calibration.sightings import plane_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 # Distances of pixels that are compared: dense where noise, sparse where distortion correlates.
 LAGS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)
 # Pixels of a plane whose residuals still hold correlations over the largest of them.
 _FEWEST = LAGS[-1] ** 2
-# Standard deviations, robust ones, beyond which a residual is none of the sensor's.
-_OUTLIER = 5.0
 # Widths of the Gaussian kernels that are tried, pixels: noise, and distortion.
 _NOISE_WIDTHS = np.geomspace(0.5, 16, 26)
 _DISTORTION_WIDTHS = np.geomspace(8, 256, 26)
@@ -37,17 +35,11 @@ def products(labels: NDArray[np.uint16], image: RangeImage) -> NDArray[np.float6
 
     (2, len(LAGS)): along rows and columns together, pairs on one plane only.
     """
-    inner, inverse, rays = plane_pixels(labels, image)
     residual = np.zeros(labels.shape)
     used = np.zeros(labels.shape, np.bool_)
-    for label in range(1, int(labels.max(initial=0)) + 1):
-        mask = inner & (labels == label)
-        if np.count_nonzero(mask) < _FEWEST:
-            continue
-        error = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
-        mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
-        residual[mask] = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
-        used |= mask
+    for plane in plane_pixels(labels, image, _FEWEST):
+        residual[plane.mask] = plane.residual
+        used |= plane.mask
     return _along_rows(residual, used, labels) + _along_rows(residual.T, used.T, labels.T)
 
 

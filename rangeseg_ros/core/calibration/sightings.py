@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import sparse
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import SAMPLES
@@ -51,6 +52,13 @@ class Sightings(NamedTuple):
         """Plane (N,) that each cell belongs to."""
         return np.repeat(np.arange(len(self.frame)), np.diff(self.start))
 
+    def rays(self) -> sparse.csr_array:
+        """Matrix (N, 3 P) from the planes' theta to the inverse depths of their cells."""
+        columns = 3 * self.plane()[:, None] + np.arange(3)
+        pointers = np.arange(0, 3 * len(self.cell) + 1, 3)
+        shape = len(self.cell), 3 * len(self.frame)
+        return sparse.csr_array((self.ray.ravel(), columns.ravel(), pointers), shape)
+
     def of_frames(self, chosen: NDArray[np.bool_]) -> Sightings:
         """Those of the frames that are chosen, (F,); the frames keep their numbers."""
         plane = chosen[self.frame]
@@ -90,22 +98,16 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     size, (rows, columns) = cell_size(labels.shape), cell_grid(labels.shape)
     height, width = labels.shape
     cells = np.arange(height)[:, None] // size * columns + np.arange(width) // size
-    inner, inverse, rays = plane_pixels(labels, image)
     residual = np.full(labels.shape, np.nan)
     found = []
-    for label in range(1, int(labels.max(initial=0)) + 1):
-        mask = inner & (labels == label)
-        if np.count_nonzero(mask) < SAMPLES * size * size:
-            continue
-        error = inverse[mask] - rays[mask] @ fit_plane(rays[mask], inverse[mask])
-        mask[mask] = np.abs(error) <= _OUTLIER * 1.4826 * np.median(np.abs(error))
-        count = np.bincount(cells[mask], minlength=rows * columns)
+    for mask, y, ray, error in plane_pixels(labels, image, SAMPLES * size * size):
+        residual[mask] = error
+        own = cells[mask]
+        count = np.bincount(own, minlength=rows * columns)
         # Where half of a cell is the plane's, its mean stands for the cell.
         kept = np.flatnonzero(2 * count >= size * size)
         if len(kept) < SAMPLES:
             continue
-        own, y, ray = cells[mask], inverse[mask], rays[mask]
-        residual[mask] = y - ray @ fit_plane(ray, y)
         sums = [np.bincount(own, part, len(count))[kept] for part in (y, *ray.T)]
         found.append((kept, np.stack(sums, axis=1) / count[kept, None]))
     step = np.where(labels[:, 1:] == labels[:, :-1], np.diff(residual, axis=1), np.nan)
@@ -121,22 +123,47 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     )
 
 
+class PlanePixels(NamedTuple):
+    """Pixels of a plane without its rim and without outliers, n of them.
+
+    Attributes
+    ----------
+    mask : (H, W) bool
+    inverse, ray : (n,) and (n, 3) float64
+        Inverse depth, 1/m, and ray at depth 1.
+    residual : (n,) float64
+        What the least-squares plane leaves of the inverse depth, 1/m.
+    """
+
+    mask: NDArray[np.bool_]
+    inverse: NDArray[np.float64]
+    ray: NDArray[np.float64]
+    residual: NDArray[np.float64]
+
+
 def plane_pixels(
-    labels: NDArray[np.uint16], image: RangeImage
-) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
-    """Pixels of planes without their rims (H, W); inverse depth, rays (H, W, 3) at depth 1."""
+    labels: NDArray[np.uint16], image: RangeImage, fewest: int
+) -> Iterator[PlanePixels]:
+    """Pixels of each plane that has so many."""
     kernel = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
     inner = (labels > 0) & image.valid & (image.along > 0)
     inner &= cv2.erode(labels, kernel) == cv2.dilate(labels, kernel)
     along = np.where(inner, image.along, 1).astype(np.float64)
-    inverse, rays = image.inverse.astype(np.float64), image.rays.astype(np.float64)
-    return inner, inverse / along, rays / along[..., None]
+    inverse = image.inverse.astype(np.float64) / along
+    rays = image.rays.astype(np.float64) / along[..., None]
+    for label in range(1, int(labels.max(initial=0)) + 1):
+        mask = inner & (labels == label)
+        if np.count_nonzero(mask) < fewest:
+            continue
+        error = np.abs(_residual(rays[mask], inverse[mask]))
+        mask[mask] = error <= _OUTLIER * 1.4826 * np.median(error)
+        yield PlanePixels(mask, inverse[mask], rays[mask], _residual(rays[mask], inverse[mask]))
 
 
-def fit_plane(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Least-squares plane theta . ray = inverse depth of pixels (N, 3), (N,)."""
+def _residual(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What the least-squares plane theta . ray = inverse depth leaves (n,)."""
     theta, *_ = np.linalg.lstsq(rays.T @ rays, rays.T @ inverse, rcond=None)
-    return np.asarray(theta, np.float64)
+    return np.asarray(inverse - rays @ theta)
 
 
 def concatenate(frames: Sequence[Sightings]) -> Sightings:

@@ -2,9 +2,9 @@
 
 The frames are cut into blocks of consecutive ones, as neighbours in time see almost the same. Each
 block is left out once, and the field of the others, which is almost that of all frames, is tried
-on it. This decides how smooth the field is, and how it depends on the distance (`kinds.py`), and
-tells how much of the residual is explained, by how much the field is scaled down where little of
-it holds, and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth
+on it. This decides how smooth the field is, and whether it depends on the distance, and tells
+how much of the residual is explained, by how much the field is scaled down where little of it
+holds, and its uncertainty (delete-a-group jackknife, to which the difference to a less smooth
 field is added).
 
 Cells count by robust weights, as in the solution: a few wrong regions would outvote the field.
@@ -15,16 +15,14 @@ and the fields differ by a quarter less than they should.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.calibration.bands import column_profile
 from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
-from rangeseg_ros.core.calibration.kinds import Kind, kinds
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
 
 BLOCKS = 5
@@ -35,9 +33,9 @@ _STEP = 8.0
 _SMOOTHNESS = (4096.0, 512.0, 64.0, 8.0)
 # Of the slope, which is known worse, as distances differ little.
 _SLOPES = (512.0, 64.0)
-# Part of the variance left by a field fixed in inverse depth that one of another kind must take
-# away. On sensors simulated without such an error it takes 0.0004 at most, on those with one, and
-# on a Kinect, 0.03 to 0.12.
+# Part of the variance left by a field fixed in inverse depth that a slope must take away. On
+# sensors simulated without such an error it takes 0.0004 at most, on those with one, and on a
+# Kinect, 0.03 to 0.12.
 _WORTH = 0.01
 # Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
 # is low by chance would be trusted most.
@@ -111,39 +109,60 @@ def learn(seen: Sightings, shape: tuple[int, int]) -> Learned:
         Of the images.
     """
     reference = float(np.median(seen.inverse))
-    fixed, ranged, sloped = kinds(seen, reference)
+    spread = max(1.4826 * float(np.median(np.abs(seen.inverse - reference))), 1e-6)
+    # Of the planes, not of the measurements: a slope that is the same everywhere is then free, as
+    # it only scales the planes, and cannot explain the noise away.
+    change = (seen.inverse - residuals(seen, seen.inverse) - reference) / spread
+    one, square = np.ones(len(change)), (1 + spread / reference * change) ** 2
     splits, grid = _splits(seen, shape), cell_grid(shape)
 
     def best(
-        kind: Kind, choices: list[tuple[float, ...]]
-    ) -> tuple[Kind, tuple[float, ...], list[Fold]]:
-        found = zip(_leave_out(splits, kind.basis, grid, choices), choices, strict=True)
-        folds, smoothness = min(found, key=lambda pair: _left(pair[0]))
-        return kind, smoothness, folds
+        basis: NDArray[np.float64], linear: ArrayLike, tried: Sequence[tuple[float, ...]]
+    ) -> _Model:
+        found = [_folds(split, basis, grid, tried) for split in splits]
+        pairs = zip(tried, map(list, zip(*found, strict=True)), strict=True)
+        smoothness, folds = min(pairs, key=lambda pair: _left(pair[1]))
+        return _Model(basis, np.array(linear), smoothness, folds)
 
-    alone: list[tuple[float, ...]] = [(value,) for value in _SMOOTHNESS]
-    chosen = best(fixed, alone)
-    most = (1 - _WORTH) * _left(chosen[2])
-    pairs = [(*chosen[1], value) for value in _SLOPES]
-    for other in (best(ranged, alone), best(sloped, pairs)):
-        if (left := _left(other[2])) < most:
-            chosen, most = other, left
-    kind, smoothness, folds = chosen
+    alone = [(value,) for value in _SMOOTHNESS]
+    model = best(one[None], [[1.0]], alone)
+    least = (1 - _WORTH) * _left(model.folds)
+    # An error dr of the range is one of -y^2 dr of the inverse depth y: its tangent, as a line
+    # through what was seen would follow the few nearest planes. Else a slope of its own.
+    ranged = best(square[None], [[1.0], [2 / reference]], alone)
+    slopes = [(*model.smoothness, value) for value in _SLOPES]
+    sloped = best(np.stack([one, change]), np.diag([1.0, 1 / spread]), slopes)
+    other = min(ranged, sloped, key=lambda each: _left(each.folds))
+    if _left(other.folds) < least:
+        model = other
+    basis, linear, smoothness, folds = model
     weight, _ = _settled_weights(seen, grid)
     profile = column_profile(seen)
     banded = seen._replace(inverse=seen.inverse - _in_cells(profile, shape)[seen.cell])
-    field = solve(banded, kind.basis, weight, grid, smoothness)
+    field = solve(banded, basis, weight, grid, smoothness)
     gain = _gain([fold.projection for fold in folds])
     # What smoothing costs shows in a field that is less smooth.
     less = [value / _STEP for value in smoothness]
-    rougher = solve(banded, kind.basis, weight, grid, less, field)
+    rough = solve(banded, basis, weight, grid, less, field)
+    offset, change = linear[0] @ field, linear[0] @ (rough - field)
     # What was scaled off may be true.
-    offset, rough = (kind.linear[0] @ each for each in (field, rougher))
-    biases = [gain * (rough - offset), (1 - gain) * offset]
-    others = [gain * (kind.linear[0] @ fold.field + fold.bands) for fold in folds]
+    biases = [gain * change, (1 - gain) * offset]
+    others = [gain * (linear[0] @ fold.field + fold.bands) for fold in folds]
     deviation = _deviation(others, biases, seen, grid)
-    field = gain * kind.linear @ field
+    field = gain * linear @ field
     return Learned(field, gain * profile, deviation, reference, smoothness, gain, folds)
+
+
+class _Model(NamedTuple):
+    """A field of K coefficients for the factors `basis` (K, N), and how well it holds.
+
+    `linear` turns them into the offset at the reference and, where there is one, the slope.
+    """
+
+    basis: NDArray[np.float64]
+    linear: NDArray[np.float64]
+    smoothness: tuple[float, ...]
+    folds: list[Fold]
 
 
 class _Split(NamedTuple):
@@ -185,8 +204,7 @@ def _splits(seen: Sightings, shape: tuple[int, int]) -> list[_Split]:
         counts = robust_weights(test, first[test.cell])
         return _Split(ends, out, train, test, weight, counts, bands)
 
-    with ThreadPoolExecutor() as pool:
-        return list(pool.map(split, np.array_split(np.unique(seen.frame), BLOCKS)))
+    return [split(block) for block in np.array_split(np.unique(seen.frame), BLOCKS)]
 
 
 def _settled_weights(
@@ -196,18 +214,6 @@ def _settled_weights(
     weight = robust_weights(seen, np.zeros(len(seen.inverse)))
     (field,) = solve(seen, np.ones((1, len(weight))), weight, grid, _SMOOTHNESS[1:2])
     return robust_weights(seen, field[seen.cell]), field
-
-
-def _leave_out(
-    splits: list[_Split],
-    basis: NDArray[np.float64],
-    grid: tuple[int, int],
-    tried: Sequence[Sequence[float]],
-) -> list[list[Fold]]:
-    """For each smoothness that is tried, a `Fold` of each block."""
-    with ThreadPoolExecutor() as pool:
-        found = list(pool.map(lambda split: _folds(split, basis, grid, tried), splits))
-    return [list(folds) for folds in zip(*found, strict=True)]
 
 
 def _folds(

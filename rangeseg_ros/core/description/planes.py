@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
@@ -22,6 +22,8 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
+
+Own = TypeVar('Own', bound='Plane')
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,7 +79,7 @@ class Plane:
     outline: Outline = field(repr=False)
     role: str = ''
 
-    def named(self, **names: int | str) -> Plane:
+    def named(self: Own, **names: int | str) -> Own:
         """The same plane with another `id`, `surface` or `role`.
 
         As `dataclasses.replace` does it, which takes each field by itself, ten times as long.

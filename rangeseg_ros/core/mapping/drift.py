@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
+from rangeseg_ros.core.tracking.plane_errors import by_motion
 
 # Metres of the way whose errors count as one at first, as neighbours in time have the same, and
 # blocks that there are at most before they are united two by two.
@@ -72,13 +73,9 @@ class DriftEstimate:
         turn_noise : float
             Standard deviation of its direction, radians.
         """
-        normal, axes = filters.normal[step.plane], filters.axes[step.plane]
-        by_turn = np.stack(
-            [axes[:, 1], -axes[:, 0], -np.cross(filters.point[step.plane] - place, normal)], 1
-        )
-        by_drift = np.zeros_like(by_turn)
-        by_drift[:, 2] = -normal * (self.way - since)[:, None]
-        design = np.concatenate([by_turn, by_drift], axis=2)
+        normal = filters.normal[step.plane]
+        design = by_motion(normal, filters.axes[step.plane], filters.point[step.plane] - place)
+        design[:, 2, 3:] *= (since - self.way)[:, None]
         weighted = np.linalg.solve(step.spread, design).transpose(0, 2, 1)
         left = (weighted @ design).sum(axis=0)
         right = (weighted @ step.gap[..., None]).sum(axis=0)[:, 0]

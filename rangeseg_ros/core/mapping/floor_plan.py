@@ -11,11 +11,13 @@ import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.map_outlines import valid
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, occupancy
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.right_angles import Squared, square_up
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
 
 _ROUNDS = 5
@@ -186,11 +188,10 @@ def make_plan(
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)
-    squared = square_up([_plane(p) for p in moved_planes(planes, motion)], tolerance)
+    squared = square_up(moved_planes(planes, motion), tolerance)
     roles, ground = _roles([s.plane for s in squared], config)
     squared = [
-        s._replace(plane=_plane(s.plane.named(role=r)))
-        for s, r in zip(squared, roles, strict=True)
+        s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
     ]
     points, counts = voxels
     points = points @ motion.rotation.T + motion.shift
@@ -209,11 +210,6 @@ def make_plan(
     return FloorPlan(frame, motion, up, ground, squared, walls, openings, grid)
 
 
-def _plane(plane: object) -> MapPlane:
-    assert isinstance(plane, MapPlane)
-    return plane
-
-
 def _upright(up: Up) -> Transform:
     """The least turn that takes up to z; none where z is up within the errors."""
     z = np.array([0.0, 0.0, 1.0])
@@ -221,12 +217,10 @@ def _upright(up: Up) -> Transform:
     if angle**2 <= chi2_quantile(2) * up.deviation**2 or angle < 1e-9:
         return Transform.identity()
     axis = np.cross(up.direction, z)
+    length = float(np.linalg.norm(axis))
     # Upside down, any level axis will do.
-    axis = axis / np.linalg.norm(axis) if np.linalg.norm(axis) > 1e-9 else np.eye(3)[0]
-    x, y, w = axis
-    cross = np.array([[0, -w, y], [w, 0, -x], [-y, x, 0]])
-    turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-    return Transform(turn, np.zeros(3))
+    turn = angle * (axis / length if length > 1e-9 else np.eye(3)[0])
+    return Transform(rotation_by(turn), np.zeros(3))
 
 
 def _roles(planes: Sequence[MapPlane], config: Config) -> tuple[list[str], float]:
@@ -263,25 +257,22 @@ def _wall(k: int, plane: MapPlane, reach: tuple[float, float], resolution: float
     along /= np.linalg.norm(along)
     foot = plane.centroid[:2]
     # The plane as seen from the side: along the wall, and up.
-    shapes = []
-    for part in plane.outline.parts:
-        rings = [np.column_stack([(r[:, :2] - foot) @ along, r[:, 2]]) for r in part]
-        shapes.append(shapely.make_valid(shapely.Polygon(rings[0], rings[1:])))
-    side = shapely.union_all(shapes)
+    turned = np.stack([np.append(along, 0), [0, 0, 1]])
+    parts = [[(r - np.append(foot, 0)) @ turned.T for r in part] for part in plane.outline.parts]
+    side = shapely.union_all([valid(shapely.Polygon(part[0], part[1:])) for part in parts])
     left, low, right, high = side.bounds
-    within = shapely.clip_by_rect(side, left, reach[0], right, reach[1])
-    if within.is_empty:
+    within = shapely.get_parts(shapely.clip_by_rect(side, left, reach[0], right, reach[1]))
+    # What is seen of it as intervals along the wall.
+    starts, _, ends, _ = shapely.bounds(within[shapely.area(within) > 0]).reshape(-1, 4).T
+    spans: list[list[float]] = []
+    for start, end in sorted(zip(starts.tolist(), ends.tolist(), strict=True)):
+        if spans and start <= spans[-1][1] + resolution / 2:
+            spans[-1][1] = max(spans[-1][1], end)
+        else:
+            spans.append([start, end])
+    if not spans:
         return None
-    places = np.arange(left + resolution / 4, right, resolution / 2)
-    lines = shapely.linestrings(
-        np.stack([np.stack([places, places * 0 + z], axis=1) for z in reach], axis=1)
-    )
-    there = shapely.length(shapely.intersection(lines, within)) > 0
-    ends = np.flatnonzero(np.diff(np.concatenate([[False], there, [False]]).astype(int)))
-    if not len(ends):
-        return None
-    spans = ends.reshape(-1, 2) * resolution / 2 + left
-    return Wall(k, foot + spans[..., None] * along, float(low), float(high))
+    return Wall(k, foot + np.array(spans)[..., None] * along, float(low), float(high))
 
 
 def _openings(wall: Wall, grid: Grid) -> list[Opening]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -123,42 +122,16 @@ def rings(outline: Polygon | MultiPolygon) -> list[list[NDArray[np.float64]]]:
     return result
 
 
-class Shape(NamedTuple):
-    """Size and place of an outline on its plane.
+def rectangle(
+    outline: Polygon | MultiPolygon,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Centre (2,), axes (2, 2) and extents (2,) of the least rectangle around an outline.
 
-    Attributes
-    ----------
-    area : float
-        Square metres.
-    centroid : (2,) float64
-    axis : (2,) float64
-        Unit vector along the length.
-    limits : (2, 2) float64
-        Least and greatest coordinate along the axis and across it.
+    The longer side comes first; the axes are right-handed.
     """
-
-    area: float
-    centroid: NDArray[np.float64]
-    axis: NDArray[np.float64]
-    limits: NDArray[np.float64]
-
-
-def shape_of(parts: Sequence[Sequence[NDArray[np.float64]]]) -> Shape:
-    """Area, centroid and rectangle along the principal axes of the area, of `rings`."""
-    area, first, second = 0.0, np.zeros(2), np.zeros((2, 2))
-    for part in parts:
-        for ring in part:
-            # Green's theorem; holes run the other way round.
-            a, b = ring, np.roll(ring, -1, axis=0)
-            cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-            area += cross.sum() / 2
-            first += (cross[:, None] * (a + b)).sum(axis=0) / 6
-            outer = np.einsum('n,ni,nj->ij', cross, a + b, a + b)
-            outer += np.einsum('n,ni,nj->ij', cross, a, a) + np.einsum('n,ni,nj->ij', cross, b, b)
-            second += outer / 24
-    centroid = first / max(area, 1e-12)
-    _, vectors = np.linalg.eigh(second / max(area, 1e-12) - np.outer(centroid, centroid))
-    axis = vectors[:, 1]
-    frame = np.stack([axis, [-axis[1], axis[0]]])
-    points = np.concatenate([ring for part in parts for ring in part]) @ frame.T
-    return Shape(area, centroid, axis, np.stack([points.min(axis=0), points.max(axis=0)], axis=1))
+    corners = shapely.get_coordinates(outline.minimum_rotated_rectangle)[:4]
+    sides = np.diff(corners[:3], axis=0)
+    extents = np.linalg.norm(sides, axis=1)
+    axis = sides[extents.argmax()] / extents.max()
+    axes = np.stack([axis, [-axis[1], axis[0]]])
+    return corners.mean(axis=0), axes, np.sort(extents)[::-1]

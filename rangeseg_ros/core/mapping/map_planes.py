@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.evidence import HIT, LEAST, MISS, Evidence
-from rangeseg_ros.core.mapping.map_outlines import MapOutline, rings, shape_of
+from rangeseg_ros.core.mapping.map_outlines import MapOutline, rectangle, rings
 from rangeseg_ros.core.rotations import quaternions
 
 
@@ -21,7 +21,8 @@ class MapPlane(Plane):
     """A plane of the map; normal . p + distance = 0 in the fixed frame.
 
     All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
-    seen from. `count` is the number of pixels of all observations, `rms` and
+    seen from. `extents`, `centre` and `orientation` are those of the least rectangle around all
+    parts, `count` is the number of pixels of all observations, `rms` and
     `confidence` are means over them, and `role` is what most observations found.
 
     Attributes
@@ -129,9 +130,11 @@ def describe(
     covariance : (4, 4) float64
         Of normal and distance.
     """
-    parts = rings(record.outline)
-    shape = shape_of(parts)
-    frame = np.stack([shape.axis, [-shape.axis[1], shape.axis[0]]]) @ axes
+    centre, sides, extents = rectangle(record.outline)
+    frame = np.stack([*(sides @ axes), normal], axis=1)
+    outline = MapOutline(
+        [[point + ring @ axes for ring in part] for part in rings(record.outline)]
+    )
     return MapPlane(
         label=record.id,
         id=record.id,
@@ -139,17 +142,17 @@ def describe(
         normal=normal.copy(),
         distance=float(-normal @ point),
         covariance=covariance,
-        centroid=point + shape.centroid @ axes,
+        centroid=point + shapely.get_coordinates(record.outline.centroid)[0] @ axes,
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
         shape=Shape(
-            area=shape.area,
-            extents=shape.limits[:, 1] - shape.limits[:, 0],
-            centre=point + shape.limits.mean(axis=1) @ frame,
-            orientation=quaternions(np.stack([*frame, normal], axis=1)),
+            area=record.outline.area,
+            extents=extents,
+            centre=point + centre @ axes,
+            orientation=quaternions(frame),
         ),
-        outline=MapOutline([[point + ring @ axes for ring in part] for part in parts]),
+        outline=outline,
         role=record.roles.most_common(1)[0][0],
         observations=record.observations,
         age=(record.last - record.first) * 1e-9,

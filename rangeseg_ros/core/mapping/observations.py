@@ -11,14 +11,20 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
-from rangeseg_ros.core.mapping.plane_errors import cross_matrices
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import length_of_distortion
+from rangeseg_ros.core.tracking.plane_errors import (
+    by_motion,
+    congruent,
+    from_errors,
+    moved_plane,
+    tangents,
+)
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
@@ -60,6 +66,17 @@ class Observations(NamedTuple):
     range: NDArray[np.float64]
     view: NDArray[np.float64]
 
+    def where(self, chosen: ArrayLike) -> Observations:
+        """Some of them, by their numbers."""
+        index = np.array(chosen, np.intp)
+        return Observations(*(part[index] for part in self))
+
+    def tangent_frame(self) -> tuple[NDArray[np.float64], ...]:
+        """Normals (M, 3), their tangents (M, 2, 3), and points (M, 3) on the planes."""
+        normal = self.plane[:, :3]
+        offset = (normal * self.centroid).sum(axis=1) + self.plane[:, 3]
+        return normal, tangents(normal), self.centroid - offset[:, None] * normal
+
 
 def observations(
     planes: Sequence[Plane], view: NDArray[np.float64], pose: Transform, noise: PoseNoise
@@ -68,36 +85,28 @@ def observations(
     normal = np.array([p.normal for p in planes], np.float64).reshape(-1, 3)
     distance = np.array([p.distance for p in planes], np.float64)
     centroid = np.array([p.centroid for p in planes], np.float64).reshape(-1, 3)
-    covariance = np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4) * RESIDUE
-    covariance = covariance + _unexplained(planes, normal, centroid)
-    turn, shift = pose
-    to_world = np.zeros((4, 4))
-    to_world[:3, :3], to_world[3, :3], to_world[3, 3] = turn, -shift @ turn, 1
+    covariance = np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4)
+    covariance = RESIDUE * covariance + _unexplained(planes, normal, centroid)
     # In the form theta . ray = 1 / z the pattern of the image is the same at any distance.
     back = np.zeros((len(planes), 3, 4))
     back[:, :, :3] = -np.eye(3) / distance[:, None, None]
     back[:, :, 3] = normal / distance[:, None] ** 2
-    theta = back @ covariance @ back.transpose(0, 2, 1)
-    values, vectors = np.linalg.eigh(theta)
+    values, vectors = np.linalg.eigh(congruent(back, covariance))
     # The symmetric root, as beta is to mean the same in every frame.
     root = (vectors * np.sqrt(np.maximum(values, 0))[:, None]) @ vectors.transpose(0, 2, 1)
+    to_world = moved_plane(*pose)
     lasting = to_world @ plane_jacobians(normal, distance) @ root
-    square = lasting @ lasting.transpose(0, 2, 1)
-    world = normal @ turn.T
-    # A turn w of the camera moves normals by w x n; its distance from the plane stays.
-    cross = cross_matrices(world)
-    by_turn = np.concatenate([-cross, (shift @ cross)[:, None]], axis=1)
-    by_shift = np.zeros((len(planes), 4, 3))
-    by_shift[:, 3] = -world
-    fresh = (1 - LASTING) * square
-    for part, sigma in ((by_turn, noise.turn), (by_shift, noise.shift)):
-        fresh = fresh + sigma**2 * part @ part.transpose(0, 2, 1)
+    world, place = normal @ pose.rotation.T, centroid @ pose.rotation.T
+    axes = tangents(world)
+    by_pose = from_errors(axes, place + pose.shift) @ by_motion(world, axes, place)
+    variance = np.repeat(np.square([noise.turn, noise.shift]), 3)
+    fresh = (1 - LASTING) * congruent(lasting, np.eye(3))
     return Observations(
-        np.column_stack([world, distance - world @ shift]),
+        np.column_stack([normal, distance]) @ to_world.T,
         np.sqrt(LASTING) * lasting,
-        fresh,
-        centroid @ turn.T + shift,
-        np.linalg.norm(centroid, axis=1),
+        fresh + congruent(by_pose * np.sqrt(variance), np.eye(6)),
+        place + pose.shift,
+        np.asarray(np.linalg.norm(centroid, axis=1)),
         view,
     )
 
@@ -112,39 +121,22 @@ def _unexplained(
     """
     share = np.array([(1 - p.confidence) * p.rms**2 for p in planes])
     area = np.maximum([p.area for p in planes], 1e-4) / np.pi
-    # A tilt about any axis in the plane turns the normal and moves the origin along.
-    across = (np.eye(3) - normal[:, :, None] * normal[:, None]) / area[:, None, None]
-    moved = -(across @ centroid[..., None])[..., 0]
-    result = np.empty((len(planes), 4, 4))
-    result[:, :3, :3] = across
-    result[:, :3, 3] = result[:, 3, :3] = moved
-    result[:, 3, 3] = 1 - (moved * centroid).sum(axis=1)
-    result *= share[:, None, None]
-    return result
+    variance = share[:, None] * np.stack([1 / area, 1 / area, np.ones(len(area))], axis=1)
+    jacobian = from_errors(tangents(normal), centroid)
+    return congruent(jacobian * np.sqrt(variance)[:, None], np.eye(3))
 
 
-def persistence(
-    before: NDArray[np.float64], now: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """How much of the error that lasts is that of the observation before.
+def continuity(before: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Correlation (K,) of the error that lasts with that of the observation before.
 
     Parameters
     ----------
     before, now : (K, C) float64
-        Views of planes.
-
-    Returns
-    -------
-    (K,) float64
-        Correlation of beta with that of the observation before; 1 where both are of the same
-        pixels.
-    (K,) float64
-        Share of the variance that is new in this frame all the same.
+        Views of planes. Where most of the pixels are the same it is 1: small motions to and fro
+        are no new looks.
     """
     alike = np.clip((before * now).sum(axis=1), 0, 1)
-    # Most of them are: small motions to and fro do not count as new looks.
-    same = alike >= 0.5
-    return np.where(same, 1.0, alike), np.where(same, 1 - alike**2, 0.0)
+    return np.where(alike >= 0.5, 1.0, alike)
 
 
 def views(

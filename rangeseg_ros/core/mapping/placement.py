@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,9 +15,12 @@ from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.rotations import quaternions, rotation_matrix
+from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 Lookup = Callable[[str, str], Transform]
 """(target, source) -> the motion between two frames at the stamp of an image; TransformError."""
+
+AnyPlane = TypeVar('AnyPlane', bound=Plane)
 
 PARAMETERS = 'the parameters up_x, up_y, up_z'
 
@@ -105,11 +109,10 @@ def find_placement(
     return found
 
 
-def moved_planes(planes: Sequence[Plane], motion: Transform) -> list[Plane]:
+def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane]:
     """Planes in the frame that `motion` leads to; normals stay on the side of the sensor."""
     turn, shift = motion
-    jacobian = np.eye(4)
-    jacobian[:3, :3], jacobian[3, :3] = turn, -shift @ turn
+    jacobian = moved_plane(turn, shift)
     moved = []
     for plane in planes:
         normal = turn @ plane.normal

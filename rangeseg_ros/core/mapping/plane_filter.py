@@ -19,9 +19,50 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.observations import Observations, persistence
-from rangeseg_ros.core.mapping.plane_errors import from_errors, shifted, tangents, to_errors
-from rangeseg_ros.core.tracking.tracks import ANGLE, OFFSET
+from rangeseg_ros.core.mapping.observations import Observations, continuity
+from rangeseg_ros.core.tracking.plane_errors import (
+    GATE,
+    candidates,
+    congruent,
+    from_errors,
+    mahalanobis,
+    shifted,
+    to_errors,
+    with_floor,
+)
+
+_IDENTITY = np.eye(3)
+
+
+class Step(NamedTuple):
+    """Observations and what is known of their planes when they come.
+
+    Attributes
+    ----------
+    plane, observation : (K,) int
+        Their numbers.
+    own, before : (K, 3, 3) float64
+        Q and C by this beta.
+    lasting, fresh : (K, 3, 3) float64
+        B and the covariance of v.
+    spread : (K, 3, 3) float64
+        Covariance of z.
+    gap : (K, 3) float64
+        z.
+    """
+
+    plane: NDArray[np.intp]
+    observation: NDArray[np.intp]
+    own: NDArray[np.float64]
+    before: NDArray[np.float64]
+    lasting: NDArray[np.float64]
+    fresh: NDArray[np.float64]
+    spread: NDArray[np.float64]
+    gap: NDArray[np.float64]
+
+    def where(self, chosen: NDArray) -> Step:
+        """Some of them."""
+        return Step(*(part[chosen] for part in self))
 
 
 @dataclass
@@ -52,12 +93,9 @@ class PlaneFilters:
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
         """Planes seen for the first time."""
-        normal = seen.plane[:, :3]
-        gap = (normal * seen.centroid).sum(axis=1) + seen.plane[:, 3]
-        point = seen.centroid - gap[:, None] * normal
-        axes = tangents(normal)
+        normal, axes, point = seen.tangent_frame()
         local = to_errors(axes, point)
-        own = _turned(local, seen.fresh)
+        own = congruent(local, seen.fresh)
         return cls(normal, point, axes, own, -local @ seen.lasting, seen.view)
 
     @property
@@ -65,10 +103,15 @@ class PlaneFilters:
         """(N,) distance of the planes in normal . p + distance = 0, metres."""
         return -(self.normal * self.point).sum(axis=1)
 
-    def plane_covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(K, 4, 4) covariance of (normal, distance) of some planes, of rank 3."""
-        jacobian = from_errors(self.axes[index], self.point[index])
-        return _turned(jacobian, self._covariance(index))
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """(N, 3, 3) of x."""
+        return self.own + congruent(self.lasting, _IDENTITY)
+
+    @property
+    def plane_covariance(self) -> NDArray[np.float64]:
+        """(N, 4, 4) covariance of (normal, distance), of rank 3."""
+        return congruent(from_errors(self.axes, self.point), self.covariance)
 
     def where(self, chosen: NDArray) -> PlaneFilters:
         """Some of the planes."""
@@ -87,10 +130,33 @@ class PlaneFilters:
         result = np.einsum('kai,ki->ka', self.axes[index], points - self.point[index])
         return result
 
-    def innovations(self, step: Step, seen: Observations) -> NDArray[np.float64]:
+    def points(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (K, 3) at coordinates (K, 2) of planes."""
+        along: NDArray[np.float64] = np.einsum('ka,kai->ki', at, self.axes[index])
+        return self.point[index] + along
+
+    def expected(
+        self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
+    ) -> Step:
+        """What observations, of the numbers `which` (K,), are to planes `index` (K,)."""
+        same = continuity(self.view[index], seen.view[which])
+        other = (1 - same**2)[:, None, None]
+        before = self.lasting[index]
+        # What beta loses of what it was is on its own from now on.
+        own = self.own[index] + other * congruent(before, _IDENTITY)
+        before = same[:, None, None] * before
+        local = to_errors(self.axes[index], self.point[index])
+        lasting = local @ seen.lasting[which]
+        fresh = congruent(local, seen.fresh[which]) + other * congruent(lasting, _IDENTITY)
+        spread = own + congruent(before + lasting, _IDENTITY) + fresh
+        gap = (local @ seen.plane[which][..., None])[..., 0]
+        return Step(index, which, own, before, lasting, fresh, spread, gap)
+
+    def gate(self, step: Step, seen: Observations) -> NDArray[np.float64]:
         """Chi-squared (K,), of three degrees of freedom, of observations being of planes."""
-        at = self.coordinates(step.plane, seen.centroid[step.observation])
-        return _chi_squared(step.gap, step.spread, at, seen.range[step.observation])
+        which = step.observation
+        at = self.coordinates(step.plane, seen.centroid[which])
+        return _gate_at(at, step.gap, step.spread, seen.range[which])
 
     def update(self, step: Step, seen: Observations) -> None:
         """Take in observations, each plane at most one, that are `expected` as it is now."""
@@ -98,51 +164,29 @@ class PlaneFilters:
         state = step.own + step.before @ (step.before + step.lasting).transpose(0, 2, 1)
         solved = np.linalg.solve(step.spread, state.transpose(0, 2, 1))
         gain = np.asarray(solved.transpose(0, 2, 1), np.float64)
-        rest = np.eye(3) - gain
-        self.own[index] = _turned(rest, step.own) + _turned(gain, step.fresh)
+        rest = _IDENTITY - gain
+        self.own[index] = congruent(rest, step.own) + congruent(gain, step.fresh)
         self.lasting[index] = rest @ step.before - gain @ step.lasting
-        other = step.rho < 1
+        other = continuity(self.view[index], seen.view[which]) < 1
         self.view[index[other]] = seen.view[which[other]]
         self._shift(index, (gain @ step.gap[..., None])[..., 0])
 
-    def follow_views(self, cells: int) -> None:
-        """Where images are of another size now, what comes is of other pixels than before."""
-        if self.view.shape[1] != cells:
-            self.view = np.zeros((len(self.view), cells))
+    def alike(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> list[tuple[int, int]]:
+        """Pairs of one of `some` planes (K,) and another that may be it by what is known of both.
 
-    def alike(
-        self,
-        some: NDArray[np.intp],
-        camera: NDArray[np.float64],
-        gate: float,
-        widest: float,
-        farthest: float,
-    ) -> list[tuple[int, int]]:
-        """Pairs of one of `some` planes and another that may be it by what is known of both.
-
-        Parameters
-        ----------
-        some : (K,) int
-        camera : (3,) float64
-            Where they are looked at from.
-        gate : float
-            Largest chi-squared of three degrees of freedom.
-        widest, farthest : float
-            Largest angle, radians, and offset as share of the distance from `camera`.
+        `camera` (3,) is where they are looked at from.
         """
-        normal = self.normal[some]
-        offset = normal @ self.point.T + self.distance[some][:, None]
-        away = np.linalg.norm(self.point - camera, axis=1)
-        close = normal @ self.normal.T > np.cos(widest)
-        close &= np.abs(offset) < farthest * away
+        reach = np.linalg.norm(self.point - camera, axis=1)
+        planes = self.normal[some], self.distance[some]
+        close = candidates(planes, (self.normal, self.point), reach)
         close[np.arange(len(some)), some] = False
         number, m = np.nonzero(close)
+        k = some[number]
         if not len(m):
             return []
-        k = some[number]
         gap, spread = self._apart(k, m)
         at = self.coordinates(k, self.point[m])
-        fits = _chi_squared(gap, spread, at, away[m]) < gate
+        fits = _gate_at(at, gap, spread, reach[m]) < GATE
         return list(zip(k[fits].tolist(), m[fits].tolist(), strict=True))
 
     def absorb(self, k: int, m: int) -> None:
@@ -151,31 +195,22 @@ class PlaneFilters:
         Both were seen by one sensor, and how their errors hang together is not known: covariance
         intersection (Julier and Uhlmann 1997), weighted as by Niehsen (2002).
         """
-        gap, _ = self._apart(np.array([k]), np.array([m]))
-        local = to_errors(self.axes[[k]], self.point[[k]])[0]
-        other = local @ self.plane_covariance(np.array([m]))[0] @ local.T
-        own = self._covariance(np.array([k]))[0]
+        index = np.array([k])
+        gap, spread = self._apart(index, np.array([m]))
+        own = self.covariance[k]
+        other = spread[0] - own
         sizes = np.cbrt([np.linalg.det(other), np.linalg.det(own)])
         weight = sizes / sizes.sum()
         information = [w * np.linalg.inv(c) for w, c in zip(weight, (own, other), strict=True)]
-        fused = np.linalg.inv(information[0] + information[1])
-        self.own[k] = fused
+        self.own[k] = np.linalg.inv(information[0] + information[1])
         self.lasting[k] = self.view[k] = 0
-        self._shift(np.array([k]), (fused @ information[1] @ gap[0])[None])
+        self._shift(index, (self.own[k] @ information[1] @ gap[0])[None])
 
-    def points(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (K, 3) at coordinates (K, 2) of planes."""
-        along: NDArray[np.float64] = np.einsum('ka,kai->ki', at, self.axes[index])
-        return self.point[index] + along
-
-    def variances(
-        self, index: NDArray[np.intp], which: NDArray[np.intp], at: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Variances (K,), across the planes, at coordinates (K, 2) of the planes index[which]."""
+    def variances(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variances (K,), across the planes `index` (K,), at coordinates (K, 2)."""
         lever = np.column_stack([at, np.ones(len(at))])
-        covariance = self._covariance(index)
         variance: NDArray[np.float64]
-        variance = np.einsum('ki,kij,kj->k', lever, covariance[which], lever)
+        variance = np.einsum('ki,kij,kj->k', lever, self.covariance[index], lever)
         return variance
 
     def _apart(
@@ -184,96 +219,25 @@ class PlaneFilters:
         """What planes `m` differ by from planes `k`, (K, 3), and its covariance (K, 3, 3)."""
         local = to_errors(self.axes[k], self.point[k])
         other = np.column_stack([self.normal[m], self.distance[m]])
-        spread = _turned(local, self.plane_covariance(m)) + self._covariance(k)
+        turned = local @ from_errors(self.axes[m], self.point[m])
+        spread = congruent(turned, self.covariance[m]) + self.covariance[k]
         return (local @ other[..., None])[..., 0], spread
-
-    def _covariance(self, index: NDArray[np.intp]) -> NDArray[np.float64]:
-        """(K, 3, 3) of x."""
-        return self.own[index] + _squared(self.lasting[index])
 
     def _shift(self, index: NDArray[np.intp], step: NDArray[np.float64]) -> None:
         """Take errors off planes."""
         moved = shifted(self.normal[index], self.point[index], self.axes[index], step)
         self.normal[index], self.point[index], self.axes[index] = moved
 
-    def expected(
-        self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
-    ) -> Step:
-        """What observations, of the numbers `which` (K,), are to planes `index` (K,)."""
-        rho, new = persistence(self.view[index], seen.view[which])
-        before = self.lasting[index]
-        # What beta loses of what it was is on its own from now on.
-        own = self.own[index] + (1 - rho**2)[:, None, None] * _squared(before)
-        before = rho[:, None, None] * before
-        local = to_errors(self.axes[index], self.point[index])
-        lasting = local @ seen.lasting[which]
-        fresh = _turned(local, seen.fresh[which]) + new[:, None, None] * _squared(lasting)
-        spread = own + _squared(before + lasting) + fresh
-        gap = (local @ seen.plane[which][..., None])[..., 0]
-        return Step(index, which, rho, own, before, lasting, fresh, spread, gap)
 
-
-class Step(NamedTuple):
-    """Observations and what is known of their planes when they come.
-
-    Attributes
-    ----------
-    plane, observation : (K,) int
-        Their numbers.
-    rho : (K,) float64
-        Correlation of beta with what it was.
-    own, before : (K, 3, 3) float64
-        Q and C by this beta.
-    lasting, fresh : (K, 3, 3) float64
-        B and the covariance of v.
-    spread : (K, 3, 3) float64
-        Covariance of z.
-    gap : (K, 3) float64
-        z.
-    """
-
-    plane: NDArray[np.intp]
-    observation: NDArray[np.intp]
-    rho: NDArray[np.float64]
-    own: NDArray[np.float64]
-    before: NDArray[np.float64]
-    lasting: NDArray[np.float64]
-    fresh: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    gap: NDArray[np.float64]
-
-    def where(self, chosen: NDArray) -> Step:
-        """Some of them."""
-        return Step(*(part[chosen] for part in self))
-
-
-def _squared(root: NDArray[np.float64]) -> NDArray[np.float64]:
-    square: NDArray[np.float64] = root @ root.transpose(0, 2, 1)
-    return square
-
-
-def _turned(by: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    result: NDArray[np.float64] = by @ covariance @ by.transpose(0, 2, 1)
-    return result
-
-
-def _chi_squared(
+def _gate_at(
+    at: NDArray[np.float64],
     gap: NDArray[np.float64],
     spread: NDArray[np.float64],
-    at: NDArray[np.float64],
-    range: NDArray[np.float64],
+    reach: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Chi-squared (K,) of differences of planes `gap` (K, 3) with covariances (K, 3, 3).
-
-    At coordinates `at` (K, 2), where angle and offset do not depend on each other, and with what
-    parts of one surface differ by, at a `range` (K,).
-    """
-    there = np.broadcast_to(np.eye(3), spread.shape).copy()
+    """Chi-squared (K,) of differences of planes `gap` (K, 3), at coordinates `at` (K, 2)."""
+    there = np.broadcast_to(_IDENTITY, spread.shape).copy()
     there[:, 2, :2] = at
-    spread = there @ spread @ there.transpose(0, 2, 1)
-    spread[:, [0, 1], [0, 1]] += ANGLE**2
-    spread[:, 2, 2] += (OFFSET * range) ** 2
-    gap = (there @ gap[..., None])[..., 0]
-    result: NDArray[np.float64]
-    result = (gap * np.linalg.solve(spread, gap[..., None])[..., 0]).sum(axis=1)
-    return result
+    return mahalanobis(
+        (there @ gap[..., None])[..., 0], with_floor(congruent(there, spread), reach)
+    )

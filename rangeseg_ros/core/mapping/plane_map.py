@@ -32,12 +32,9 @@ from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.tracking.plane_errors import FARTHEST, GATE, SURE_TURN, candidates
 from rangeseg_ros.core.tracking.tracker import NOMINAL, Jump
-from rangeseg_ros.core.tracking.tracks import FARTHEST, SURE_TURN
 
-# Chi-squared with the three degrees of freedom of a plane.
-_GATE = chi2_quantile(3)
 # Share of the planes in sight whose outlines a frame adds to: at 30 Hz each has its turn four
 # times a second, and the work in a frame is bounded.
 _LOOKED_AT = 1 / 8
@@ -121,8 +118,10 @@ class PlaneMap:
         self.drift.move(pose.shift)
         if planes:
             view = views(labels, planes, config.distortion_length)
-            if self._filters is not None:
-                self._filters.follow_views(view.shape[1])
+            known = self._filters
+            if known is not None and known.view.shape[1] != view.shape[1]:
+                # Of images of another size, what comes is of other pixels than before.
+                known.view = np.zeros((len(self._records), view.shape[1]))
             seen = observations(planes, view, pose, noise)
             match, step = self._associate(planes, seen)
             if jump:
@@ -155,7 +154,7 @@ class PlaneMap:
         if self._filters is None:
             return []
         filters = self._filters
-        covariance = filters.plane_covariance(np.arange(len(self._records)))
+        covariance = filters.plane_covariance
         found = [
             describe(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
             for k, record in enumerate(self._records)
@@ -183,15 +182,14 @@ class PlaneMap:
         filters = self._filters
         if filters is None:
             return match, None
-        gap = filters.normal @ seen.centroid.T + filters.distance[:, None]
-        close = filters.normal @ seen.plane[:, :3].T > np.cos(SURE_TURN)
-        close &= np.abs(gap) < FARTHEST * seen.range
+        planes_known = filters.normal, filters.distance
+        close = candidates(planes_known, (seen.plane[:, :3], seen.centroid), seen.range)
         index, which = np.nonzero(close)
         if not len(index):
             return match, None
         step = filters.expected(index, seen, which)
-        value = filters.innovations(step, seen)
-        fits = np.flatnonzero(value < _GATE)
+        value = filters.gate(step, seen)
+        fits = np.flatnonzero(value < GATE)
         index, which, value = index[fits], which[fits], value[fits]
         reach = np.array([np.hypot(*planes[m].extents) / 2 for m in which.tolist()])
         at = filters.coordinates(index, seen.centroid[which])
@@ -242,7 +240,7 @@ class PlaneMap:
         new = order[match[order] < 0]
         if len(new):
             match[new] = len(self._records) + np.arange(len(new))
-            first = PlaneFilters.of(Observations(*(part[new] for part in seen)))
+            first = PlaneFilters.of(seen.where(new))
             self._filters = self._filters.joined(first) if self._filters else first
             for _ in new:
                 self._records.append(Record(self._next, stamp, stamp, way=self.drift.way))
@@ -275,7 +273,7 @@ class PlaneMap:
         assert filters is not None
         gone: list[int] = []
         grown = [k for k, record in enumerate(self._records) if record.united == self._time]
-        for k, m in filters.alike(np.array(grown), camera, _GATE, SURE_TURN, FARTHEST):
+        for k, m in filters.alike(np.array(grown), camera):
             if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
                 continue
             kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
@@ -361,7 +359,7 @@ class PlaneMap:
         owner = shown[which]
         at = np.concatenate([one.centres for one in evidence])
         points = (filters.points(owner, at) - pose.shift) @ pose.rotation
-        variance = filters.variances(shown, which, at)
+        variance = filters.variances(owner, at)
         variance += noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
         found = find_sightings(
             points,

@@ -248,11 +248,15 @@ class TransformBuffer:
         first, second = samples[after - 1 : after + 1]
         if first.parent != second.parent:
             return first
+        # Here, as it takes longer to import than to segment a frame.
+        from scipy.spatial.transform import Rotation, Slerp
+
         share = (stamp - first.stamp) / (second.stamp - first.stamp)
+        turns = Rotation.from_quat([first.rotation, second.rotation])
         return _Sample(
             stamp,
             first.parent,
-            slerp(first.rotation, second.rotation, share),
+            Slerp([0, 1], turns)(share).as_quat(),
             first.shift + share * (second.shift - first.shift),
         )
 
@@ -275,18 +279,3 @@ class TransformBuffer:
                     break
                 times.append(time)
         return min((time for time in times if time is not None), default=0)
-
-
-def slerp(
-    first: NDArray[np.float64], second: NDArray[np.float64], share: float
-) -> NDArray[np.float64]:
-    """Unit quaternion (4,) on the shorter arc between two, `share` of the way (Shoemake 1985)."""
-    cosine = float(first @ second)
-    second = -second if cosine < 0 else second
-    # By the chord, which unlike the cosine tells small angles apart.
-    angle = 2 * np.arcsin(min(float(np.linalg.norm(second - first)) / 2, 1.0))
-    if angle < 1e-9:
-        return first
-    mixed = np.sin((1 - share) * angle) * first + np.sin(share * angle) * second
-    unit: NDArray[np.float64] = mixed / np.linalg.norm(mixed)
-    return unit

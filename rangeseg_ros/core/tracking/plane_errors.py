@@ -1,0 +1,163 @@
+"""What planes err by, as three numbers, and the gate by which two planes may be one.
+
+A plane is its unit normal n and a point p on it. Its error is x = (a, b, c): the true normal is
+n + a e1 + b e2 with the axes e1, e2 of the tangent space of the unit sphere at n, and the true
+plane passes c below p along n. No covariance of x is singular, as that of (normal, distance) is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.significance import chi2_quantile
+
+GATE = chi2_quantile(3)
+"""Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one."""
+OFFSET, ANGLE = 0.007, np.radians(1.0)
+"""What planes of one surface differ by from frame to frame beyond their covariances.
+
+Their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
+distortion of a Kinect is there), and an angle, at least and for an
+offset over half of the plane's width.
+"""
+NARROWEST = 0.01
+"""Half the width that a plane counts with at least, metres, so that what it tilts by is finite."""
+SURE_TURN, FARTHEST = np.radians(15.0), 0.1
+"""Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
+
+Beyond is no error of the sensor but another plane, however uncertain both are.
+"""
+
+
+def candidates(
+    first: tuple[NDArray[np.float64], NDArray[np.float64]],
+    second: tuple[NDArray[np.float64], NDArray[np.float64]],
+    reach: NDArray[np.float64],
+    turn: float = SURE_TURN,
+) -> NDArray[np.bool_]:
+    """(N, M) which planes are near enough in angle and offset to be asked of the gate.
+
+    Parameters
+    ----------
+    first : ((N, 3), (N,)) float64
+        Normals and distances.
+    second : ((M, 3), (M, 3)) float64
+        Normals and points on the planes, metres.
+    reach : (M,) float64
+        Distances of these points from the camera, metres.
+    turn : float
+        Largest angle, radians.
+    """
+    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(turn)
+    return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
+
+
+def with_floor(
+    spread: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    width: NDArray[np.float64] | float = np.inf,
+) -> NDArray[np.float64]:
+    """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
+
+    Parameters
+    ----------
+    spread : (K, 3, 3) float64
+        Where both planes are looked at, so that c is independent of a and b.
+    reach : (K,) float64
+        Distances from the camera, metres.
+    width : (K,) float64
+        Half of that of the narrower plane, metres. Planes of a map are not as narrow as one frame
+        shows them.
+    """
+    result = spread.copy()
+    offset = (OFFSET * reach) ** 2
+    result[:, 2, 2] += offset
+    result[:, [0, 1], [0, 1]] += (ANGLE**2 + offset / width**2)[:, None]
+    return result
+
+
+def mahalanobis(gap: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared Mahalanobis distances (K,) of `gap` (K, D) with covariances `spread` (K, D, D)."""
+    value: NDArray[np.float64]
+    value = (gap * np.linalg.solve(spread, gap[..., None])[..., 0]).sum(axis=1)
+    return value
+
+
+def tangents(normal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Two unit vectors across each unit normal (N, 3), right-handed with it: (N, 2, 3).
+
+    Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
+    """
+    x, y, z = normal.T
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    b = x * y * a
+    axes = np.empty((len(normal), 2, 3))
+    axes[:, 0, 0], axes[:, 0, 1], axes[:, 0, 2] = 1 + sign * x * x * a, sign * b, -sign * x
+    axes[:, 1, 0], axes[:, 1, 1], axes[:, 1, 2] = b, sign + y * y * a, -y
+    return axes
+
+
+def to_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K, 3, 4) from (normal, distance) to (a, b, c) of planes with `axes` (K, 2, 3)."""
+    local = np.zeros((len(axes), 3, 4))
+    local[:, :2, :3] = axes
+    local[:, 2, :3] = point
+    local[:, 2, 3] = 1
+    return local
+
+
+def from_errors(axes: NDArray[np.float64], point: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K, 4, 3) from (a, b, c) to (normal, distance)."""
+    jacobian = np.zeros((len(axes), 4, 3))
+    jacobian[:, :3, :2] = axes.transpose(0, 2, 1)
+    jacobian[:, 3, :2] = -(axes @ point[:, :, None])[..., 0]
+    jacobian[:, 3, 2] = 1
+    return jacobian
+
+
+def shifted(
+    normal: NDArray[np.float64],
+    point: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    step: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Normals, points and axes of planes without the errors `step` (K, 3).
+
+    The axes turn with their plane.
+    """
+    first, second = axes[:, 0], axes[:, 1]
+    normal = normal + step[:, :1] * first + step[:, 1:2] * second
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    first = first - (first * normal).sum(axis=1, keepdims=True) * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    axes = np.stack([first, np.cross(normal, first)], axis=1)
+    return normal, point - step[:, 2:] * normal, axes
+
+
+def by_motion(
+    normal: NDArray[np.float64], axes: NDArray[np.float64], point: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(K, 3, 6) derivatives of (a, b, c) of planes seen, by a motion of the planes expected.
+
+    The motion is a turn about the origin of `point`, radians, and a shift, metres.
+    """
+    design = np.zeros((len(normal), 3, 6))
+    design[:, 0, :3], design[:, 1, :3] = -axes[:, 1], axes[:, 0]
+    design[:, 2, :3] = np.cross(point, normal)
+    design[:, 2, 3:] = normal
+    return design
+
+
+def congruent(by: NDArray[np.float64], covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """B C B^T of stacked matrices: the covariance of B x where C is that of x."""
+    result: NDArray[np.float64] = by @ covariance @ np.swapaxes(by, -1, -2)
+    return result
+
+
+def moved_plane(rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(4, 4) from (normal, distance) to those in a frame in which x is at rotation x + shift."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[3, :3] = rotation, -shift @ rotation
+    return matrix
