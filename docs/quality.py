@@ -11,8 +11,8 @@ import numpy as np
 from distortion import errors
 from measure_frames import CONFIG, face_of, room_of, walked
 
+from rangeseg_ros.core.ground.classes import GROUND
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
-from rangeseg_ros.core.meaning.classes import GROUND
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 

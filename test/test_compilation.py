@@ -93,7 +93,7 @@ def test_labels_and_planes_need_less():
             process.kill()
     first, every = found
     assert first < every
-    assert not any('.meaning.' in module for module, *_ in first)
+    assert not any('.ground.' in module for module, *_ in first)
 
 
 def test_two_processes_compile_a_kernel_once(tmp_path):

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.cameras import write_camera
 

@@ -10,8 +10,8 @@ from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Plane, RangeImage, Segmentation, planes_from_message
+from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.mapping.map_outlines import MapOutline
-from rangeseg_ros.core.meaning.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message

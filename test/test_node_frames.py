@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros import Config, planes_from_message
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera

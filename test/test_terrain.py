@@ -7,14 +7,10 @@ import numpy as np
 import pytest
 from clouds import cloud_of
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.meaning.cells import Cells
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.meaning.continuity import surfaces_of
-from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
-from rangeseg_ros.core.meaning.steps import BASELINES, Steps
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.crossings import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.ideal import Ideal
@@ -78,22 +74,6 @@ def test_below_a_drop_is_no_ground(depth, height):
     assert share(result, frame, DROP, DROP) > 0.98
     deep = result.height[(frame.terrain == DROP) & (frame.crossing < 2.5)]
     assert np.median(deep) == pytest.approx(-depth, abs=0.03)
-
-
-@pytest.mark.parametrize(('falls', 'blur', 'levels'), [(1, 2.0, 2), (1, 0.0, 1), (-1, 2.0, 1)])
-def test_a_step_down_that_the_sensor_smooths_is_one(falls, blur, levels):
-    """Over the same way a ramp that is allowed falls as much; one up is given that chance."""
-    rows, columns = 240, 6
-    place = np.zeros((3, rows, columns), np.float32)
-    far = np.arange(rows)[::-1, None]  # the first row is farthest
-    place[0] = -falls * 0.05 * ndtr((far - rows / 2) / 2)
-    place[1] = 2 + 0.05 * far
-    place[2] = 0.02 * np.arange(columns)
-    flat = np.zeros((rows, columns), np.float32)
-    cells = Cells(place, flat + 1, place, flat + 1e-6, np.zeros((2, rows, columns), np.float32))
-    slope = float(np.tan(np.radians(13.5)))
-    count = surfaces_of(cells, Steps.of(slope, 0.05, np.ones(len(BASELINES)), blur)).number
-    assert count == levels
 
 
 def test_a_mirage_in_the_floor_is_a_drop():

@@ -343,10 +343,10 @@ class Config:
         low=0.0,
         high=45.0,
     )
-    sensor_height_noise: float = option(
+    sensor_height_sd: float = option(
         0.015, 'standard deviation of sensor_height, metres', low=0.001, high=10.0
     )
-    up_noise: float = option(
+    up_sd: float = option(
         1.5,
         'standard deviation of the direction that is up, however it is told, degrees',
         low=0.01,
@@ -442,9 +442,15 @@ def _frames_in_seconds(frames: object) -> object:
     return frames / 30 if isinstance(frames, int | float) else frames
 
 
+def _as_it_is(value: object) -> object:
+    return value
+
+
 # Former names of parameters, their names now, and what becomes of their values.
 RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     'track_memory': ('track_time', _frames_in_seconds),
+    'sensor_height_noise': ('sensor_height_sd', _as_it_is),
+    'up_noise': ('up_sd', _as_it_is),
 }
 
 

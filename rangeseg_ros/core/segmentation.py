@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.ground import Terrain
-from rangeseg_ros.core.meaning.ramps import Ramp, ramps_of
-from rangeseg_ros.core.meaning.stairs import Stairs, stairs_of
-from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
+from rangeseg_ros.core.ground.ramps import Ramp, ramps_of
+from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
+from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.ground.terrain import Terrain
+from rangeseg_ros.core.ground.tilt import Tilt, tilt_of
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -10,14 +10,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground.memory import GroundMemory
+from rangeseg_ros.core.ground.roles import roles, unit
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.meaning.memory import GroundMemory
-from rangeseg_ros.core.meaning.roles import roles, unit
-from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.messages.make import Make
 
 # One row of `~/planes`: the fields of a Plane.

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.crossings import drops, outlines, unseen
+from rangeseg_ros.core.ground.points import points_of_class
+from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.meaning.class_points import points_of_class
-from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
-from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
@@ -90,7 +90,7 @@ def _terrain(make: Make, header: Any, image: RangeImage, result: Segmentation) -
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, result, GROUND)[:, :3])
+    return points_message(make, header, _points(image, result, GROUND))
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -133,17 +133,18 @@ def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 
 
 OUTPUTS = {
+    # What a robot stops for is published before pictures.
+    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
+    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
+    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
+    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
+    'terrain': Output('sensor_msgs/msg/Image', _terrain),
     'labels': Output('sensor_msgs/msg/Image', _labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
     'markers': _of_markers(lambda image, result: of_planes(result.planes)),
     'overlay': Output('sensor_msgs/msg/Image', _overlay),
     'normals': Output('sensor_msgs/msg/Image', _normals),
     'edges': Output('sensor_msgs/msg/Image', _edges),
-    'terrain': Output('sensor_msgs/msg/Image', _terrain),
-    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
-    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
-    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
-    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': _of_markers(_outline),
     'stairs': _of_markers(_stairs),
     'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),

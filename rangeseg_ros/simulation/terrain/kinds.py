@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, WIDE, Terrain, Wave, slab
 from rangeseg_ros.simulation.terrain.site import Site

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.solids import Solid, box, cylinder
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, Wave, slab

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 

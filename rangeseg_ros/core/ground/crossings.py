@@ -9,9 +9,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND
-from rangeseg_ros.core.meaning.ground import Terrain
-from rangeseg_ros.core.meaning.ground_field import GroundField, plane_at
+from rangeseg_ros.core.ground.classes import DROP, GROUND
+from rangeseg_ros.core.ground.field import GroundField, plane_at
+from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.rays import completed_rays
 

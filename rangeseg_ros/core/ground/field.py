@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.cells import Cells, CellSize
+from rangeseg_ros.core.ground.cells import Cells, CellSize
 from rangeseg_ros.core.sensing.moments import cofactors
 
 # Cells of a block, which is about square.

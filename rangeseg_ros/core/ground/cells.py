@@ -48,16 +48,12 @@ class Cells(NamedTuple):
         NaN where not measured.
     error : (...) float32
         Standard deviation of the height, metres, by the sensor model for one pixel.
-    kink : (2, ...) float32
-        Difference of height between the left and the right half, and the way between them,
-        metres.
     """
 
     ray: NDArray[np.float32]
     inverse: NDArray[np.float32]
     place: NDArray[np.float32]
     error: NDArray[np.float32]
-    kink: NDArray[np.float32]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -86,8 +82,8 @@ def cells_of(
     """
     height, width = image.shape
     shape = -(-height // size.rows), -(-width // size.columns)
-    single, several = (np.empty((n, *shape), np.float32) for n in (2, 8))
-    cells = Cells(several[:3], single[0], several[3:6], single[1], several[6:])
+    single, several = (np.empty((n, *shape), np.float32) for n in (2, 6))
+    cells = Cells(several[:3], single[0], several[3:], single[1])
     axes = axes_of(up).astype(np.float32)
     run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, axes, sensor, cells)
     return cells
@@ -233,7 +229,6 @@ def _divide(
     fewest = np.float32(size.rows * size.columns / 2)
     none, nothing = np.float32(0), np.float32(np.nan)
     count, value = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    apart = np.empty((3, columns), np.float32)
     for c in range(columns):
         count[c] = sums[4, 0, c] + sums[4, 1, c]
         enough = count[c] >= fewest
@@ -252,15 +247,3 @@ def _divide(
         deviation = np.sqrt(np.float32(random_variance(sensor, value[c] * value[c])))
         error = abs(cells.place[0, i, c]) / value[c] * deviation
         cells.error[i, c] = error if value[c] > none else none
-    # How far the left half is from the right one.
-    for k in range(3):
-        x, y, z = axes[k]
-        for c in range(columns):
-            left = x * sums[0, 0, c] + y * sums[1, 0, c] + z * sums[2, 0, c]
-            right = x * sums[0, 1, c] + y * sums[1, 1, c] + z * sums[2, 1, c]
-            apart[k, c] = left / sums[3, 0, c] - right / sums[3, 1, c]
-    for c in range(columns):
-        both = min(sums[4, 0, c], sums[4, 1, c]) * np.float32(2) >= fewest
-        way = np.sqrt(apart[1, c] * apart[1, c] + apart[2, c] * apart[2, c])
-        cells.kink[0, i, c] = abs(apart[0, c]) if both else none
-        cells.kink[1, i, c] = way if both else none

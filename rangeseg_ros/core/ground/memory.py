@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.ground.terrain import Terrain
 
 # From this confidence on a height is worth remembering: most of the half that remains of it for a
 # surface which fills the view.

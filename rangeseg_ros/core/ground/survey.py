@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
-from rangeseg_ros.core.meaning.memory import GroundMemory
-from rangeseg_ros.core.meaning.roles import unit
+from rangeseg_ros.core.ground.memory import GroundMemory
+from rangeseg_ros.core.ground.roles import unit
+from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -57,12 +57,12 @@ class Survey:
             float(np.radians(config.ground_slope)),
             config.obstacle_height,
             config.drop_height,
-            float(np.radians(config.up_noise)),
+            float(np.radians(config.up_sd)),
         )
         if up is None:
             up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
         direction = unit(up)
-        height = config.sensor_height, config.sensor_height_noise
+        height = config.sensor_height, config.sensor_height_sd
         return cls(image, sensor, direction, *height, limits)
 
     def terrain(self) -> Terrain:

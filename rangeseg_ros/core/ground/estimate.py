@@ -1,0 +1,215 @@
+"""Where the ground under the robot is, by what is stated and by what is seen, with its error.
+
+The height above the stated ground is a + b x + c y for a plane, with x, y horizontal: a is the
+step between the ground seen, continued, and the ground stated; b and c are a slope, or the error
+of up. A plane that is continued to below the camera does not depend on the direction that is
+called up, so that a slope under the robot is no contradiction, and a level landing is one.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.moments import cofactors
+from rangeseg_ros.core.significance import SAMPLES
+
+# Metres of ground, from where it begins, that tell its plane: how much the slopes of both differ
+# is how well the ground in between is known.
+_WAYS = (0.4, 0.8)
+# How often there is a step out of view between a robot and the ground it sees, and the highest.
+_STEPS, _HIGHEST = 0.1, 0.35
+SURE = 0.97
+"""Confidence from which on the ground is the ground; less is unknown."""
+FURNITURE = 2.0
+"""Metres: what is longer, along or across the view, is no table (without a stated height)."""
+
+
+class Stand(NamedTuple):
+    """Where a robot stands.
+
+    Attributes
+    ----------
+    surface : int
+        1 where the ground is in view, 0 where it is not known.
+    theta : (3,) float64
+        Plane of the ground under the robot: theta . ray is its inverse range.
+    confidence : float
+        0...1: that the ground seen is the one that the robot stands on.
+    reasons : tuple of str
+        What contradicts, in words.
+    """
+
+    surface: int
+    theta: NDArray[np.float64]
+    confidence: float
+    reasons: tuple[str, ...] = ()
+
+    def height(self, up: NDArray[np.float64]) -> float:
+        """Of the sensor above the ground below it, along `up`, metres; NaN without a ground."""
+        return float(-1 / (self.theta @ up)) if self.surface else float('nan')
+
+
+class Step(NamedTuple):
+    """The ground that is seen against the one that is stated.
+
+    Attributes
+    ----------
+    plane : (a, b, c)
+        Of the ground seen, above the stated ground.
+    error : float
+        Standard deviation of a, that of the stated height included, metres.
+    distance : float
+        Where the ground seen begins, metres.
+    size : float
+        The longer side of the rectangle around it, metres.
+    """
+
+    plane: tuple[float, float, float]
+    error: float
+    distance: float
+    size: float
+
+    def confidence(self, least: float) -> float:
+        """That there is no step of `least` or more between the robot and the ground it sees."""
+        a, s = self.plane[0], self.error
+        same = (1 - _STEPS) * math.exp(-((a / s) ** 2) / 2) / (s * math.sqrt(2 * math.pi))
+        tails = sum(math.erfc((least - side * a) / (s * math.sqrt(2))) / 2 for side in (-1, 1))
+        step = _STEPS * tails / (2 * (_HIGHEST - least))
+        return same / (same + step) if same > 0 else 0.0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def solve(
+    total: NDArray[np.float64],
+    first: float,
+    others: float,
+    prior: tuple[float, float, float],
+) -> tuple[float, float, float, float]:
+    """Plane h = a + b x + c y by least squares: a, b, c and the variance of a.
+
+    Parameters
+    ----------
+    total : (9,) float64
+        Weighted sums of 1, x, y, xx, xy, yy, h, xh, yh.
+    first, others : float
+        Inverse variances of the prior: of a, of b and c.
+    prior : (a, b, c)
+    """
+    a, b, c = total[0] + first, total[1], total[2]
+    d, e, f = total[3] + others, total[4], total[5] + others
+    x = total[6] + first * prior[0]
+    y, z = total[7] + others * prior[1], total[8] + others * prior[2]
+    aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+    return (
+        (aa * x + bb * y + cc * z) / determinant,
+        (bb * x + dd * y + ee * z) / determinant,
+        (cc * x + ee * y + ff * z) / determinant,
+        aa / determinant,
+    )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def first_plane(
+    place: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    nearest: NDArray[np.int64],
+    errors: tuple[float, float],
+    least: float,
+) -> tuple[float, float, float]:
+    """Plane of the nearest cells, robust, beginning with the stated one.
+
+    Parameters
+    ----------
+    place : (3, rows, columns) float64
+        Heights are above the stated ground.
+    variance : (rows, columns) float64
+    nearest : (columns,) int64
+        Row of the nearest cell of each column; -1 for none.
+    errors : (float, float)
+        Standard deviations of the stated height, metres, and of the slope.
+    least : float
+        The least step, metres.
+    """
+    a = b = c = 0.0
+    total = np.empty(9)
+    for _ in range(8):
+        total[:] = 0
+        for k in range(len(nearest)):
+            i = nearest[k]
+            if i < 0:
+                continue
+            x, y, h = place[1, i, k], place[2, i, k], place[0, i, k]
+            off = 2 * (h - a - b * x - c * y) / least
+            _add_to(total, x, y, h, 1 / (variance[i, k] + (least / 4) ** 2) / (1 + off * off))
+        # What they err by, they have in common: as many as tell a plane.
+        total *= SAMPLES / len(nearest)
+        a, b, c, _ = solve(total, errors[0] ** -2.0, errors[1] ** -2.0, (0.0, 0.0, 0.0))
+    return a, b, c
+
+
+@njit(cache=True, inline='always')
+def _add_to(total: NDArray[np.float64], x: float, y: float, h: float, w: float) -> None:
+    entries = (w, w * x, w * y, w * x * x, w * x * y, w * y * y, w * h, w * x * h, w * y * h)
+    for n in range(9):
+        total[n] += entries[n]
+
+
+def step_of(
+    place: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    reached: NDArray[np.bool_],
+    height_error: float,
+    slope: float,
+) -> Step:
+    """The ground seen against the one stated.
+
+    Parameters
+    ----------
+    place : (3, rows, columns) float64
+        Heights are above the stated ground, metres.
+    variance : (rows, columns) float64
+        Of a cell's height, if all that errs alike were one measurement, metres^2.
+    reached : (rows, columns) bool
+        Cells of the ground: at least one.
+    height_error : float
+        Standard deviation of the stated height, metres.
+    slope : float
+        Tangent of the steepest ground.
+    """
+    x, y = place[1][reached], place[2][reached]
+    distance = np.hypot(x, y)
+    start = float(np.quantile(distance, 0.01))
+    fits = np.array(
+        [
+            solve(_sums(place, variance, reached, start + way), 1e-6, (2 / slope) ** 2, (0, 0, 0))
+            for way in _WAYS
+        ]
+    )
+    (_, b, c, _), (a, p, q, square) = fits
+    between = start * math.hypot(b - p, c - q)
+    size = max(np.ptp(x), np.ptp(y))
+    error = math.sqrt(height_error**2 + square + between**2)
+    return Step((float(a), float(p), float(q)), error, start, float(size))
+
+
+@njit(cache=True, nogil=True)
+def _sums(
+    place: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    reached: NDArray[np.bool_],
+    distance: float,
+) -> NDArray[np.float64]:
+    """Sums of the ground up to a distance."""
+    total = np.zeros(9)
+    for i in range(reached.shape[0]):
+        for c in range(reached.shape[1]):
+            if reached[i, c]:
+                x, y = place[1, i, c], place[2, i, c]
+                if x * x + y * y <= distance * distance:
+                    _add_to(total, x, y, place[0, i, c], 1 / variance[i, c])
+    return total
