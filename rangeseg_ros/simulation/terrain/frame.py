@@ -74,6 +74,10 @@ def simulate_terrain(
     size = _of(scene, piece, lambda p: p.size, 0.0)
     on_ground = terrain == GROUND
     depth[on_ground] = _on_waves(scene.waves, origin, rays[on_ground], depth[on_ground])
+    if scene.relief:
+        # Of single pixels, as of grass or gravel.
+        relief = scene.relief * np.random.default_rng([seed, 14]).standard_normal(depth.shape)
+        depth = np.where(on_ground, depth + relief / np.minimum(rays[..., 2], -0.1), depth)
     points = origin + np.where(np.isfinite(depth), depth, 1)[..., None] * rays
     height = points[..., 2] - _ground_below(scene, points)
     lifted = sum((wave.height(points) for wave in scene.waves), np.zeros(depth.shape))

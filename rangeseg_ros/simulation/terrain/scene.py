@@ -79,6 +79,8 @@ class Terrain:
     pose: Pose
     waves: tuple[Wave, ...] = ()
     stairs: dict[str, float | str] = field(default_factory=dict)
+    errors: tuple[float, float] = (1.0, 0.01)
+    relief: float = 0.0
 
     @property
     def up(self) -> NDArray[np.float64]:
