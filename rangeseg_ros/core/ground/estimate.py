@@ -18,15 +18,11 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.significance import SAMPLES
 
-# Metres of ground, from where it begins, that tell its plane: how much the slopes of both differ
-# is how well the ground in between is known.
-_WAYS = (0.4, 0.8)
+# Metres of ground, from where it begins, that are continued to below the camera: each doubles the
+# one before. A short one is right where a ramp begins, a long one where the ground undulates.
+_WAYS = (0.4, 0.8, 1.6, 3.2)
 # How often there is a step out of view between a robot and the ground it sees, and the highest.
 _STEPS, _HIGHEST = 0.1, 0.35
-SURE = 0.97
-"""Confidence from which on the ground is the ground; less is unknown."""
-FURNITURE = 2.0
-"""Metres: what is longer, along or across the view, is no table (without a stated height)."""
 
 
 class Stand(NamedTuple):
@@ -39,7 +35,7 @@ class Stand(NamedTuple):
     theta : (3,) float64
         Plane of the ground under the robot: theta . ray is its inverse range.
     confidence : float
-        0...1: that the ground seen is the one that the robot stands on.
+        0...1: probability that the ground seen is the one that the robot stands on.
     reasons : tuple of str
         What contradicts, in words.
     """
@@ -54,8 +50,8 @@ class Stand(NamedTuple):
         return float(-1 / (self.theta @ up)) if self.surface else float('nan')
 
 
-class Step(NamedTuple):
-    """The ground that is seen against the one that is stated.
+class Continuation(NamedTuple):
+    """The ground that is seen, continued to below the camera, against the one that is stated.
 
     Attributes
     ----------
@@ -63,24 +59,27 @@ class Step(NamedTuple):
         Of the ground seen, above the stated ground.
     error : float
         Standard deviation of a, that of the stated height included, metres.
-    distance : float
-        Where the ground seen begins, metres.
+    confidence : float
+        That there is no step out of view between the robot and the ground it sees.
     size : float
-        The longer side of the rectangle around it, metres.
+        The longer side of the rectangle around the ground seen, metres.
     """
 
     plane: tuple[float, float, float]
     error: float
-    distance: float
+    confidence: float
     size: float
 
-    def confidence(self, least: float) -> float:
-        """That there is no step of `least` or more between the robot and the ground it sees."""
-        a, s = self.plane[0], self.error
-        same = (1 - _STEPS) * math.exp(-((a / s) ** 2) / 2) / (s * math.sqrt(2 * math.pi))
-        tails = sum(math.erfc((least - side * a) / (s * math.sqrt(2))) / 2 for side in (-1, 1))
-        step = _STEPS * tails / (2 * (_HIGHEST - least))
-        return same / (same + step) if same > 0 else 0.0
+
+def no_step(a: float, sd: float, least: float) -> float:
+    """Probability that ground `a` metres off the stated one, +- `sd`, is no step of `least`.
+
+    By Bayes' rule: one ground in `_STEPS` lies behind a step that is uniform up to `_HIGHEST`.
+    """
+    same = (1 - _STEPS) * math.exp(-((a / sd) ** 2) / 2) / (sd * math.sqrt(2 * math.pi))
+    tails = sum(math.erfc((least - side * a) / (sd * math.sqrt(2))) / 2 for side in (-1, 1))
+    step = _STEPS * tails / (2 * max(_HIGHEST - least, least))
+    return same / (same + step) if same > 0 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -121,7 +120,7 @@ def first_plane(
     errors: tuple[float, float],
     least: float,
 ) -> tuple[float, float, float]:
-    """Plane of the nearest cells, robust, beginning with the stated one.
+    """Plane (a, b, c) of the nearest cells, robust, beginning with the stated one.
 
     Parameters
     ----------
@@ -145,7 +144,7 @@ def first_plane(
                 continue
             x, y, h = place[1, i, k], place[2, i, k], place[0, i, k]
             off = 2 * (h - a - b * x - c * y) / least
-            _add_to(total, x, y, h, 1 / (variance[i, k] + (least / 4) ** 2) / (1 + off * off))
+            add_point(total, x, y, h, 1 / (variance[i, k] + (least / 4) ** 2) / (1 + off * off))
         # What they err by, they have in common: as many as tell a plane.
         total *= SAMPLES / len(nearest)
         a, b, c, _ = solve(total, errors[0] ** -2.0, errors[1] ** -2.0, (0.0, 0.0, 0.0))
@@ -153,63 +152,51 @@ def first_plane(
 
 
 @njit(cache=True, inline='always')
-def _add_to(total: NDArray[np.float64], x: float, y: float, h: float, w: float) -> None:
+def add_point(total: NDArray[np.float64], x: float, y: float, h: float, w: float) -> None:
+    """Add a point of weight w to the sums of `solve`."""
     entries = (w, w * x, w * y, w * x * x, w * x * y, w * y * y, w * h, w * x * h, w * y * h)
     for n in range(9):
         total[n] += entries[n]
 
 
-def step_of(
+def continued(
     place: NDArray[np.float64],
     variance: NDArray[np.float64],
-    reached: NDArray[np.bool_],
-    height_error: float,
+    height_sd: float,
     slope: float,
-) -> Step:
-    """The ground seen against the one stated.
+    least: float,
+) -> Continuation:
+    """The ground seen, continued to below the camera by the scale at which it agrees best.
 
     Parameters
     ----------
-    place : (3, rows, columns) float64
-        Heights are above the stated ground, metres.
-    variance : (rows, columns) float64
+    place : (3, N) float64
+        Of the cells of the ground: heights above the stated ground, metres. At least one.
+    variance : (N,) float64
         Of a cell's height, if all that errs alike were one measurement, metres^2.
-    reached : (rows, columns) bool
-        Cells of the ground: at least one.
-    height_error : float
+    height_sd : float
         Standard deviation of the stated height, metres.
     slope : float
         Tangent of the steepest ground.
+    least : float
+        The least step, metres.
     """
-    x, y = place[1][reached], place[2][reached]
+    h, x, y = place
     distance = np.hypot(x, y)
-    start = float(np.quantile(distance, 0.01))
-    fits = np.array(
-        [
-            solve(_sums(place, variance, reached, start + way), 1e-6, (2 / slope) ** 2, (0, 0, 0))
-            for way in _WAYS
-        ]
-    )
-    (_, b, c, _), (a, p, q, square) = fits
-    between = start * math.hypot(b - p, c - q)
-    size = max(np.ptp(x), np.ptp(y))
-    error = math.sqrt(height_error**2 + square + between**2)
-    return Step((float(a), float(p), float(q)), error, start, float(size))
-
-
-@njit(cache=True, nogil=True)
-def _sums(
-    place: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    reached: NDArray[np.bool_],
-    distance: float,
-) -> NDArray[np.float64]:
-    """Sums of the ground up to a distance."""
-    total = np.zeros(9)
-    for i in range(reached.shape[0]):
-        for c in range(reached.shape[1]):
-            if reached[i, c]:
-                x, y = place[1, i, c], place[2, i, c]
-                if x * x + y * y <= distance * distance:
-                    _add_to(total, x, y, place[0, i, c], 1 / variance[i, c])
-    return total
+    start = float(np.partition(distance, len(distance) // 100)[len(distance) // 100])
+    size = float(max(np.ptp(x), np.ptp(y)))
+    best = None
+    for way in _WAYS:
+        near = distance <= start + way
+        u, v, w = x[near], y[near], 1 / variance[near]
+        z = h[near]
+        terms = np.array([np.ones(len(u)), u, v, u * u, u * v, v * v, z, u * z, v * z])
+        a, b, c, square = solve((terms * w).sum(axis=1), 1e-6, (2 / slope) ** 2, (0.0, 0.0, 0.0))
+        # What the ground is off its plane goes on unseen: it tells two points, a way apart.
+        residual = z - a - b * u - c * v
+        bent = (1 + 2 * start / way) * math.sqrt(float((w * residual**2).sum()) / w.sum())
+        sd = math.sqrt(height_sd**2 + square + bent**2)
+        if best is None or no_step(a, sd, least) > best.confidence:
+            best = Continuation((a, b, c), sd, no_step(a, sd, least), size)
+    assert best is not None
+    return best

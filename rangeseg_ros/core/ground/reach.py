@@ -1,10 +1,11 @@
 """Ground is reached: a chain of seen ground, link by link, leads from the robot to it.
 
 Cells are looked at from near to far, and once more from far to near. What is reached already
-predicts the next cell: its height, by the mean of what was reached last, and its slope, by a plane
-through more of it. Both are least squares whose weights decrease with the distance, of the cell's
-own column and those beside it, so that a chain goes around what stands in its way. A cell is
-reached where it is neither a step from what is predicted nor, with the cells around it, too steep.
+predicts the next cell by local linear regression: its height by the mean of what was reached last,
+its slope by a plane through more of it, with weights that decrease with the distance, of the
+cell's own column and those beside it, so that a chain goes around what stands in its way. A cell
+is reached where it is neither a step from what is predicted nor, with the cells around it, too
+steep.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.estimate import solve
+from rangeseg_ros.core.ground.estimate import add_point, solve
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
-# A quarter of the least step is what the steepest ground rises over the length of the mean: its
-# lag behind a slope that begins, the noise, and half a step are told apart.
+# Share of the least step that the steepest ground rises by over the length of the mean: its lag
+# behind a slope that begins, the noise, and half a step are told apart.
 _QUARTER = 1 / 4
-# The plane is of a length four times as large: of weights that are powers of the mean's.
+# The plane is of a length four times as large: its weights are fourth roots of the mean's.
 _LONGER = 4
 # Of the least step: what the continued plane may be off by where a slope begins, and what a mixed
 # pixel of a step shows at least.
@@ -59,8 +60,8 @@ def reach(
     """
     rows, columns = variance.shape
     reached = np.zeros((rows, columns), np.bool_)
-    # Sums of a column: of the plane (1, x, y, xx, xy, yy, h, xh, yh) and of the mean (1, x, y, h),
-    # and where the cell is that was reached last.
+    # Sums of a column: those of `solve` for the plane, those of 1, x, y, h for the mean, and where
+    # the cell is that was reached last.
     sums, means = np.zeros((columns, 9)), np.zeros((columns, 4))
     last = np.full((columns, 2), np.nan)
     total, mean = np.empty(9), np.empty(4)
@@ -77,8 +78,7 @@ def reach(
                 noise = np.sqrt(variance[i, c])
                 span = length * max(1.0, 1.5 * noise / (least * _QUARTER))
                 if i == nearest[c] and outward and np.sqrt(x * x + y * y) < start:
-                    off = abs(h - plane[0] - plane[1] * x - plane[2] * y)
-                    found = off < least / 2
+                    found = abs(h - plane[0] - plane[1] * x - plane[2] * y) < least / 2
                 else:
                     found = _linked(
                         x, y, h, c, variance[i, c], span, length, sums, means, last, total,
@@ -86,7 +86,7 @@ def reach(
                     )  # fmt: skip
                 if found and _even(place, variance, i, c, least, slope):
                     reached[i, c] = True
-                    _add(x, y, h, c, 1 / variance[i, c], span, sums, means, last)
+                    _add(x, y, h, 1 / variance[i, c], span, sums[c], means[c], last[c])
     return reached
 
 
@@ -106,6 +106,12 @@ def _first(
             if abs(place[0, i, c] - plane[0] - plane[1] * x - plane[2] * y) < least / 2:
                 distance = min(distance, np.sqrt(x * x + y * y))
     return distance + 5 * least
+
+
+@njit(cache=True, inline='always')
+def _decay(way: float) -> float:
+    """exp(-way) by the first terms of exp(way), which is all that weights need."""
+    return 1 / (1 + way * (1 + way * (0.5 + way / 6)))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -134,7 +140,7 @@ def _linked(
         if not way < 4 * _LONGER * span:
             continue
         near = min(near, way)
-        weight = np.exp(-way / (_LONGER * span))
+        weight = _decay(way / (_LONGER * span))
         for n in range(9):
             total[n] += weight * sums[q, n]
         weight *= weight
@@ -198,7 +204,6 @@ def _add(
     x: float,
     y: float,
     h: float,
-    c: int,
     weight: float,
     span: float,
     sums: NDArray[np.float64],
@@ -207,14 +212,12 @@ def _add(
 ) -> None:
     """Add a cell to the sums of its column, in which what is farther away counts less."""
     long, short = 0.0, 0.0
-    if last[c, 0] == last[c, 0]:
-        way = np.sqrt((last[c, 0] - x) ** 2 + (last[c, 1] - y) ** 2)
-        long = np.exp(-way / (_LONGER * span))
+    if last[0] == last[0]:
+        long = _decay(np.sqrt((last[0] - x) ** 2 + (last[1] - y) ** 2) / (_LONGER * span))
         short = long**_LONGER
-    entries = (1.0, x, y, x * x, x * y, y * y, h, x * h, y * h)
-    for n in range(9):
-        sums[c, n] = long * sums[c, n] + weight * entries[n]
-    for n in range(3):
-        means[c, n] = short * means[c, n] + weight * entries[n]
-    means[c, 3] = short * means[c, 3] + weight * h
-    last[c, 0], last[c, 1] = x, y
+    sums *= long
+    add_point(sums, x, y, h, weight)
+    means *= short
+    for n, entry in enumerate((1.0, x, y, h)):
+        means[n] += weight * entry
+    last[0], last[1] = x, y

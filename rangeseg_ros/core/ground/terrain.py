@@ -15,16 +15,8 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.ground.estimate import (
-    FURNITURE,
-    SURE,
-    Stand,
-    Step,
-    first_plane,
-    step_of,
-)
-from rangeseg_ros.core.ground.field import GroundField, cell_heights, ground_field, sums_of
-from rangeseg_ros.core.ground.pixels import pixels_of
+from rangeseg_ros.core.ground.estimate import Continuation, Stand, continued, first_plane
+from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, systematic_variance
@@ -39,6 +31,10 @@ _FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
 _RELIEF = (9, 25)
 # Surfaces that are tried, the nearest first, until one agrees with the stated height.
 _TRIALS = 3
+SURE = 0.97
+"""Confidence from which on the ground is the ground; less is unknown."""
+FURNITURE = 2.0
+"""Metres: what is longer, along or across the view, is no table (without a stated height)."""
 
 
 class Limits(NamedTuple):
@@ -149,12 +145,12 @@ def terrain_of(
     """
     right, down, _ = up @ image.axes
     if abs(right) <= abs(down):
-        return _terrain(image, sensor, up, known, limits, bool(down > 0))
+        return _upright(image, sensor, up, known, limits, bool(down > 0))
     # A camera on its side: columns are along up in the image with rows and columns exchanged.
     rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
     rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
     turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
-    found = _terrain(turned, sensor, up, known, limits, bool(right > 0))
+    found = _upright(turned, sensor, up, known, limits, bool(right > 0))
     return found._replace(
         classes=np.ascontiguousarray(found.classes.T),
         height=np.ascontiguousarray(found.height.T),
@@ -162,7 +158,7 @@ def terrain_of(
     )
 
 
-def _terrain(
+def _upright(
     image: RangeImage,
     sensor: SensorModel,
     up: NDArray[np.float64],
@@ -171,30 +167,36 @@ def _terrain(
     turned: bool,
 ) -> Terrain:
     """The same for an image whose columns are along up; `turned` where up is down in it."""
-    size = CellSize.of(image.shape)
+    size = CellSize.for_image(image.shape)
     cells = cells_of(image, size, up, sensor)
-    place, variance = _measured(cells, size, sensor, limits.least)
-    height = known[0] or _lowest(place, variance, turned)
+    place, variance = _smoothed(cells, size, sensor, limits.least)
+    height, height_sd = known
+    height = height or _lowest(place, variance, turned)
     place[0] += height
-    left, nearest_step = variance.copy(), None
-    for _ in range(_TRIALS):
-        reached, step = _reached(place, left, sensor, size, height, known[1], limits, turned)
-        if step is None:
+    seen, left = None, variance.copy()
+    for _ in range(_TRIALS if height_sd > 0 else 1):
+        reached = _reach(place, left, height_sd, limits, turned)
+        if not reached.any():
             break
-        nearest_step = nearest_step or step
-        confidence = step.confidence(limits.least)
-        if known[0] == 0:  # the camera's height is what it is: a table tells by its size
-            confidence = float(step.size >= FURNITURE)
-        if confidence >= SURE:
-            stand = Stand(1, _theta(step, height, up), confidence)
+        smooth = _smooth_variance(place[:, reached], height, sensor, size)
+        found = continued(
+            place[:, reached],
+            4 * variance[reached] + smooth,
+            height_sd,
+            float(np.tan(limits.slope)),
+            limits.least,
+        )
+        seen = seen or found
+        # Without a height the ground is what the camera stands on: a table tells by its size.
+        sure = found.confidence >= SURE if height_sd > 0 else found.size >= FURNITURE
+        if sure:
+            stand = Stand(1, _theta(found, height, up), found.confidence)
             return _with_ground(image, cells, size, reached, stand, up, limits, turned)
-        if known[0] == 0:
-            break
         left[reached] = 0
-    return _without_ground(image, cells, size, nearest_step, up, known, limits)
+    return _without_ground(image, cells, size, seen, up, known, limits)
 
 
-def _measured(
+def _smoothed(
     cells: Cells, size: CellSize, sensor: SensorModel, least: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Places of cells and the variances of their heights, 0 where nothing is measured.
@@ -233,40 +235,39 @@ def _lowest(place: NDArray[np.float64], variance: NDArray[np.float64], turned: b
     return max(-float(np.median(place[0, nearest[columns], columns])), 0.02)
 
 
-def _reached(
+def _reach(
     place: NDArray[np.float64],
     variance: NDArray[np.float64],
-    sensor: SensorModel,
-    size: CellSize,
-    height: float,
-    doubt: float,
+    height_sd: float,
     limits: Limits,
     turned: bool,
-) -> tuple[NDArray[np.bool_], Step | None]:
-    """Cells that a chain from the nearest ones leads to, and what they say of the robot's ground.
-
-    None where there are none.
-    """
-    slope = float(np.tan(limits.slope))
-    steepest = float(np.tan(limits.slope + limits.tilt))
+) -> NDArray[np.bool_]:
+    """Cells that a chain from the nearest ones leads to."""
     nearest = _nearest(variance, turned)
-    errors = (2 * doubt if doubt > 0 else 1.0, slope / 2)
+    errors = (2 * height_sd or 1.0, float(np.tan(limits.slope)) / 2)
     plane = first_plane(place, variance, nearest, errors, limits.least)
-    reached = reach(place, variance, nearest, plane, limits.least, steepest, turned)
-    if not reached.any():
-        return reached, None
-    # All of a patch of the distortion errs alike: 4 pi times the square of its width.
+    steepest = float(np.tan(limits.slope + limits.tilt))
+    return reach(place, variance, nearest, plane, limits.least, steepest, turned)
+
+
+def _smooth_variance(
+    place: NDArray[np.float64], height: float, sensor: SensorModel, size: CellSize
+) -> NDArray[np.float64]:
+    """Variance (N,) of the heights of cells by the sensor's distortion, metres^2.
+
+    All of a patch of it errs alike, 4 pi times the square of its width: it counts for every cell.
+    """
     square = (place[0] - height) ** 2 + place[1] ** 2 + place[2] ** 2
-    inverse = 1 / np.where(variance > 0, square, 1)
     patch = max(4 * np.pi * sensor.distortion_length**2 / (size.rows * size.columns), 1.0)
-    smooth = patch * systematic_variance(sensor, inverse) / inverse * (place[0] - height) ** 2
-    step = step_of(place, 4 * variance + smooth, reached, doubt, slope)
-    return reached, step
+    variance: NDArray[np.float64] = (
+        patch * systematic_variance.py_func(sensor, 1 / square) * square * (place[0] - height) ** 2
+    )
+    return variance
 
 
-def _theta(step: Step, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
+def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
     """The plane of the ground under the robot: theta . ray is its inverse range."""
-    a, b, c = step.plane
+    a, b, c = found.plane
     lean = np.array([b, c]) @ axes_of(up)[1:]
     theta: NDArray[np.float64] = -(up - lean) / (height - a)
     return theta
@@ -283,10 +284,8 @@ def _with_ground(
     turned: bool,
 ) -> Terrain:
     """Classes and heights by the ground that was reached, continued."""
-    there = sums_of(cells, cells.inverse > 0)
-    theta = ground_field(sums_of(cells, reached), there, stand.theta)
-    field = GroundField.of(theta, size, up)
-    height = cell_heights(cells, field, size)
+    field = ground_field(cells, reached, stand.theta, size, up)
+    height = field.heights(cells)
     # Relief counts as noise: what the cells of the ground scatter by.
     count = cv2.blur(reached.astype(np.float32), _RELIEF)
     squares = cv2.blur(np.where(reached, height, 0) ** 2, _RELIEF)
@@ -303,11 +302,11 @@ def _with_ground(
     bounds[1] = np.where(beside, -flat, np.inf)
     bounds[2] = np.where(beside, flat, -np.inf)
     bounds[3] = np.maximum(share * limits.obstacle, np.minimum(sure, _CERTAIN * limits.obstacle))
-    classes, heights = pixels_of(image, field, size, bounds)
+    classes, heights = classify(image, field, bounds)
     kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
     kind[height > bounds[3]] = OBSTACLE
     kind[height < bounds[0]] = DROP
-    below = CellTerrain(cells.place, height, kind, sure.astype(np.float32), turned)
+    below = CellTerrain(cells.place, height, kind, sure, turned)
     return Terrain(classes, heights, stand, field, below)
 
 
@@ -315,35 +314,30 @@ def _without_ground(
     image: RangeImage,
     cells: Cells,
     size: CellSize,
-    step: Step | None,
+    seen: Continuation | None,
     up: NDArray[np.float64],
     known: tuple[float, float],
     limits: Limits,
 ) -> Terrain:
     """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
-    height, doubt = known
-    obstacle = np.zeros(cells.inverse.shape, np.bool_)
+    height, height_sd = known
+    classes = np.zeros(image.shape, np.uint8)
     reasons: tuple[str, ...] = ()
     if height > 0:
-        apart = abs(step.plane[0]) if step else 0.0
-        reach_of = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + apart + _CERTAIN * (doubt + limits.tilt * reach_of)
-        obstacle = cells.place[0] + height > bound
-    if step and height > 0:
-        seen, sd = height - step.plane[0], abs(step.plane[0]) / step.error
+        apart = abs(seen.plane[0]) if seen else 0.0
+        distance = np.hypot(cells.place[1], cells.place[2])
+        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
+        above = size.enlarged(cells.place[0] + height > bound, image.shape)
+        classes = np.where(image.valid & above, OBSTACLE, UNKNOWN).astype(np.uint8)
+    if seen and height > 0:
         reasons = (
-            f'the stated height is {height:.2f} m, the ground seen is {seen:.2f} m below, '
-            f'{sd:.0f} sd: a step or ramp out of view, or a wrong height',
+            f'the stated height is {height:.2f} m, the ground seen is '
+            f'{height - seen.plane[0]:.2f} m below, {abs(seen.plane[0]) / seen.error:.0f} sd: a '
+            'step or ramp out of view, or a wrong height',
         )
-    elif step:
-        reasons = (f'no height is stated, and {step.size:.1f} m of a surface may be a table',)
-    wide = obstacle.repeat(size.rows, axis=0).repeat(size.columns, axis=1)
-    wide = wide[: image.shape[0], : image.shape[1]]
-    classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
-    confidence = step.confidence(limits.least) if step and height > 0 else 0.0
-    return Terrain(
-        classes,
-        np.full(image.shape, np.nan, np.float32),
-        Stand(0, np.zeros(3), confidence, reasons),
-        GroundField.of(np.zeros((1, 1, 3)), size, up),
-    )
+    elif seen:
+        reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
+    confidence = seen.confidence if seen and height > 0 else 0.0
+    nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
+    stand = Stand(0, np.zeros(3), confidence, reasons)
+    return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
