@@ -17,6 +17,7 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.significance import OUTLIER
 
 # Rows of an image whose cells are 1 x 4 pixels.
 _ROWS = 240
@@ -55,12 +56,15 @@ class Cells(NamedTuple):
     error : (...) float32
         Standard deviation of the height of a pixel, metres: by the sensor model, or by how much
         neighbouring pixels differ where that is more, as it is on grass and gravel.
+    mixed : (...) bool
+        Whether the pixels are of two surfaces: they differ by more than by noise.
     """
 
     ray: NDArray[np.float32]
     inverse: NDArray[np.float32]
     place: NDArray[np.float32]
     error: NDArray[np.float32]
+    mixed: NDArray[np.bool_]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -87,7 +91,8 @@ def cells_of(
     """
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
     ray, (inverse, scatter) = np.empty((3, *shape), np.float32), np.empty((2, *shape), np.float32)
-    run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, ray, inverse, scatter)
+    means = ray, inverse, scatter
+    run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
         place = np.tensordot(axes_of(up).astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
@@ -96,7 +101,7 @@ def cells_of(
             random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter, 5)
         )
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
-    return Cells(ray, inverse, place, error.astype(np.float32))
+    return Cells(ray, inverse, place, error.astype(np.float32), scatter > OUTLIER * variance)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -27,8 +27,12 @@ _LONGER = 4
 _BENT, _JUMP = 0.8, 1 / 8
 # Columns on either side whose ground leads to a cell, and lengths of the mean over which it does.
 _BESIDE, _GAP = 2, 2.0
+# Radius of where a chain begins, in least steps: half of a small robot.
+_START = 5
 # Cells, as powers of two, over which a slope is measured, and the longest such way, metres.
-_BASELINES, _WAY = 5, 0.4
+_BASELINES, _WAY = 6, 0.8
+# The last of these baselines, along columns and rows, that are beside a cell.
+_NEXT = (2, 0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -65,29 +69,43 @@ def reach(
     sums, means = np.zeros((columns, 9)), np.zeros((columns, 4))
     last = np.full((columns, 2), np.nan)
     total, mean = np.empty(9), np.empty(4)
-    start = _first(place, nearest, plane, least)
+    x_first, y_first = _first(place, nearest, plane, least)
     length = least * _QUARTER / slope
     for outward in (True, False):
         for m in range(rows):
             i = m if outward == turned else rows - 1 - m
+            before = i - 1 if outward == turned else i + 1
             for n in range(columns):
                 c = n if m % 2 == 0 else columns - 1 - n
                 if reached[i, c] or not variance[i, c] > 0:
                     continue
                 x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
                 noise = np.sqrt(variance[i, c])
+                # A chain that comes back must be sure: it has passed where noise is as high as steps.
+                if not outward and OUTLIER * noise > least / 2:
+                    continue
                 span = length * max(1.0, 1.5 * noise / (least * _QUARTER))
-                if i == nearest[c] and outward and np.sqrt(x * x + y * y) < start:
-                    found = abs(h - plane[0] - plane[1] * x - plane[2] * y) < least / 2
+                off = np.sqrt((x - x_first) ** 2 + (y - y_first) ** 2)
+                if i == nearest[c] and outward and off < _START * least:
+                    found = _agrees(place, i, c, plane, least)
                 else:
                     found = _linked(
                         x, y, h, c, variance[i, c], span, length, sums, means, last, total,
                         mean, plane, least, slope,
                     )  # fmt: skip
-                if found and _even(place, variance, i, c, least, slope):
+                if found and _even(place, variance, reached, i, before, c, least, slope):
                     reached[i, c] = True
                     _add(x, y, h, 1 / variance[i, c], span, sums[c], means[c], last[c])
     return reached
+
+
+@njit(cache=True, inline='always')
+def _agrees(
+    place: NDArray[np.float64], i: int, c: int, plane: tuple[float, float, float], least: float
+) -> bool:
+    """Whether a cell is of the ground under the robot."""
+    off = place[0, i, c] - plane[0] - plane[1] * place[1, i, c] - plane[2] * place[2, i, c]
+    return bool(abs(off) < least / 2)
 
 
 @njit(cache=True, inline='always')
@@ -96,16 +114,16 @@ def _first(
     nearest: NDArray[np.int64],
     plane: tuple[float, float, float],
     least: float,
-) -> float:
-    """Distance up to which nearest cells may be where the chain begins, metres."""
-    distance = np.inf
+) -> tuple[float, float]:
+    """Where the chain begins: the place (x, y) of the nearest cell of the ground."""
+    distance, x, y = np.inf, np.inf, np.inf
     for c in range(len(nearest)):
         i = nearest[c]
-        if i >= 0:
-            x, y = place[1, i, c], place[2, i, c]
-            if abs(place[0, i, c] - plane[0] - plane[1] * x - plane[2] * y) < least / 2:
-                distance = min(distance, np.sqrt(x * x + y * y))
-    return distance + 5 * least
+        if i >= 0 and _agrees(place, i, c, plane, least):
+            square = place[1, i, c] ** 2 + place[2, i, c] ** 2
+            if square < distance:
+                distance, x, y = square, place[1, i, c], place[2, i, c]
+    return x, y
 
 
 @njit(cache=True, inline='always')
@@ -163,39 +181,51 @@ def _linked(
 def _even(
     place: NDArray[np.float64],
     variance: NDArray[np.float64],
+    reached: NDArray[np.bool_],
     i: int,
+    before: int,
     c: int,
     least: float,
     slope: float,
 ) -> bool:
-    """Whether a cell lies in no step and on no slope that is too steep, along and across."""
+    """Whether a cell is no steeper against the cells of its row and its column than ground may be.
+
+    Against those beside it, whatever they are, so that the foot of a wall is none; against those
+    farther away where they are ground, in the row `before` as well; and on no slope that goes on
+    to either side.
+    """
     rows, columns = variance.shape
     noise = np.sqrt(2 * variance[i, c])
     for axis in range(2):
         for e in range(_BASELINES):
-            k, m = (1 << e, 0) if axis == 0 else (0, 1 << e)
-            rise, fall, ahead, back = 0.0, 0.0, 0.0, 0.0
+            near = e <= _NEXT[axis]
+            rise, ahead = (0.0, 0.0), (0.0, 0.0)
             for sign in (-1, 1):
-                p, q = i + sign * k, c + sign * m
-                if not (0 <= p < rows and 0 <= q < columns) or not variance[p, q] > 0:
+                p = i + (sign << e if axis == 0 else 0)
+                q = c + (sign << e if axis == 1 else 0)
+                if not (0 <= p < rows and 0 <= q < columns):
+                    continue
+                if axis == 1 and not reached[p, q] and 0 <= before < rows and reached[before, q]:
+                    p = before
+                if not variance[p, q] > 0:
                     continue
                 x, y = place[1, p, q] - place[1, i, c], place[2, p, q] - place[2, i, c]
-                way = np.sqrt(x * x + y * y)
-                difference = sign * (place[0, p, q] - place[0, i, c])
-                neighbours = e == 0 or (e == 1 and axis == 0)
-                bound = slope * way + OUTLIER * noise + _JUMP * least
-                if neighbours and abs(difference) > bound:
+                way, up = np.sqrt(x * x + y * y), place[0, p, q] - place[0, i, c]
+                if way > _WAY:
+                    continue
+                rise, ahead = (rise[1], sign * up), (ahead[1], way)
+                # Beyond an edge the ground below is hidden: what is next is farther than it is deep.
+                if not (e == 0 or (near and way < least) or reached[p, q]):
+                    continue
+                off = OUTLIER * noise + _JUMP * least if near else CLEARLY * noise
+                if abs(up) > slope * way + off:
                     return False
-                if sign < 0:
-                    rise, ahead = difference, way
-                else:
-                    fall, back = difference, way
-            if min(ahead, back) < least / 2 or max(ahead, back) > _WAY:
-                continue
-            up = 1.0 if rise + fall > 0 else -1.0
-            both = min(up * rise / ahead, up * fall / back)
-            if both > slope and abs(rise + fall) > slope * (ahead + back) + CLEARLY * noise:
-                return False
+            if min(ahead) > least / 2:
+                total = abs(rise[0] + rise[1])
+                both = min(abs(rise[0]) / ahead[0], abs(rise[1]) / ahead[1])
+                long = slope * (ahead[0] + ahead[1]) + CLEARLY * noise
+                if rise[0] * rise[1] > 0 and both > slope and total > long:
+                    return False
     return True
 
 

@@ -206,7 +206,7 @@ def _smoothed(
     place = cells.place.astype(np.float64)
     there = cells.inverse > 0
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
-    variance = np.where(there, cells.error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
+    variance = np.where(there & ~cells.mixed, cells.error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
     noisy = variance > (least / 8) ** 2
     if noisy.any():
         lowest = np.float32(-1e4)
