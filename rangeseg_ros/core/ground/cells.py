@@ -20,7 +20,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
 # Rows of an image whose cells are 1 x 4 pixels.
-_ROWS = 240
+_ROWS = 120
 
 
 class CellSize(NamedTuple):
@@ -33,7 +33,7 @@ class CellSize(NamedTuple):
     def for_image(cls, shape: tuple[int, int]) -> CellSize:
         """2 x 8 for 640 x 480, more for larger images, 1 x 4 for small ones."""
         rows = max(shape[0] // _ROWS, 1)
-        return cls(rows, 4 * rows)
+        return cls(rows, 2 * rows)
 
     def enlarged(self, cells: NDArray, shape: tuple[int, int]) -> NDArray:
         """Values of cells (rows, columns) for all pixels (H, W)."""

@@ -23,7 +23,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import ray_of
 
 # Cells of a block, which is about square.
-_ROWS, _COLUMNS = 8, 2
+_ROWS, _COLUMNS = 4, 2
 # The prior counts as so much of a window full of ground: as much as the window is of the one twice
 # as wide that the prior is from.
 _PRIOR = 1 / 4

@@ -89,8 +89,9 @@ def reach(
                 if i == nearest[c] and outward and off < _START * least:
                     found = _agrees(place, i, c, plane, least)
                 else:
+                    gap = max(_GAP * length, span)
                     found = _linked(
-                        x, y, h, c, variance[i, c], span, length, sums, means, last, total,
+                        x, y, h, c, variance[i, c], span, gap, sums, means, last, total,
                         mean, plane, least, slope,
                     )  # fmt: skip
                 if found and _even(place, variance, reached, i, before, c, least, slope):
@@ -140,7 +141,7 @@ def _linked(
     c: int,
     variance: float,
     span: float,
-    length: float,
+    gap: float,
     sums: NDArray[np.float64],
     means: NDArray[np.float64],
     last: NDArray[np.float64],
@@ -165,7 +166,7 @@ def _linked(
         weight *= weight
         for n in range(4):
             mean[n] += weight * means[q, n]
-    if not near <= max(_GAP * length, span) or not mean[0] * variance > 0:
+    if not near <= gap or not mean[0] * variance > 0:
         return False
     a, b, d = solve(total, 1e-6, (2 / slope) ** 2, (0.0, plane[1], plane[2]))[:3]
     u, v, w = mean[1] / mean[0], mean[2] / mean[0], mean[3] / mean[0]
@@ -196,10 +197,13 @@ def _even(
     """
     rows, columns = variance.shape
     noise = np.sqrt(2 * variance[i, c])
+    x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
+    steepest = slope * slope
     for axis in range(2):
         for e in range(_BASELINES):
             near = e <= _NEXT[axis]
-            rise, ahead = (0.0, 0.0), (0.0, 0.0)
+            off = OUTLIER * noise + _JUMP * least if near else CLEARLY * noise
+            last, total = 0.0, np.inf
             for sign in (-1, 1):
                 p = i + (sign << e if axis == 0 else 0)
                 q = c + (sign << e if axis == 1 else 0)
@@ -209,23 +213,23 @@ def _even(
                     p = before
                 if not variance[p, q] > 0:
                     continue
-                x, y = place[1, p, q] - place[1, i, c], place[2, p, q] - place[2, i, c]
-                way, up = np.sqrt(x * x + y * y), place[0, p, q] - place[0, i, c]
-                if way > _WAY:
+                up = sign * (place[0, p, q] - h)
+                # What is level is not steep, however far away it is.
+                if abs(up) < CLEARLY * noise:
                     continue
-                rise, ahead = (rise[1], sign * up), (ahead[1], way)
+                way = (place[1, p, q] - x) ** 2 + (place[2, p, q] - y) ** 2
+                if way > _WAY * _WAY:
+                    continue
                 # Beyond an edge the ground below is hidden: what is next is farther than it is deep.
-                if not (e == 0 or (near and way < least) or reached[p, q]):
-                    continue
-                off = OUTLIER * noise + _JUMP * least if near else CLEARLY * noise
-                if abs(up) > slope * way + off:
-                    return False
-            if min(ahead) > least / 2:
-                total = abs(rise[0] + rise[1])
-                both = min(abs(rise[0]) / ahead[0], abs(rise[1]) / ahead[1])
-                long = slope * (ahead[0] + ahead[1]) + CLEARLY * noise
-                if rise[0] * rise[1] > 0 and both > slope and total > long:
-                    return False
+                if e == 0 or (near and way < least * least) or reached[p, q]:
+                    more = abs(up) - off
+                    if more > 0 and more * more > steepest * way:
+                        return False
+                if 4 * way > least * least and up * up > steepest * way:
+                    way = np.sqrt(way)
+                    if up * last > 0 and abs(up + last) > slope * (way + total) + CLEARLY * noise:
+                        return False
+                    last, total = up, way
     return True
 
 

@@ -293,15 +293,15 @@ def _with_ground(
         relief = np.where(count > 0, squares / count, 0)
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
     beside = cv2.dilate(reached.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    flat = np.clip(noise, _FLAT * limits.least, _NEAR * limits.least)
+    flat = np.clip(noise, _FLAT * limits.least, limits.least)
     flat = np.where(reached, flat, np.minimum(flat, limits.least / 2))
     share = np.where(reached, np.float32(_NEAR), np.float32(_APART))
     bounds = np.empty((4, *reached.shape), np.float32)
     sure = np.float32(_CERTAIN) * cells.error
     bounds[0] = -np.maximum(share * limits.drop, np.minimum(sure, _CERTAIN * limits.drop))
-    bounds[1] = np.where(beside, -flat, np.inf)
-    bounds[2] = np.where(beside, flat, -np.inf)
     bounds[3] = np.maximum(share * limits.obstacle, np.minimum(sure, _CERTAIN * limits.obstacle))
+    bounds[1] = np.where(beside, np.maximum(-flat, bounds[0]), np.inf)
+    bounds[2] = np.where(beside, np.minimum(flat, bounds[3]), -np.inf)
     classes, heights = classify(image, field, bounds)
     kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
     kind[height > bounds[3]] = OBSTACLE

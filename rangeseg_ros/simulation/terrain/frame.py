@@ -74,10 +74,6 @@ def simulate_terrain(
     size = _of(scene, piece, lambda p: p.size, 0.0)
     on_ground = terrain == GROUND
     depth[on_ground] = _on_waves(scene.waves, origin, rays[on_ground], depth[on_ground])
-    if scene.relief:
-        # Of single pixels, as of grass or gravel.
-        relief = scene.relief * np.random.default_rng([seed, 14]).standard_normal(depth.shape)
-        depth = np.where(on_ground, depth + relief / np.minimum(rays[..., 2], -0.1), depth)
     points = origin + np.where(np.isfinite(depth), depth, 1)[..., None] * rays
     height = points[..., 2] - _ground_below(scene, points)
     lifted = sum((wave.height(points) for wave in scene.waves), np.zeros(depth.shape))
@@ -87,6 +83,8 @@ def simulate_terrain(
     measured = sensor.measure(
         np.where(hidden, np.inf, depth), camera, np.random.default_rng([seed, 12])
     )
+    if scene.relief:
+        measured = _with_relief(measured, scene.relief, on_ground, rays, seed)
     terrain[(measured == 0) | ((terrain != GROUND) & (size < LEAST))] = UNKNOWN
     terrain[(terrain == DROP) & (height > -LEAST)] = UNKNOWN
     crossing, _ = cast(scene.ground, origin, rays)
@@ -97,6 +95,20 @@ def simulate_terrain(
         size.astype(np.float32),
         crossing.astype(np.float32),
     )
+
+
+def _with_relief(
+    measured: NDArray[np.uint16] | NDArray[np.float32],
+    relief: float,
+    ground: NDArray[np.bool_],
+    rays: NDArray[np.float64],
+    seed: int,
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Depth of rough ground: each pixel sees a blade or a stone `relief` (sd, m) off the ground."""
+    off = relief * np.random.default_rng([seed, 14]).standard_normal(measured.shape)
+    off *= (1000 if measured.dtype == np.uint16 else 1) / np.minimum(rays[..., 2], -0.1)
+    rough = np.maximum(measured + np.clip(off, -0.3 * measured, 0.3 * measured), 0)
+    return np.where(ground & (measured > 0), rough, measured).astype(measured.dtype)
 
 
 def _first_hit(
