@@ -90,7 +90,8 @@ def cells_of(
     sensor : SensorModel
     """
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
-    ray, (inverse, scatter) = np.empty((3, *shape), np.float32), np.empty((2, *shape), np.float32)
+    values = np.empty((6, *shape), np.float32)
+    ray, inverse, scatter = values[:3], values[3], values[4:]
     means = ray, inverse, scatter
     run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -98,10 +99,10 @@ def cells_of(
         place[:, inverse == 0] = np.nan
         # The median: a cell on a jump edge scatters by more than noise.
         variance = np.maximum(
-            random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter, 5)
+            random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter[0], 5)
         )
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
-    return Cells(ray, inverse, place, error.astype(np.float32), scatter > OUTLIER * variance)
+    return Cells(ray, inverse, place, error.astype(np.float32), (scatter > OUTLIER * variance).any(axis=0))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -116,16 +117,17 @@ def _means(
     mean: NDArray[np.float32],
     scatter: NDArray[np.float32],
 ) -> None:
-    """Of rows first...after of cells: mean ray, mean inverse range, mean square difference.
+    """Of rows first...after of cells: mean ray, mean inverse range, and the scatter of that.
 
-    Half the mean square of successive differences (von Neumann) is the variance of the noise
-    wherever the surface changes little from pixel to pixel.
+    Half the mean square of successive differences (von Neumann), along the rows, is the variance
+    of the noise wherever the surface changes little from pixel to pixel. Down the columns, where
+    ground recedes, it is that of differences about their mean.
     """
     height, width = inverse.shape
     for i in range(first, after):
         for c in range(mean.shape[1]):
-            x = y = z = total = squares = np.float32(0)
-            count = pairs = 0
+            x = y = z = total = squares = fall = falls = np.float32(0)
+            count = pairs = below = 0
             for v in range(i * size.rows, min((i + 1) * size.rows, height)):
                 before = np.float32(0)
                 for j in range(c * size.columns, min((c + 1) * size.columns, width)):
@@ -139,7 +141,12 @@ def _means(
                             squares += (value - before) * (value - before)
                             pairs += 1
                     before = value
+                    if v > i * size.rows and value > 0 and inverse[v - 1, j] > 0:
+                        step = value - inverse[v - 1, j]
+                        fall, falls, below = fall + step, falls + step * step, below + 1
             enough = 2 * count >= size.rows * size.columns
             ray[0, i, c], ray[1, i, c], ray[2, i, c] = x / count, y / count, z / count
             mean[i, c] = total / count if enough else np.float32(0)
-            scatter[i, c] = squares / (2 * pairs) if pairs > 0 else np.float32(0)
+            scatter[0, i, c] = squares / (2 * pairs) if pairs > 0 else np.float32(0)
+            down = (falls - fall * fall / below) / (2 * (below - 1)) if below > 1 else np.float32(0)
+            scatter[1, i, c] = down

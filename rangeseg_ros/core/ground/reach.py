@@ -27,6 +27,7 @@ _LONGER = 4
 _BENT, _JUMP = 0.8, 1 / 8
 # Columns on either side whose ground leads to a cell, and lengths of the mean over which it does.
 _BESIDE, _GAP = 2, 2.0
+_VOTERS = 4
 # Radius of where a chain begins, in least steps: half of a small robot.
 _START = 5
 # Cells, as powers of two, over which a slope is measured, and the longest such way, metres.
@@ -175,7 +176,16 @@ def _linked(
         return False
     if abs(h - a - b * x - d * y) >= _BENT * least or b * b + d * d >= slope * slope:
         return False
-    return abs(h - w) < slope * np.sqrt((x - u) ** 2 + (y - v) ** 2) + noise
+    if abs(h - w) >= slope * np.sqrt((x - u) ** 2 + (y - v) ** 2) + noise:
+        return False
+    # Most of the columns agree: one that noise leads across an edge leads no others.
+    votes = 0
+    for q in range(max(c - _VOTERS, 0), min(c + _VOTERS + 1, len(last))):
+        if means[q, 0] > 0:
+            u, v, w = means[q, 1] / means[q, 0], means[q, 2] / means[q, 0], means[q, 3] / means[q, 0]
+            if (x - u) ** 2 + (y - v) ** 2 < _WAY * _WAY:
+                votes += 1 if abs(h - w - b * (x - u) - d * (y - v)) < least / 2 else -1
+    return votes > 0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

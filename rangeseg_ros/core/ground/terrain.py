@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.ground.estimate import Continuation, Stand, continued, first_plane
+from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued, first_plane
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -31,7 +31,9 @@ _FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
 _RELIEF = (9, 25)
 # Surfaces that are tried, the nearest first, until one agrees with the stated height.
 _TRIALS = 3
-SURE = 0.97
+# Metres: what is smaller is no floor, such as a hand or a fork before the camera.
+_SMALL = 0.25
+SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
 FURNITURE = 2.0
 """Metres: what is longer, along or across the view, is no table (without a stated height)."""
@@ -192,6 +194,8 @@ def _upright(
         if sure:
             stand = Stand(1, _theta(found, height, up), found.confidence)
             return _with_ground(image, cells, size, reached, stand, up, limits, turned)
+        if found.size > _SMALL and abs(found.plane[0]) < HIGHEST:
+            break  # it may be the robot's own floor, by another height than the stated one
         left[reached] = 0
     return _without_ground(image, cells, size, seen, up, known, limits)
 
