@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.ground.crossings import drops, outlines, unseen
+from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.ideal import Ideal

@@ -11,15 +11,22 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.ground.crossings import drops, outlines, unseen
-from rangeseg_ros.core.ground.points import points_of_class
+from rangeseg_ros.core.ground.grid import empty_grid
+from rangeseg_ros.core.ground.points import drops, outlines, points_of_class, unseen
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.messages.clouds import planes_message, points_message
+from rangeseg_ros.messages.clouds import (
+    grid_points_message,
+    planes_message,
+    points_message,
+    stairs_message,
+)
+from rangeseg_ros.messages.grids import GRID, grid_header, grid_message, grid_points
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
 from rangeseg_ros.messages.marker_bytes import markers_bytes
@@ -113,11 +120,31 @@ def _crossings(
     find: Callable[[RangeImage, Terrain], NDArray[np.float32]],
 ) -> Any:
     found = _NONE if result.ground is None else find(image, result.ground)
-    return points_message(make, header, found)
+    # However many: none of them is left out where there is no other near it.
+    return points_message(make, header, thinned(found, _resolution(result), len(found)))
 
 
 def _points(image: RangeImage, result: Segmentation, kind: int) -> NDArray[np.float32]:
-    return _NONE if result.ground is None else points_of_class(image, result.ground, kind)
+    if result.ground is None:
+        return _NONE
+    return thinned(points_of_class(image, result.ground, kind), _resolution(result))
+
+
+def _resolution(result: Segmentation) -> float:
+    return result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+
+
+def _grid(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return grid_message(make, header, result.grid or empty_grid())
+
+
+def _grid_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    grid = result.grid or empty_grid()
+    return grid_points_message(make, grid_header(make, header, grid), grid_points(grid))
+
+
+def _stairs_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return stairs_message(make, header, result.stairs)
 
 
 def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
@@ -147,6 +174,9 @@ OUTPUTS = {
     'edges': Output('sensor_msgs/msg/Image', _edges),
     'outline': _of_markers(_outline),
     'stairs': _of_markers(_stairs),
+    'stairs_points': Output('sensor_msgs/msg/PointCloud2', _stairs_points),
+    'grid': Output(GRID, _grid),
+    'grid_points': Output('sensor_msgs/msg/PointCloud2', _grid_points),
     'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
 }
 

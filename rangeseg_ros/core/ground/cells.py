@@ -102,7 +102,8 @@ def cells_of(
             random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter[0], 5)
         )
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
-    return Cells(ray, inverse, place, error.astype(np.float32), (scatter > OUTLIER * variance).any(axis=0))
+    mixed = (scatter > OUTLIER * variance).any(axis=0)
+    return Cells(ray, inverse, place, error.astype(np.float32), mixed)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -148,5 +149,5 @@ def _means(
             ray[0, i, c], ray[1, i, c], ray[2, i, c] = x / count, y / count, z / count
             mean[i, c] = total / count if enough else np.float32(0)
             scatter[0, i, c] = squares / (2 * pairs) if pairs > 0 else np.float32(0)
-            down = (falls - fall * fall / below) / (2 * (below - 1)) if below > 1 else np.float32(0)
-            scatter[1, i, c] = down
+            falls -= fall * fall / max(below, 1)
+            scatter[1, i, c] = falls / (2 * max(below - 1, 1))

@@ -88,8 +88,8 @@ def ground_field(
         theta = _fitted(sums, theta)
     rows, columns = ground.shape
     large = (theta.shape[1] * _COLUMNS, theta.shape[0] * _ROWS)
-    spread = cv2.resize(theta.astype(np.float32), large, interpolation=cv2.INTER_LINEAR)
-    planes = np.ascontiguousarray(spread[:rows, :columns].transpose(2, 0, 1))
+    spread = cv2.resize(theta, large, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    planes = np.ascontiguousarray(spread.transpose(2, 0, 1), np.float32)
     return GroundField(planes, size, up)
 
 

@@ -11,21 +11,14 @@ from collections.abc import Callable
 
 from rangeseg_ros.core.ground.terrain import Terrain
 
-# From this confidence on a height is worth remembering: most of the half that remains of it for a
-# surface which fills the view.
-_SURE = 0.4
-# Share of the newest image in what is remembered.
-_NEWEST = 0.2
 
-
-class GroundMemory:
+class HeightMemory:
     """Height of one camera above the ground.
 
     Parameters
     ----------
     patience : float
-        Seconds for which a surface farther below, with none at the remembered height in view,
-        must be seen to be the ground. A surface less far below, such as a table, never is.
+        Seconds for which it holds while the ground is out of view.
     """
 
     def __init__(self, patience: float) -> None:
@@ -35,7 +28,7 @@ class GroundMemory:
     def forget(self) -> None:
         """Know nothing."""
         self._height = 0.0
-        self._doubted: int | None = None
+        self._stamp = 0
 
     def terrain(
         self, find: Callable[[tuple[float, float]], Terrain], doubt: float, stamp: int
@@ -52,26 +45,10 @@ class GroundMemory:
         stamp : int
             Of the image, nanoseconds.
         """
-        if not self._height:
-            return self._remembered(find((0.0, 0.0)))
-        found = find((self._height, doubt))
-        if found.stand.surface:
-            return self._remembered(found)
-        other = find((0.0, 0.0))
-        deeper = other.stand.height(other.field.up) > self._height + 2 * doubt
-        if not deeper or other.stand.confidence < _SURE:
-            self._doubted = None
-        elif self._doubted is None:
-            self._doubted = stamp
-        elif stamp - self._doubted > 1e9 * self.patience:
+        if stamp - self._stamp > 1e9 * self.patience:
             self.forget()
-            return self._remembered(other)
+        found = find((self._height, doubt) if self._height else (0.0, 0.0))
+        if found.stand.surface:
+            self._height, self._stamp = found.stand.height(found.field.up), stamp
+            return found
         return found._replace(remembered=self._height)
-
-    def _remembered(self, found: Terrain) -> Terrain:
-        if found.stand.surface and found.stand.confidence >= _SURE:
-            height = found.stand.height(found.field.up)
-            share = _NEWEST if self._height else 1.0
-            self._height += share * (height - self._height)
-            self._doubted = None
-        return found

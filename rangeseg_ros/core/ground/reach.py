@@ -27,6 +27,7 @@ _LONGER = 4
 _BENT, _JUMP = 0.8, 1 / 8
 # Columns on either side whose ground leads to a cell, and lengths of the mean over which it does.
 _BESIDE, _GAP = 2, 2.0
+# Columns on either side of which most must agree with a link, and how far away, metres.
 _VOTERS = 4
 # Radius of where a chain begins, in least steps: half of a small robot.
 _START = 5
@@ -82,7 +83,7 @@ def reach(
                     continue
                 x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
                 noise = np.sqrt(variance[i, c])
-                # A chain that comes back must be sure: it has passed where noise is as high as steps.
+                # What comes back has passed where noise is as high as steps: it must be sure.
                 if not outward and OUTLIER * noise > least / 2:
                     continue
                 span = length * max(1.0, 1.5 * noise / (least * _QUARTER))
@@ -182,7 +183,8 @@ def _linked(
     votes = 0
     for q in range(max(c - _VOTERS, 0), min(c + _VOTERS + 1, len(last))):
         if means[q, 0] > 0:
-            u, v, w = means[q, 1] / means[q, 0], means[q, 2] / means[q, 0], means[q, 3] / means[q, 0]
+            u, v = means[q, 1] / means[q, 0], means[q, 2] / means[q, 0]
+            w = means[q, 3] / means[q, 0]
             if (x - u) ** 2 + (y - v) ** 2 < _WAY * _WAY:
                 votes += 1 if abs(h - w - b * (x - u) - d * (y - v)) < least / 2 else -1
     return votes > 0
@@ -230,7 +232,7 @@ def _even(
                 way = (place[1, p, q] - x) ** 2 + (place[2, p, q] - y) ** 2
                 if way > _WAY * _WAY:
                     continue
-                # Beyond an edge the ground below is hidden: what is next is farther than it is deep.
+                # Beyond an edge the ground is hidden: what is next is farther than it is deep.
                 if e == 0 or (near and way < least * least) or reached[p, q]:
                     more = abs(up) - off
                     if more > 0 and more * more > steepest * way:

@@ -78,6 +78,8 @@ class CellTerrain(NamedTuple):
         See `classes`.
     unsure : (...) float32
         The noise of a pixel's height, metres.
+    crossing : (2, ...) float32
+        Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     turned : bool
         Whether up is down along the columns.
     """
@@ -86,6 +88,7 @@ class CellTerrain(NamedTuple):
     height: NDArray[np.float32]
     kind: NDArray[np.int8]
     unsure: NDArray[np.float32]
+    crossing: NDArray[np.float32]
     turned: bool
 
 
@@ -210,7 +213,8 @@ def _smoothed(
     place = cells.place.astype(np.float64)
     there = cells.inverse > 0
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
-    variance = np.where(there & ~cells.mixed, cells.error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
+    square = cells.error.astype(np.float64) ** 2
+    variance = np.where(there & ~cells.mixed, square * share + 1e-8, 0.0)
     noisy = variance > (least / 8) ** 2
     if noisy.any():
         lowest = np.float32(-1e4)
@@ -310,7 +314,12 @@ def _with_ground(
     kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
     kind[height > bounds[3]] = OBSTACLE
     kind[height < bounds[0]] = DROP
-    below = CellTerrain(cells.place, height, kind, sure, turned)
+    along = (field.theta * cells.ray).sum(axis=0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        flat_axes = axes_of(up)[1:].astype(np.float32)
+        along[along <= 0] = np.nan
+        crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
+    below = CellTerrain(cells.place, height, kind, sure, crossing, turned)
     return Terrain(classes, heights, stand, field, below)
 
 

@@ -104,11 +104,13 @@ def _with_relief(
     rays: NDArray[np.float64],
     seed: int,
 ) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Depth of rough ground: each pixel sees a blade or a stone `relief` (sd, m) off the ground."""
+    """Depth of rough ground: each pixel sees a stone or a blade of grass, `relief` (sd, m)."""
     off = relief * np.random.default_rng([seed, 14]).standard_normal(measured.shape)
     off *= (1000 if measured.dtype == np.uint16 else 1) / np.minimum(rays[..., 2], -0.1)
     rough = np.maximum(measured + np.clip(off, -0.3 * measured, 0.3 * measured), 0)
-    return np.where(ground & (measured > 0), rough, measured).astype(measured.dtype)
+    result = measured.copy()
+    result[ground & (measured > 0)] = rough[ground & (measured > 0)]
+    return result
 
 
 def _first_hit(

@@ -49,7 +49,8 @@ def _strip(site: Site) -> None:
     """The edge a few centimetres inside the view."""
     site.height, site.pitch, site.roll = 0.8, site.random.uniform(26, 30), 0.0
     near = site.height / np.tan(np.radians(site.pitch + 21))
-    _edge(site, near + site.random.uniform(0.03, 0.15), float(site.random.choice([0.06, 0.08, 0.1])))
+    depth = float(site.random.choice([0.06, 0.08, 0.1]))
+    _edge(site, near + site.random.uniform(0.03, 0.15), depth)
 
 
 def _wrong_height(site: Site) -> None:
