@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.ground.grid import empty_grid
-from rangeseg_ros.core.ground.points import drops, outlines, points_of_class, unseen
+from rangeseg_ros.core.ground.points import drops, outlines, points_of_class, thinned, unseen
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.placement import moved_planes
