@@ -23,6 +23,8 @@ from rangeseg_ros.core.significance import SAMPLES
 _WAYS = (0.4, 0.8, 1.6, 3.2)
 # How often there is a step out of view between a robot and the ground it sees, and the highest.
 _STEPS, HIGHEST = 0.1, 0.35
+# Metres: what is smaller is no floor, such as a hand or a fork before the camera.
+_SMALL = 0.25
 
 
 class Stand(NamedTuple):
@@ -69,6 +71,11 @@ class Continuation(NamedTuple):
     error: float
     confidence: float
     size: float
+
+    def behind_step(self, nearer: Continuation, highest: float) -> bool:
+        """Whether nearer ground may be the robot's own, and this one a step of it, metres."""
+        apart = abs(self.plane[0] - nearer.plane[0])
+        return nearer.size > _SMALL and apart < highest
 
 
 def no_step(a: float, sd: float, least: float) -> float:

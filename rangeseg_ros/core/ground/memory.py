@@ -11,6 +11,9 @@ from collections.abc import Callable
 
 from rangeseg_ros.core.ground.terrain import Terrain
 
+# Share of the newest image in what is remembered.
+_NEWEST = 0.2
+
 
 class HeightMemory:
     """Height of one camera above the ground.
@@ -18,7 +21,8 @@ class HeightMemory:
     Parameters
     ----------
     patience : float
-        Seconds for which it holds while the ground is out of view.
+        Seconds for which a surface farther below, with none at the remembered height in view,
+        must be seen to be the ground. A surface less far below, such as a table, never is.
     """
 
     def __init__(self, patience: float) -> None:
@@ -28,7 +32,7 @@ class HeightMemory:
     def forget(self) -> None:
         """Know nothing."""
         self._height = 0.0
-        self._stamp = 0
+        self._doubted: int | None = None
 
     def terrain(
         self, find: Callable[[tuple[float, float]], Terrain], doubt: float, stamp: int
@@ -45,10 +49,26 @@ class HeightMemory:
         stamp : int
             Of the image, nanoseconds.
         """
-        if stamp - self._stamp > 1e9 * self.patience:
-            self.forget()
-        found = find((self._height, doubt) if self._height else (0.0, 0.0))
+        if not self._height:
+            return self._remembered(find((0.0, 0.0)))
+        found = find((self._height, doubt))
         if found.stand.surface:
-            self._height, self._stamp = found.stand.height(found.field.up), stamp
-            return found
+            return self._remembered(found)
+        other = find((0.0, 0.0))
+        deeper = other.stand.height(other.field.up) > self._height + 2 * doubt
+        if not deeper:
+            self._doubted = None
+        elif self._doubted is None:
+            self._doubted = stamp
+        elif stamp - self._doubted > 1e9 * self.patience:
+            self.forget()
+            return self._remembered(other)
         return found._replace(remembered=self._height)
+
+    def _remembered(self, found: Terrain) -> Terrain:
+        if found.stand.surface:
+            height = found.stand.height(found.field.up)
+            share = _NEWEST if self._height else 1.0
+            self._height += share * (height - self._height)
+            self._doubted = None
+        return found

@@ -79,14 +79,17 @@ def reach(
             before = i - 1 if outward == turned else i + 1
             for n in range(columns):
                 c = n if m % 2 == 0 else columns - 1 - n
-                if reached[i, c] or not variance[i, c] > 0:
+                if not variance[i, c] > 0:
                     continue
                 x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
                 noise = np.sqrt(variance[i, c])
+                span = length * max(1.0, 1.5 * noise / (least * _QUARTER))
+                if reached[i, c]:
+                    _add(x, y, h, 1 / variance[i, c], span, sums[c], means[c], last[c])
+                    continue
                 # What comes back has passed where noise is as high as steps: it must be sure.
                 if not outward and OUTLIER * noise > least / 2:
                     continue
-                span = length * max(1.0, 1.5 * noise / (least * _QUARTER))
                 off = np.sqrt((x - x_first) ** 2 + (y - y_first) ** 2)
                 if i == nearest[c] and outward and off < _START * least:
                     found = _agrees(place, i, c, plane, least)

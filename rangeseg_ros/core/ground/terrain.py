@@ -31,11 +31,9 @@ _FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
 _RELIEF = (9, 25)
 # Surfaces that are tried, the nearest first, until one agrees with the stated height.
 _TRIALS = 3
-# Metres: what is smaller is no floor, such as a hand or a fork before the camera.
-_SMALL = 0.25
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
-FURNITURE = 2.0
+FURNITURE = 1.5
 """Metres: what is longer, along or across the view, is no table (without a stated height)."""
 
 
@@ -178,29 +176,27 @@ def _upright(
     height, height_sd = known
     height = height or _lowest(place, variance, turned)
     place[0] += height
-    seen, left = None, variance.copy()
-    for _ in range(_TRIALS if height_sd > 0 else 1):
+    seen: list[Continuation] = []
+    left = variance.copy()
+    for _ in range(_TRIALS):
         reached = _reach(place, left, height_sd, limits, turned)
         if not reached.any():
             break
         smooth = _smooth_variance(place[:, reached], height, sensor, size)
-        found = continued(
-            place[:, reached],
-            4 * variance[reached] + smooth,
-            height_sd,
-            float(np.tan(limits.slope)),
-            limits.least,
-        )
-        seen = seen or found
+        error = 4 * variance[reached] + smooth
+        slope = float(np.tan(limits.slope))
+        found = continued(place[:, reached], error, height_sd, slope, limits.least)
         # Without a height the ground is what the camera stands on: a table tells by its size.
         sure = found.confidence >= SURE if height_sd > 0 else found.size >= FURNITURE
-        if sure:
+        # What is nearer may be the robot's own floor, by another height than the stated one.
+        highest = HIGHEST if height_sd > 0 else np.inf
+        if sure and not any(found.behind_step(nearer, highest) for nearer in seen):
             stand = Stand(1, _theta(found, height, up), found.confidence)
             return _with_ground(image, cells, size, reached, stand, up, limits, turned)
-        if found.size > _SMALL and abs(found.plane[0]) < HIGHEST:
-            break  # it may be the robot's own floor, by another height than the stated one
+        seen.append(found)
         left[reached] = 0
-    return _without_ground(image, cells, size, seen, up, known, limits)
+    nearest = seen[0] if seen else None
+    return _without_ground(image, cells, size, nearest, up, known, limits)
 
 
 def _smoothed(
