@@ -150,8 +150,9 @@ def first_plane(
             if i < 0:
                 continue
             x, y, h = place[1, i, k], place[2, i, k], place[0, i, k]
-            off = 2 * (h - a - b * x - c * y) / least
-            add_point(total, x, y, h, 1 / (variance[i, k] + (least / 4) ** 2) / (1 + off * off))
+            # Geman and McClure's weights: those of another surface vanish.
+            off = 1 + (2 * (h - a - b * x - c * y) / least) ** 2
+            add_point(total, x, y, h, 1 / (variance[i, k] + (least / 4) ** 2) / (off * off))
         # What they err by, they have in common: as many as tell a plane.
         total *= SAMPLES / len(nearest)
         a, b, c, _ = solve(total, errors[0] ** -2.0, errors[1] ** -2.0, (0.0, 0.0, 0.0))

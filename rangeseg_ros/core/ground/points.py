@@ -92,7 +92,7 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
             opened[~completed[1]] = 0
     if not len(seen):
         return np.zeros((0, 4), np.float32)
-    return _crossings(rays, image, terrain, opened > 0, (seen.min(), seen.max()))
+    return _crossings(rays, image, terrain, opened > 0, (float(seen.min()), float(seen.max())))
 
 
 def _crossings(

@@ -319,6 +319,20 @@ def _with_ground(
     return Terrain(classes, heights, stand, field, below)
 
 
+def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
+    """Cells (rows, columns) of surfaces that rise away from the camera more steeply than ground."""
+    steep = np.zeros(cells.inverse.shape, np.bool_)
+    if len(steep) < 3:
+        return steep
+    rise = np.abs(cells.place[0, 2:] - cells.place[0, :-2])
+    way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
+    noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
+    # Three times as steep as any ground, as what is hidden behind an edge is not.
+    steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
+    steep[0], steep[-1] = steep[1], steep[-2]
+    return steep
+
+
 def _without_ground(
     image: RangeImage,
     cells: Cells,
@@ -330,20 +344,24 @@ def _without_ground(
 ) -> Terrain:
     """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
     height, height_sd = known
-    classes = np.zeros(image.shape, np.uint8)
     reasons: tuple[str, ...] = ()
+    obstacle = _faces(cells, limits)
     if height > 0:
-        apart = abs(seen.plane[0]) if seen else 0.0
+        # What is higher than any step is none, nor the ground by a wrong height.
+        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
         distance = np.hypot(cells.place[1], cells.place[2])
         bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
-        above = size.enlarged(cells.place[0] + height > bound, image.shape)
-        classes = np.where(image.valid & above, OBSTACLE, UNKNOWN).astype(np.uint8)
+        obstacle |= cells.place[0] + height > bound
+    wide = size.enlarged(obstacle, image.shape)
+    classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
     if seen and height > 0:
-        reasons = (
-            f'the stated height is {height:.2f} m, the ground seen is '
-            f'{height - seen.plane[0]:.2f} m below, {abs(seen.plane[0]) / seen.error:.0f} sd: a '
-            'step or ramp out of view, or a wrong height',
-        )
+        off, below = abs(seen.plane[0]), height - seen.plane[0]
+        why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
+        if off > _CERTAIN * seen.error:
+            why += f', {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
+        else:
+            why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
+        reasons = (why,)
     elif seen:
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
