@@ -101,7 +101,7 @@ class FrameStatistics:
     sources : dict of str
         What up, fixed frame, target frame and map of the last frame come from.
     no_terrain : str
-        Why there is no terrain, as up is not known; empty where it is.
+        Why there is no terrain: up is not known, or not where it is said; empty where there is.
     missing : str
         Which frames of the parameters were not known for the last frame, and why.
     found : Segmentation or None
@@ -233,8 +233,6 @@ class FrameStatistics:
             return DiagnosticStatus.WARN, self.missing
         if found and not found.verdict.ok:
             return DiagnosticStatus.WARN, str(found.verdict)
-        if found and found.tilt:
-            return DiagnosticStatus.WARN, str(found.tilt)
         if found and not found.planes:
             return DiagnosticStatus.WARN, f'no planes: {found.reason}'
         count = len(found.planes) if found else 0

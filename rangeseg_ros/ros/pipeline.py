@@ -201,12 +201,14 @@ class Pipeline:
         lost = ''
         if config.gravity_frame:
             lost = self._up.hold(at, work.frame.stamp, config.track_time)
-        self._statistics.no_terrain = lost
         placed = work.frame.stamp, at.up, at.pose, at.height
         if found is None:
             found = sequence.segment(image, *placed)
         else:
             found = sequence.follow(found, image, *placed)
+        if not lost and found.tilt:
+            lost = f'no terrain: {found.tilt}'
+        self._statistics.no_terrain = lost
         if lost:
             found = replace(found, survey=None)
         self._tell(sequence, at)

@@ -75,9 +75,9 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
     """Crossings of rays without a measurement, as `_crossings`.
 
     As far as ground is seen, reached or not, and not nearer: no sensor sees below its own nearest
-    or farthest range. Not where the robot's own body is in the way. Single pixels do not count: sensors miss
-    some everywhere. Clouds do not tell the rays of what they have not measured: those between
-    measured points, where their grid is smooth (see `completed_rays`).
+    or farthest range. Not where the robot's own body is in the way. Single pixels do not count:
+    sensors miss some everywhere. Clouds do not tell the rays of what they have not measured:
+    those between measured points, where their grid is smooth (see `completed_rays`).
     """
     seen = image.inverse[(terrain.classes <= GROUND) & image.valid]
     missing = ~image.valid if image.body is None else ~(image.valid | image.body)

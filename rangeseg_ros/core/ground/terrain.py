@@ -320,7 +320,7 @@ def _with_ground(
 
 
 def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
-    """Cells (rows, columns) of surfaces that rise away from the camera more steeply than ground."""
+    """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:
         return steep
@@ -362,6 +362,8 @@ def _without_ground(
         else:
             why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
         reasons = (why,)
+    elif height > 0:
+        reasons = (f'no ground that is seen is {height:.2f} m below, as is stated',)
     elif seen:
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0

@@ -62,7 +62,7 @@ class Terrain:
     Attributes
     ----------
     kind : str
-        Of `KINDS`.
+        Of `KINDS` or `HARD`.
     pieces : tuple of Piece
     ground : tuple of Solid
         The ground continued, without holes and edges.
@@ -71,6 +71,10 @@ class Terrain:
         Added to the ground.
     stairs : dict
         `direction`, `count`, `rise`, `run` of a staircase; empty without one.
+    errors : (float, float)
+        Of what the robot is told: degrees of up about each axis, metres of the height.
+    relief : float
+        Standard deviation of the height of rough ground, metres.
     """
 
     kind: str
