@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rangeseg_ros.core.config import Config
     from rangeseg_ros.core.description.planes import Plane
+    from rangeseg_ros.core.ground.roles import ROLES
     from rangeseg_ros.core.mapping.transforms import Transform
-    from rangeseg_ros.core.meaning.roles import ROLES
     from rangeseg_ros.core.options import ConfigError
     from rangeseg_ros.core.segmentation import Segmentation
     from rangeseg_ros.core.segmenter import Segmenter
@@ -50,7 +50,7 @@ _HOMES = {
     'core.config': ('Config',),
     'core.description.planes': ('Plane',),
     'core.mapping.transforms': ('Transform',),
-    'core.meaning.roles': ('ROLES',),
+    'core.ground.roles': ('ROLES',),
     'core.options': ('ConfigError',),
     'core.segmentation': ('Segmentation',),
     'core.segmenter': ('Segmenter',),

@@ -5,9 +5,9 @@ import pytest
 from clouds import cloud_of
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.meaning.class_points import points_of_class
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
-from rangeseg_ros.core.meaning.survey import Survey
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.points import points_of_class
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel

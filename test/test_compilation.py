@@ -81,7 +81,7 @@ def test_labels_and_planes_need_less():
         for outputs in (FIRST, tuple(OUTPUTS))
     )
     assert first < every
-    assert not any('.meaning.' in module for module, *_ in first)
+    assert not any('.ground.' in module for module, *_ in first)
 
 
 def test_without_processes_it_is_compiled_all_the_same(monkeypatch):

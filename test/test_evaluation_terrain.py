@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.cameras import write_camera
 
@@ -134,12 +134,10 @@ def test_the_table_tells_the_kinds_apart(drawn, evaluate):
 
 
 def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate):
-    """A height of 3 m makes the pit the ground, and all else obstacles."""
+    """Nothing is ground where a height of 3 m contradicts the floor that is seen 2 m below."""
     text = (drawn / 'terrain.csv').read_text()
     (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,3,'))
-    pit = {'ground_kept': 140 / 1080, 'ground_called_obstacle': 940 / 1080}
-    near = evaluate(drawn)[1]['by_kind']['near']
-    assert {name: near[name] for name in pit} == pytest.approx(pit)
+    assert evaluate(drawn)[1]['by_kind']['near']['ground_kept'] == 0
     assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
 
 
@@ -208,4 +206,4 @@ def test_a_simulated_set_is_measured(run, evaluate, tmp_path):
     assert list(figures['per_image']) == [f'{number:06d}' for number in range(6)]
     assert list(figures['by_kind']) == ['clutter', 'drop', 'hole', 'low boxes', 'room', 'waves']
     pooled = figures['pooled']
-    assert min(pooled[name] for name in ('ground_kept', 'obstacle_found', 'drop_found')) > 0.99
+    assert min(pooled[name] for name in ('ground_kept', 'obstacle_found', 'drop_found')) > 0.98

@@ -46,9 +46,3 @@ def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
         found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
         assert found.level == level and found.message == 'What it is.'
         assert {value.key: value.value for value in found.values}['input'] == 'What it is.'
-
-
-def test_a_tilt_is_a_warning():
-    found = status(found=result(tilt='the camera looks tilted by 20 degrees'))
-    assert found.level == DiagnosticStatus.WARN
-    assert found.message == 'the camera looks tilted by 20 degrees'

@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
 from rangeseg_ros.cli.segment import command
-from rangeseg_ros.core.meaning.crossings import unseen
+from rangeseg_ros.core.ground.points import unseen
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
 

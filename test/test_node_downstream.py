@@ -15,8 +15,8 @@ from sensor_msgs.msg import Imu
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, planes_from_message
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.messages.clouds import points_from_message
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import OUTPUTS

@@ -25,7 +25,7 @@ from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros import Config, planes_from_message
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -38,9 +38,9 @@ PITCH, HEIGHT, BASE = np.radians(35), 1.2, 0.3
 FRAMES = {'gravity_frame': 'base_footprint', 'target_frame': 'base_link', 'fixed_frame': 'odom'}
 
 
-def floor_depth(camera):
+def floor_depth(camera, pitch=PITCH):
     """Depth of the ground, millimetres; 0 above the horizon."""
-    down = camera.rays @ np.array([0, np.cos(PITCH), np.sin(PITCH)])
+    down = camera.rays @ np.array([0, np.cos(pitch), np.sin(pitch)])
     with np.errstate(divide='ignore'):
         depth = np.where(down > 0.1, HEIGHT / down, 0)
     return np.round(1000 * depth).astype(np.uint16)
@@ -237,6 +237,43 @@ def test_two_cameras_in_one_fixed_frame_have_a_node_and_a_map_each(tf_messages):
         )
         # Each has what its camera has seen.
         assert floor['y'] == pytest.approx(y, abs=0.2)
+
+
+def test_without_an_up_there_is_no_terrain(tf_messages):
+    """Before tf has come, two seconds after it has stopped, and of a camera knocked over."""
+    options = {'gravity_frame': 'odom', 'tf_timeout': 0.1, 'track_time': 2.0}
+    arguments = [word for name, value in options.items() for word in ('-p', f'{name}:={value}')]
+    topics = 'terrain', 'obstacles', 'grid'
+
+    def published(bench, pitch=PITCH, robot=None):
+        """Ground pixels, points of obstacles and free cells of an image."""
+        image = bench.image(floor_depth(bench.camera, pitch))
+        if robot:
+            for seconds in (-0.02, 0.02):
+                robot.at(later(image.header.stamp, seconds), 0.0)
+        bench.camera_info.publish(bench.info())
+        bench.depth.publish(image)
+        terrain, obstacles, grid = (
+            bench.until(lambda name=name: bench.find(name, image)) for name in topics
+        )
+        ground = np.count_nonzero(np.frombuffer(terrain.data, np.uint8) == 1)
+        return ground, obstacles.width, grid.data.count(0)
+
+    with Bench(*arguments) as bench, bench.listening(*topics), bench.camera_on():
+        assert published(bench)[0] == 0
+        status = bench.status(lambda s: 'no terrain' in s.message)
+        assert status.level == DiagnosticStatus.ERROR and 'up is not known' in status.message
+        robot = Robot(bench, tf_messages)
+        bench.until(robot.moving.get_subscription_count)
+        bench.until(robot.static.get_subscription_count)
+        bench.repeat(lambda: None, lambda: published(bench, robot=robot)[0] > 0)
+        ground, obstacles, free = published(bench)  # tf has stopped
+        assert ground > 1000 and obstacles == 0 and free > 100
+        bench.spin(2.5)
+        assert published(bench) == (0, 0, 0)
+        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'not known' in s.message)
+        assert published(bench, PITCH + np.radians(25), robot) == (0, 0, 0)
+        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'tilted by' in s.message)
 
 
 @pytest.fixture(scope='module')

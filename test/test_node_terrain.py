@@ -11,7 +11,7 @@ from recordings import ROS2
 from ros_bench import Bench
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, corrected
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
 
@@ -21,8 +21,8 @@ CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 PITCH = np.radians(35)
 UP = np.array([0, -np.cos(PITCH), -np.sin(PITCH)])
 HEIGHT, EDGE, DEEP = 1.0, 1.8, 0.5
-STAMPED = ('terrain', 'ground', 'obstacles', 'drops', 'unseen')
-MARKERS = ('outline', 'stairs')
+STAMPED = ('terrain', 'ground', 'obstacles', 'drops', 'unseen', 'grid', 'grid_points')
+MARKERS = ('outline', 'stairs', 'stairs_points')
 
 
 def head_of_a_stair(body):

@@ -8,7 +8,7 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import find_placement, moved_planes
+from rangeseg_ros.core.mapping.placement import HeldUp, Placement, find_placement, moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -101,3 +101,17 @@ def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
     image = RangeImage.from_depth(depth, CAMERA)
     result = sequence.segment(image, 10**9, UP, height=1.0)
     assert result.survey.sensor_height == expected
+
+
+def test_the_last_up_is_held_for_seconds_and_then_lost():
+    """tf stops: what was up stays so for a while, and is not taken for a level camera's."""
+    up, held = np.array([0.0, -0.8, -0.6]), HeldUp()
+    assert 'not known' in held.hold(Placement(sources={'up': 'no tf'}), 0, 3.0)
+    assert held.hold(Placement(up=up, height=0.8), 10**9, 3.0) == ''
+    later = Placement(sources={'up': 'no tf'})
+    assert held.hold(later, 3 * 10**9, 3.0) == ''
+    assert (later.up == up).all() and later.height == 0.8
+    assert later.sources['up'] == 'held for 2.0 s: no tf'
+    lost = Placement(sources={'up': 'no tf'})
+    assert held.hold(lost, 5 * 10**9, 3.0) == 'no terrain, as up is not known: no tf'
+    assert lost.up is None

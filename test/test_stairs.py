@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.cli.segment import command
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.scenes import Pose

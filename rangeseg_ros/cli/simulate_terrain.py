@@ -14,6 +14,7 @@ from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.hard import HARD
 from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 
 
@@ -31,7 +32,8 @@ from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 @click.option(
     '--seed', type=click.IntRange(min=0), default=0, show_default=True, help='Of the first scene.'
 )
-@click.option('--kind', type=click.Choice(list(KINDS)), help='Only scenes of this kind.')
+@click.option('--kind', type=click.Choice([*KINDS, *HARD]), help='Only scenes of this kind.')
+@click.option('--hard', is_flag=True, help='Scenes that are easily confused, of all such kinds.')
 @click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own.")
 @click.option('--height', 'rows', type=click.IntRange(16, 4096), help="Rows; the sensor's own.")
 @click.option(
@@ -45,6 +47,7 @@ def command(
     scenes: int,
     seed: int,
     kind: str | None,
+    hard: bool,
     width: int | None,
     rows: int | None,
     output: Path,
@@ -65,7 +68,7 @@ def command(
     The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees. Another width keeps the
     horizontal field of view. `rangeseg evaluate OUTPUT` compares classes of pixels with the truth.
     """
-    names = [kind] if kind else list(KINDS)
+    names = [kind] if kind else list(HARD if hard else KINDS)
     camera = SENSORS[sensor](seed).camera
     camera = resize(camera, width or camera.width, rows or camera.height)
     with (

@@ -338,10 +338,10 @@ class Config:
         low=0.0,
         high=45.0,
     )
-    sensor_height_noise: float = option(
+    sensor_height_sd: float = option(
         0.015, 'standard deviation of sensor_height, metres', low=0.001, high=10.0
     )
-    up_noise: float = option(
+    up_sd: float = option(
         1.5,
         'standard deviation of the direction that is up, however it is told, degrees',
         low=0.01,
@@ -352,6 +352,29 @@ class Config:
     )
     drop_height: float = option(
         0.05, 'what lies so deep below the ground is a drop, metres', low=0.005, high=10.0
+    )
+    grid_resolution: float = option(
+        0.05, 'side of a cell of ~/grid, the ground around the robot, metres', low=0.01, high=1.0
+    )
+    grid_size: float = option(8.0, 'side of ~/grid, metres', low=0.1, high=50.0)
+    grid_memory: float = option(
+        30.0,
+        'how long ~/grid remembers what is out of sight, with fixed_frame or odometry, seconds',
+        low=0.0,
+        high=86400.0,
+    )
+    grid_clearance: float = option(
+        2.0,
+        'what hangs higher above the ground is no obstacle of ~/grid, metres',
+        low=0.0,
+        high=100.0,
+    )
+    cloud_resolution: float = option(
+        0.0,
+        'side of the cells of which ~/ground and ~/obstacles have a point, metres, more where '
+        'there would be 20 000 points or more; ~/drops has all edges of drops; 0 = all pixels',
+        low=0.0,
+        high=1.0,
     )
     seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
 
@@ -435,9 +458,15 @@ def _frames_in_seconds(frames: object) -> object:
     return frames / 30 if isinstance(frames, int | float) else frames
 
 
+def _as_it_is(value: object) -> object:
+    return value
+
+
 # Former names of parameters, their names now, and what becomes of their values.
 RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     'track_memory': ('track_time', _frames_in_seconds),
+    'sensor_height_noise': ('sensor_height_sd', _as_it_is),
+    'up_noise': ('up_sd', _as_it_is),
 }
 # Former parameters that nothing reads any more.
 DROPPED = ('warm_start',)

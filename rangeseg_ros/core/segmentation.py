@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.ground import Terrain
-from rangeseg_ros.core.meaning.ramps import Ramp, ramps_of
-from rangeseg_ros.core.meaning.stairs import Stairs, stairs_of
-from rangeseg_ros.core.meaning.survey import Survey
-from rangeseg_ros.core.meaning.tilt import Tilt, tilt_of
+from rangeseg_ros.core.ground.grid import GroundGrid
+from rangeseg_ros.core.ground.ramps import Ramp, ramps_of
+from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
+from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.ground.terrain import Terrain
+from rangeseg_ros.core.ground.tilt import Tilt, tilt_of
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -206,6 +207,13 @@ class Segmentation:
         return self.survey.terrain() if isinstance(self.survey, Survey) else self.survey
 
     @cached_property
+    def grid(self) -> GroundGrid | None:
+        """The ground around the robot, of this image and those before that were asked for it."""
+        if not isinstance(self.survey, Survey) or self.ground is None:
+            return None
+        return self.survey.ground_grid(self.ground)
+
+    @cached_property
     def stairs(self) -> list[Stairs]:
         """Staircases in sight, up and down, worked out when read."""
         if not isinstance(self.survey, Survey) or self.ground is None:
@@ -247,6 +255,6 @@ class Segmentation:
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
-        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt, 'image': None}
-        judged = {'verdict': self.verdict}
+        found = {'survey': survey, 'stairs': stairs, 'grid': self.grid, 'tilt': self.tilt}
+        judged = {'verdict': self.verdict, 'image': None}
         return {**self.__dict__, 'labelling': kept, **found, **judged}

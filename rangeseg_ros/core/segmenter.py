@@ -15,7 +15,7 @@ from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
-from rangeseg_ros.core.meaning.survey import Survey
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
 from rangeseg_ros.core.runtime.first_use import with_kernels
 from rangeseg_ros.core.runtime.loading import load_lazily

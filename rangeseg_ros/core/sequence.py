@@ -10,14 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground.grid import GridMemory
+from rangeseg_ros.core.ground.memory import HeightMemory
+from rangeseg_ros.core.ground.roles import roles, unit
+from rangeseg_ros.core.ground.survey import Survey, grid_options
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.meaning.memory import GroundMemory
-from rangeseg_ros.core.meaning.roles import roles, unit
-from rangeseg_ros.core.meaning.survey import Survey
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -49,7 +50,8 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config)
-        self._ground = GroundMemory(self.config.track_time)
+        self._height = HeightMemory(self.config.track_time)
+        self._grid = GridMemory(grid_options(self.config))
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -70,7 +72,9 @@ class SequenceSegmenter:
             self._odometry, self.motion = PlaneOdometry(config), None
         self._odometry.config = config
         self.map.config = config
-        self._ground.patience = config.track_time
+        self._height.patience = config.track_time
+        if grid_options(config) != grid_options(before) or config.map_frame != before.map_frame:
+            self._grid = GridMemory(grid_options(config))
 
     def segment(
         self,
@@ -114,7 +118,8 @@ class SequenceSegmenter:
         if stamp < self._stamp:
             self._tracker.reset()
             self.map.clear('time has gone back')
-            self._ground.forget()
+            self._height.forget()
+            self._grid.forget()
             self._pose = None
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
         sensor = Transform(np.eye(3), image.place)
@@ -141,7 +146,14 @@ class SequenceSegmenter:
             height = 0.0 if height is None else float(height + survey.up @ image.place)
             if height > 0 and not survey.sensor_height:
                 survey = replace(survey, sensor_height=height)
-            survey = replace(survey, memory=self._ground, stamp=stamp)
+            survey = replace(
+                survey,
+                memory=self._height,
+                grid=self._grid,
+                stamp=stamp,
+                pose=pose,
+                fixed_frame=self.config.map_frame,
+            )
         if image.place.any():
             planes = [
                 plane.named(id=seen.id, surface=seen.surface, role=seen.role)

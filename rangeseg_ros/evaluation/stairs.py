@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.stairs import Stairs
+from rangeseg_ros.core.ground.stairs import Stairs
 
 # Pixels from which a tread counts as in sight, and metres that its pixels are off its height.
 _FEWEST, _OFF = 300, 0.005

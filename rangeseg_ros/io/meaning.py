@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from rangeseg_ros.core.meaning.stairs import Stairs
+from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.io.files import replacing
 

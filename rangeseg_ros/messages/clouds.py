@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.roles import ROLES
+from rangeseg_ros.core.ground.roles import ROLES
+from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.messages.make import Make
 
 # One row of `~/planes`: the fields of a Plane.
@@ -47,6 +48,18 @@ PLANE_TYPE = np.dtype(
 
 _POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
 _HEIGHT_TYPE = np.dtype([*_POINT_TYPE.descr, ('height', '<f4')])
+_GRID_TYPE = np.dtype(
+    [*_POINT_TYPE.descr, ('height_variance', '<f4'), ('class', '<u4'), ('age', '<f4')]
+)
+_EDGE = tuple(f'edge_{axis}{end}' for end in (1, 2) for axis in 'xyz')
+_STAIRS_TYPE = np.dtype(
+    [
+        *_POINT_TYPE.descr,
+        *((name, '<f4') for name in (*_EDGE, 'width', 'rise', 'run')),
+        ('count', '<u4'),
+        ('direction', '<i4'),
+    ]
+)
 
 # sensor_msgs/PointField: datatype -> numpy.
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -172,6 +185,37 @@ def points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
     """sensor_msgs/PointCloud2 of points (N, 3), metres, or (N, 4) with their height."""
     kind = _POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
     return _cloud(make, header, np.ascontiguousarray(points, '<f4').view(kind)[:, 0])
+
+
+def grid_points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
+    """sensor_msgs/PointCloud2 of cells (N, 6): x, y, z, variance of the height, class, age."""
+    rows = np.empty(len(points), _GRID_TYPE)
+    for name, values in zip(_GRID_TYPE.names or (), points.T, strict=True):
+        rows[name] = values
+    return _cloud(make, header, rows)
+
+
+def stairs_message(make: Make, header: Any, stairs: Sequence[Stairs]) -> Any:
+    """sensor_msgs/PointCloud2 with a point per staircase, in the middle of its first edge.
+
+    Its fields are those of the table of stairs; `direction` is 1 for up and -1 for down.
+    """
+    rows = np.array(
+        [
+            (
+                *seen.edge.mean(axis=0).tolist(),
+                *seen.edge.ravel().tolist(),
+                seen.width,
+                seen.rise,
+                seen.run,
+                seen.count,
+                1 if seen.direction == 'up' else -1,
+            )
+            for seen in stairs
+        ],
+        _STAIRS_TYPE,
+    )
+    return _cloud(make, header, rows)
 
 
 def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:

@@ -23,22 +23,26 @@ Make = Callable[..., Any]
 def make_rclpy(kind: str, **fields: Any) -> Any:
     """Make a message of the sourced ROS installation, or of the wheels."""
     cls, octets = _class_and_octets(kind)
-    for name, many in octets:
-        if many:
+    for name, code in octets:
+        if code:
             # rclpy takes an array of bytes as it is, and a numpy array octet by octet.
-            data, fields[name] = fields[name], array('B')
+            data, fields[name] = fields[name], array(code)
             fields[name].frombytes(np.ascontiguousarray(data))
         else:
             fields[name] = bytes([fields[name]])
     return cls(**fields)
 
 
+# Types of fields that are octets, and the codes of their arrays.
+_OCTETS = {'octet': '', 'sequence<uint8>': 'B', 'sequence<int8>': 'b'}
+
+
 @cache
-def _class_and_octets(kind: str) -> tuple[type, list[tuple[str, bool]]]:
-    """Class of rclpy, and its fields that are octets: name, and whether they are many."""
+def _class_and_octets(kind: str) -> tuple[type, list[tuple[str, str]]]:
+    """Class of rclpy, and its fields that are octets with the codes of their arrays."""
     cls: Any = message_class(kind)
     types = cls.get_fields_and_field_types().items()
-    return cls, [(n, t != 'octet') for n, t in types if t in ('octet', 'sequence<uint8>')]
+    return cls, [(name, _OCTETS[kind]) for name, kind in types if kind in _OCTETS]
 
 
 @cache

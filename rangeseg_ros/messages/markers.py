@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.ramps import Ramp
-from rangeseg_ros.core.meaning.stairs import Stairs
+from rangeseg_ros.core.ground.ramps import Ramp
+from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.drawing import colours
 
 # visualization_msgs/Marker: type and action.

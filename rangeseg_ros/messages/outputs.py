@@ -10,16 +10,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.grid import empty_grid
+from rangeseg_ros.core.ground.points import drops, outlines, points_of_class, thinned, unseen
+from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.meaning.class_points import points_of_class
-from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.meaning.crossings import drops, outlines, unseen
-from rangeseg_ros.core.meaning.ground import Terrain
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.messages.clouds import planes_message, points_message
+from rangeseg_ros.messages.clouds import (
+    grid_points_message,
+    planes_message,
+    points_message,
+    stairs_message,
+)
+from rangeseg_ros.messages.grids import GRID, grid_header, grid_message, grid_points
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import Make
 from rangeseg_ros.messages.marker_bytes import markers_bytes
@@ -74,7 +81,7 @@ def _planes(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 
 
 def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, result, GROUND)[:, :3])
+    return points_message(make, header, _points(image, result, GROUND))
 
 
 def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
@@ -97,11 +104,31 @@ def _crossings(
     find: Callable[[RangeImage, Terrain], NDArray[np.float32]],
 ) -> Any:
     found = _NONE if result.ground is None else find(image, result.ground)
-    return points_message(make, header, found)
+    # However many: none of them is left out where there is no other near it.
+    return points_message(make, header, thinned(found, _resolution(result), len(found)))
 
 
 def _points(image: RangeImage, result: Segmentation, kind: int) -> NDArray[np.float32]:
-    return _NONE if result.ground is None else points_of_class(image, result.ground, kind)
+    if result.ground is None:
+        return _NONE
+    return thinned(points_of_class(image, result.ground, kind), _resolution(result))
+
+
+def _resolution(result: Segmentation) -> float:
+    return result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+
+
+def _grid(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return grid_message(make, header, result.grid or empty_grid())
+
+
+def _grid_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    grid = result.grid or empty_grid()
+    return grid_points_message(make, grid_header(make, header, grid), grid_points(grid))
+
+
+def _stairs_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+    return stairs_message(make, header, result.stairs)
 
 
 def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
@@ -117,6 +144,12 @@ def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) ->
 
 
 OUTPUTS = {
+    # What a robot stops for is published before pictures.
+    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
+    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
+    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
+    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
+    'terrain': _of_image('mono8', lambda image, result: result.terrain),
     'labels': _of_image('mono16', lambda image, result: result.labels),
     'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
     'markers': _of_markers(lambda image, result: of_planes(result.planes)),
@@ -125,13 +158,11 @@ OUTPUTS = {
     ),
     'normals': _of_image('32FC3', lambda image, result: result.normals),
     'edges': _of_image('mono8', lambda image, result: 255 * result.edges.astype(np.uint8)),
-    'terrain': _of_image('mono8', lambda image, result: result.terrain),
-    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
-    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
-    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
-    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
     'outline': _of_markers(_outline),
     'stairs': _of_markers(_stairs),
+    'stairs_points': Output('sensor_msgs/msg/PointCloud2', _stairs_points),
+    'grid': Output(GRID, _grid),
+    'grid_points': Output('sensor_msgs/msg/PointCloud2', _grid_points),
     'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
 }
 

@@ -100,6 +100,8 @@ class FrameStatistics:
         Why the last frame could not be segmented; empty when it could.
     sources : dict of str
         What up, fixed frame, target frame and map of the last frame come from.
+    no_terrain : str
+        Why there is no terrain: up is not known, or not where it is said; empty where there is.
     missing : str
         Which frames of the parameters were not known for the last frame, and why.
     found : Segmentation or None
@@ -120,6 +122,7 @@ class FrameStatistics:
         self.problem = ''
         self.sources: dict[str, str] = {}
         self.missing = ''
+        self.no_terrain = ''
         self.found: Segmentation | None = None
         self.ground = ''
         self.stairs = ''
@@ -224,12 +227,12 @@ class FrameStatistics:
             return DiagnosticStatus.WARN, self.compiling
         if lost:
             return DiagnosticStatus.WARN, lost
+        if self.no_terrain:
+            return DiagnosticStatus.ERROR, self.no_terrain
         if self.missing:
             return DiagnosticStatus.WARN, self.missing
         if found and not found.verdict.ok:
             return DiagnosticStatus.WARN, str(found.verdict)
-        if found and found.tilt:
-            return DiagnosticStatus.WARN, str(found.tilt)
         if found and not found.planes:
             return DiagnosticStatus.WARN, f'no planes: {found.reason}'
         count = len(found.planes) if found else 0

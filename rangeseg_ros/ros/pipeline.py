@@ -12,7 +12,7 @@ import cv2
 from rclpy.node import Node
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import Placement
+from rangeseg_ros.core.mapping.placement import HeldUp, Placement
 from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.runtime.pace import Pace
 from rangeseg_ros.core.runtime.threads import sharing_cores
@@ -92,6 +92,7 @@ class Pipeline:
         self._sequence: SequenceSegmenter | None = None
         self._jumps = 0
         self._ended = 0.0
+        self._up = HeldUp()
         self._size = 0
         self._threads = [
             Thread(target=self._work_all, name='segmentation', daemon=True)
@@ -196,8 +197,16 @@ class Pipeline:
         elif config is not self._sequence.config:
             self._sequence.config = config
         sequence = self._sequence
+        lost = ''
+        if config.gravity_frame:
+            lost = self._up.hold(at, work.frame.stamp, config.track_time)
         placed = work.frame.stamp, at.up, at.pose, at.height
         found = sequence.follow(found, image, *placed)
+        if not lost and found.tilt:
+            lost = f'no terrain: {found.tilt}'
+        self._statistics.no_terrain = lost
+        if lost:
+            found = replace(found, survey=None)
         self._tell(sequence, at)
         ticks.append(time.perf_counter())
         target = (config.target_frame, at.target) if at.target else None

@@ -26,7 +26,7 @@ _MAP_INTERVAL = 1.0
 """Seconds between messages of the map: it changes with every frame, and is not for control."""
 
 
-_FIRST = ('drops', 'obstacles', 'ground')
+_FIRST = ('drops', 'grid', 'obstacles', 'ground')
 """Outputs that a robot stops for: published before those that people look at."""
 
 

@@ -109,6 +109,38 @@ def find_placement(
     return found
 
 
+class HeldUp:
+    """The last direction that was known to be up: a camera on a robot keeps it for seconds."""
+
+    def __init__(self) -> None:
+        self._last: tuple[int, NDArray[np.float64], float | None] | None = None
+
+    def hold(self, found: Placement, stamp: int, patience: float) -> str:
+        """Where up is not known, take the last one; why there is none, or empty.
+
+        Parameters
+        ----------
+        found : Placement
+            Of an image; its up and height are set.
+        stamp : int
+            When the image was taken, nanoseconds.
+        patience : float
+            Seconds for which the last one holds.
+        """
+        if found.up is not None:
+            self._last = stamp, found.up, found.height
+            return ''
+        why = found.sources.get('up', '')
+        if self._last is not None:
+            then, up, height = self._last
+            age = (stamp - then) / 1e9
+            if 0 <= age <= patience:
+                found.up, found.height = up, height
+                found.sources['up'] = f'held for {age:.1f} s: {why}'
+                return ''
+        return f'no terrain, as up is not known: {why}'
+
+
 def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane]:
     """Planes in the frame that `motion` leads to; normals stay on the side of the sensor."""
     turn, shift = motion

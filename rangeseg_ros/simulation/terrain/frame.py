@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.sensors.sensor import Sensor
 from rangeseg_ros.simulation.solids import Solid, cast
@@ -83,6 +83,8 @@ def simulate_terrain(
     measured = sensor.measure(
         np.where(hidden, np.inf, depth), camera, np.random.default_rng([seed, 12])
     )
+    if scene.relief:
+        measured = _with_relief(measured, scene.relief, on_ground, rays, seed)
     terrain[(measured == 0) | ((terrain != GROUND) & (size < LEAST))] = UNKNOWN
     terrain[(terrain == DROP) & (height > -LEAST)] = UNKNOWN
     crossing, _ = cast(scene.ground, origin, rays)
@@ -93,6 +95,22 @@ def simulate_terrain(
         size.astype(np.float32),
         crossing.astype(np.float32),
     )
+
+
+def _with_relief(
+    measured: NDArray[np.uint16] | NDArray[np.float32],
+    relief: float,
+    ground: NDArray[np.bool_],
+    rays: NDArray[np.float64],
+    seed: int,
+) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Depth of rough ground: each pixel sees a stone or a blade of grass, `relief` (sd, m)."""
+    off = relief * np.random.default_rng([seed, 14]).standard_normal(measured.shape)
+    off *= (1000 if measured.dtype == np.uint16 else 1) / np.minimum(rays[..., 2], -0.1)
+    rough = np.maximum(measured + np.clip(off, -0.3 * measured, 0.3 * measured), 0)
+    result = measured.copy()
+    result[ground & (measured > 0)] = rough[ground & (measured > 0)]
+    return result
 
 
 def _first_hit(

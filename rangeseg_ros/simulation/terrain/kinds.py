@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.meaning.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.simulation.solids import box
+from rangeseg_ros.simulation.terrain.hard import HARD
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, WIDE, Terrain, Wave, slab
 from rangeseg_ros.simulation.terrain.site import Site
 
@@ -214,17 +215,17 @@ KINDS: dict[str, Callable[[Site], None]] = {
 
 
 def terrain_scene(kind: str, seed: int) -> Terrain:
-    """A terrain of that kind; the same seed gives the same terrain."""
+    """A terrain of a kind of `KINDS` or `HARD`; the same seed gives the same terrain."""
     site = Site(kind, seed)
-    KINDS[kind](site)
+    {**KINDS, **HARD}[kind](site)
     return site.terrain()
 
 
 def stated(scene: Terrain, seed: int) -> tuple[NDArray[np.float64], float]:
-    """Up and the sensor's height as a robot knows them: off by 1 degree per axis and 1 cm."""
+    """Up and the sensor's height as a robot knows them: off by the errors of the scene."""
     random = np.random.default_rng([seed, 13])
     signs = random.choice([-1.0, 1.0], 4)
-    wrong = Rotation.from_euler('xyz', signs[:3], degrees=True)
+    wrong = Rotation.from_euler('xyz', scene.errors[0] * signs[:3], degrees=True)
     up: NDArray[np.float64] = wrong.apply(scene.up)
     ground = sum(float(wave.height(np.zeros(3))) for wave in scene.waves)
-    return up, float(scene.pose.position[2] - ground + 0.01 * signs[3])
+    return up, float(scene.pose.position[2] - ground + scene.errors[1] * signs[3])

@@ -62,7 +62,7 @@ class Terrain:
     Attributes
     ----------
     kind : str
-        Of `KINDS`.
+        Of `KINDS` or `HARD`.
     pieces : tuple of Piece
     ground : tuple of Solid
         The ground continued, without holes and edges.
@@ -71,6 +71,10 @@ class Terrain:
         Added to the ground.
     stairs : dict
         `direction`, `count`, `rise`, `run` of a staircase; empty without one.
+    errors : (float, float)
+        Of what the robot is told: degrees of up about each axis, metres of the height.
+    relief : float
+        Standard deviation of the height of rough ground, metres.
     """
 
     kind: str
@@ -79,6 +83,8 @@ class Terrain:
     pose: Pose
     waves: tuple[Wave, ...] = ()
     stairs: dict[str, float | str] = field(default_factory=dict)
+    errors: tuple[float, float] = (1.0, 0.01)
+    relief: float = 0.0
 
     @property
     def up(self) -> NDArray[np.float64]:

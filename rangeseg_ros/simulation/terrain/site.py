@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.meaning.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.solids import Solid, box, cylinder
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, Wave, slab
@@ -33,6 +33,9 @@ class Site:
         self.ground: list[Solid] = []
         self.waves: tuple[Wave, ...] = ()
         self.stairs: dict[str, float | str] = {}
+        # What the robot is told wrongly: degrees of up about each axis, metres of height.
+        self.errors = (1.0, 0.01)
+        self.relief = 0.0
 
     def ahead(self, least: float = 0.25, most: float = 1.4) -> float:
         """Somewhere beyond where the ground comes into view."""
@@ -110,7 +113,14 @@ class Site:
             (0, 0, self.height), self.random.uniform(-12, 12), self.pitch, self.roll
         )
         return Terrain(
-            self.kind, tuple(self.pieces), tuple(self.ground), pose, self.waves, self.stairs
+            self.kind,
+            tuple(self.pieces),
+            tuple(self.ground),
+            pose,
+            self.waves,
+            self.stairs,
+            self.errors,
+            self.relief,
         )
 
 

@@ -9,16 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from rangeseg_ros.core.meaning.ground import Terrain
+from rangeseg_ros.core.ground.terrain import Terrain
 
-# From this confidence on a height is worth remembering: most of the half that remains of it for a
-# surface which fills the view.
-_SURE = 0.4
 # Share of the newest image in what is remembered.
 _NEWEST = 0.2
 
 
-class GroundMemory:
+class HeightMemory:
     """Height of one camera above the ground.
 
     Parameters
@@ -59,7 +56,7 @@ class GroundMemory:
             return self._remembered(found)
         other = find((0.0, 0.0))
         deeper = other.stand.height(other.field.up) > self._height + 2 * doubt
-        if not deeper or other.stand.confidence < _SURE:
+        if not deeper:
             self._doubted = None
         elif self._doubted is None:
             self._doubted = stamp
@@ -69,7 +66,7 @@ class GroundMemory:
         return found._replace(remembered=self._height)
 
     def _remembered(self, found: Terrain) -> Terrain:
-        if found.stand.surface and found.stand.confidence >= _SURE:
+        if found.stand.surface:
             height = found.stand.height(found.field.up)
             share = _NEWEST if self._height else 1.0
             self._height += share * (height - self._height)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.meaning.stairs import RISE
+from rangeseg_ros.core.ground.stairs import RISE
 from rangeseg_ros.core.rotations import rotation_matrix
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
@@ -78,7 +78,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         found[upward & (offset < -config.role_height)] = 'lower'
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
-        ramp = (slope > 2 * config.up_noise) & (slope <= config.ground_slope)
+        ramp = (slope > 2 * config.up_sd) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
             foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
             if foot <= config.role_height:

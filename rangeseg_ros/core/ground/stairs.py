@@ -16,9 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.meaning.cells import axes_of
-from rangeseg_ros.core.meaning.classes import GROUND
-from rangeseg_ros.core.meaning.ground import CellTerrain, Terrain
+from rangeseg_ros.core.ground.cells import axes_of
+from rangeseg_ros.core.ground.classes import GROUND
+from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.significance import SAMPLES
 
 RISE, _RUN = (0.1, 0.24), (0.22, 0.4)

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.meaning.ground import Limits, Terrain, terrain_of
-from rangeseg_ros.core.meaning.memory import GroundMemory
-from rangeseg_ros.core.meaning.roles import unit
+from rangeseg_ros.core.ground.grid import GridMemory, GridOptions, GroundGrid
+from rangeseg_ros.core.ground.memory import HeightMemory
+from rangeseg_ros.core.ground.roles import unit
+from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -30,10 +31,18 @@ class Survey:
     height_noise : float
         Its standard deviation, metres.
     limits : Limits
-    memory : GroundMemory, optional
+    grid : GridMemory
+        Of the images before, or of none.
+    memory : HeightMemory, optional
         Of the images before, for a height that is unknown.
     stamp : int
         When the image was taken, nanoseconds.
+    pose : (rotation (3, 3), shift (3,)), optional
+        Fixed frame from the frame of the image with the sensor as its origin.
+    fixed_frame : str
+        Its name.
+    cloud_resolution : float
+        Side of the cubes of which clouds have a point, metres; 0 = all pixels.
     """
 
     image: RangeImage
@@ -42,8 +51,12 @@ class Survey:
     sensor_height: float
     height_noise: float
     limits: Limits
-    memory: GroundMemory | None = None
+    grid: GridMemory
+    memory: HeightMemory | None = None
     stamp: int = 0
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
+    fixed_frame: str = ''
+    cloud_resolution: float = 0.0
 
     @classmethod
     def of(
@@ -57,13 +70,21 @@ class Survey:
             float(np.radians(config.ground_slope)),
             config.obstacle_height,
             config.drop_height,
-            float(np.radians(config.up_noise)),
+            float(np.radians(config.up_sd)),
         )
         if up is None:
             up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
         direction = unit(up)
-        height = config.sensor_height, config.sensor_height_noise
-        return cls(image, sensor, direction, *height, limits)
+        height = config.sensor_height, config.sensor_height_sd
+        return cls(
+            image,
+            sensor,
+            direction,
+            *height,
+            limits,
+            GridMemory(grid_options(config)),
+            cloud_resolution=config.cloud_resolution,
+        )
 
     def terrain(self) -> Terrain:
         """Find it."""
@@ -75,5 +96,17 @@ class Survey:
         doubt = min(self.limits.obstacle, self.limits.drop)
         return self.memory.terrain(self._found, doubt, self.stamp)
 
+    def ground_grid(self, terrain: Terrain) -> GroundGrid:
+        """The grid of the images before, with the terrain of this one."""
+        place = self.image.place
+        return self.grid.add(terrain, self.up, self.stamp, place, self.pose, self.fixed_frame)
+
     def _found(self, known: tuple[float, float]) -> Terrain:
         return terrain_of(self.image, self.sensor, self.up, known, self.limits)
+
+
+def grid_options(config: Config) -> GridOptions:
+    """Of the parameters."""
+    return GridOptions(
+        config.grid_resolution, config.grid_size, config.grid_memory, config.grid_clearance
+    )

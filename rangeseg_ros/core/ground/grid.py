@@ -1,0 +1,241 @@
+"""What the ground around a robot is, in cells of a horizontal grid, remembered while it moves.
+
+Cells add up evidence as the log-odds of danger (A. Hornung et al., "OctoMap", Autonomous Robots
+2013): an obstacle or a drop counts at once, ground that is seen again and again takes it back.
+Without the poses of the camera nothing is remembered: the grid is of one image.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.ground.cells import axes_of
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
+from rangeseg_ros.core.rotations import quaternions
+from rangeseg_ros.core.significance import OUTLIER
+
+# Log-odds that a sight of danger adds, that one of ground takes away, and their bounds: those of
+# OctoMap.
+_HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
+# Points between a cell of the ground and the next one in its column: far away, rows are far apart.
+_BETWEEN = 4
+
+
+class GridOptions(NamedTuple):
+    """How large the grid is.
+
+    Attributes
+    ----------
+    resolution : float
+        Side of a cell, metres.
+    size : float
+        Side of the grid, metres.
+    memory : float
+        Seconds after which a cell that is not seen is forgotten.
+    clearance : float
+        What hangs higher above the ground is not in the way, metres.
+    """
+
+    resolution: float
+    size: float
+    memory: float
+    clearance: float
+
+
+class GroundGrid(NamedTuple):
+    """The ground around the robot, row by row along y, with x along the rows.
+
+    Attributes
+    ----------
+    classes : (N, N) uint8
+        As `Segmentation.terrain`.
+    height : (N, N) float32
+        Of the ground along z of the frame, metres; NaN where none was seen.
+    variance : (N, N) float32
+        Of the height, square metres.
+    age : (N, N) float32
+        Seconds since the cell was seen; inf for never.
+    resolution : float
+        Side of a cell, metres.
+    origin : (3,) float64
+        Corner of the first cell in the frame, metres; z is the ground below the camera.
+    orientation : (4,) float64
+        Quaternion of the grid's axes in the frame.
+    frame : str
+        Name of the fixed frame; empty for that of the image.
+    """
+
+    classes: NDArray[np.uint8]
+    height: NDArray[np.float32]
+    variance: NDArray[np.float32]
+    age: NDArray[np.float32]
+    resolution: float
+    origin: NDArray[np.float64]
+    orientation: NDArray[np.float64]
+    frame: str
+
+
+def empty_grid() -> GroundGrid:
+    """The grid of an image whose ground is not looked for."""
+    empty, classes = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.uint8)
+    return GroundGrid(classes, empty, empty, empty, 0.0, np.zeros(3), np.array([0, 0, 0, 1.0]), '')
+
+
+class GridMemory:
+    """The grid of one camera.
+
+    Parameters
+    ----------
+    options : GridOptions
+    """
+
+    def __init__(self, options: GridOptions) -> None:
+        self.options = options
+        self.forget()
+
+    def forget(self) -> None:
+        """Know nothing."""
+        count = max(round(self.options.size / self.options.resolution), 1)
+        shape = count, count
+        self._odds, self._height, self._variance = np.zeros((3, *shape))
+        self._danger = np.zeros(shape, np.uint8)
+        self._seen = np.full(shape, -np.inf)
+        self._corner = np.zeros(2, np.int64)
+
+    def add(
+        self,
+        terrain: Terrain,
+        up: NDArray[np.float64],
+        stamp: int,
+        place: NDArray[np.float64],
+        pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
+        frame: str = '',
+    ) -> GroundGrid:
+        """The grid with what an image shows.
+
+        Parameters
+        ----------
+        terrain : Terrain
+            Of the image.
+        up : (3,) float64
+            Unit vector in the frame of the image.
+        stamp : int
+            When the image was taken, nanoseconds.
+        place : (3,) float64
+            Of the sensor in the frame of the image, metres.
+        pose : (rotation (3, 3), shift (3,)) or None
+            Fixed frame, with z up, from the frame of the image with the sensor as its origin.
+        frame : str
+            Name of the fixed frame.
+        """
+        side, seconds = self.options.resolution, stamp * 1e-9
+        axes = axes_of(up)[[1, 2, 0]]  # ahead, left, up
+        fixed = pose is not None and (pose[0] @ up)[2] > np.cos(np.pi / 4)
+        rotation, shift = pose if fixed and pose else (axes, np.zeros(3))
+        if not fixed:
+            self.forget()
+        self._move_to(shift)
+        if terrain.cells is not None:
+            turn = rotation @ axes.T
+            for danger, points, variance in _evidence(terrain.cells, self.options.clearance):
+                self._count(danger, points @ turn.T + shift, variance, seconds)
+        age = seconds - self._seen
+        known = age <= self.options.memory
+        level = terrain.stand.height(up)
+        origin = np.append(self._corner * side, shift[2] - (0 if np.isnan(level) else level))
+        if not fixed:
+            origin = axes.T @ origin + place
+        classes = np.where(self._odds > 0, self._danger, np.where(self._odds < 0, GROUND, UNKNOWN))
+        ground = known & (self._variance > 0)
+        return GroundGrid(
+            np.where(known, classes, UNKNOWN).astype(np.uint8),
+            np.where(ground, self._height, np.nan).astype(np.float32),
+            np.where(ground, self._variance, np.nan).astype(np.float32),
+            np.where(known, age, np.inf).astype(np.float32),
+            side,
+            origin,
+            quaternions(np.eye(3) if fixed else axes.T),
+            frame if fixed else '',
+        )
+
+    def _move_to(self, centre: NDArray[np.float64]) -> None:
+        """Have the grid around a place; what leaves it is forgotten."""
+        count = len(self._odds)
+        corner = np.floor(centre[:2] / self.options.resolution).astype(np.int64) - count // 2
+        before, self._corner = self._corner, corner
+        if not (corner - before).any():
+            return
+        # Of the old grid, the cells that are in the new one.
+        x, y = corner - before
+        old = slice(max(y, 0), count + min(y, 0)), slice(max(x, 0), count + min(x, 0))
+        new = slice(max(-y, 0), count + min(-y, 0)), slice(max(-x, 0), count + min(-x, 0))
+        for name, empty in (
+            ('_odds', 0), ('_height', 0), ('_variance', 0), ('_danger', 0), ('_seen', -np.inf)
+        ):  # fmt: skip
+            values = getattr(self, name)
+            moved = np.full_like(values, empty)
+            if max(abs(x), abs(y)) < count:
+                moved[new] = values[old]
+            setattr(self, name, moved)
+
+    def _count(
+        self,
+        danger: int,
+        points: NDArray[np.float64],
+        variance: NDArray[np.float64],
+        seconds: float,
+    ) -> None:
+        """Add points (N, 3) of the ground, or of a kind of danger, and what their heights err."""
+        count = len(self._odds)
+        index = np.floor(points[:, :2] / self.options.resolution).astype(np.int64) - self._corner
+        inside = ((index >= 0) & (index < count)).all(axis=1)
+        cell = index[inside, 1] * count + index[inside, 0]
+        number = np.bincount(cell, minlength=count * count).reshape(count, count)
+        hit = number > 0
+        self._seen[hit] = seconds
+        if danger != GROUND:
+            self._danger[hit] = danger
+            self._odds[hit] = np.minimum(np.maximum(self._odds[hit], 0) + _HIT, _BOUNDS[1])
+            return
+        self._odds[hit] = np.maximum(self._odds[hit] - _MISS, _BOUNDS[0])
+        height, square = (
+            np.bincount(cell, values[inside], minlength=count * count).reshape(count, count)[hit]
+            / number[hit]
+            for values in (points[:, 2], variance)
+        )
+        old, before = self._height[hit], self._variance[hit]
+        # A Kalman filter; what differs by more than it errs begins anew.
+        anew = (before == 0) | ((height - old) ** 2 > OUTLIER**2 * (before + square))
+        gain = np.where(anew, 1.0, before / np.maximum(before + square, 1e-12))
+        self._height[hit] = old + gain * (height - old)
+        self._variance[hit] = np.where(anew, square, (1 - gain) * before)
+
+
+def _evidence(
+    cells: CellTerrain, clearance: float
+) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
+    """Classes, points (N, 3) on axes ahead, left, up, metres, and the variances of their heights.
+
+    Ground first, so that danger in the same cell counts more. A drop is where the ground ends: its
+    rays cross the ground continued.
+    """
+    place = cells.place[[1, 2, 0]].astype(np.float64)
+    variance = (cells.unsure.astype(np.float64) / 3) ** 2
+    ground = cells.kind == GROUND
+    both = ground[1:] & ground[:-1]
+    share = np.arange(_BETWEEN) / _BETWEEN
+    low, high = place[:, 1:][:, both], place[:, :-1][:, both]
+    between = low[..., None] + share * (high - low)[..., None]
+    points = np.concatenate([place[:, ground], between.reshape(3, -1)], axis=1)
+    errors = np.concatenate([variance[ground], np.repeat(variance[1:][both], _BETWEEN)])
+    found = [(GROUND, points.T, errors)]
+    obstacle = (cells.kind == OBSTACLE) & (cells.height < clearance)
+    found.append((OBSTACLE, place[:, obstacle].T, variance[obstacle]))
+    drop = (cells.kind == DROP) & np.isfinite(cells.crossing).all(axis=0)
+    crossing = np.concatenate([cells.crossing, np.zeros((1, *drop.shape))])
+    found.append((DROP, crossing[:, drop].T, variance[drop]))
+    return found

@@ -1,0 +1,154 @@
+"""Where the pixels of a class lie, where rays cross the ground, and the outline of the ground."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.ground.classes import DROP, GROUND
+from rangeseg_ros.core.ground.terrain import Terrain
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.rays import completed_rays
+
+MOST_POINTS = 20_000
+"""Points of a thinned cloud: as many as layers of costmaps take in the time of a frame."""
+# Pixels that an outline may differ from the border of the ground.
+_TOLERANCE = 2.0
+
+
+def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[np.float32]:
+    """Points (N, 4) of the pixels of a class: x, y, z and height above the ground, metres.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    terrain : Terrain
+        Of the image.
+    kind : int
+        GROUND, OBSTACLE or DROP.
+
+    Returns
+    -------
+    (N, 4) float32
+        In the frame of the image, in the order of the pixels.
+    """
+    where = terrain.classes == kind
+    points = np.empty((np.count_nonzero(where), 4), np.float32)
+    points[:, :3] = image.rays[where] / image.inverse[where][:, None] + image.place
+    points[:, 3] = terrain.height[where]
+    return points
+
+
+def thinned(
+    points: NDArray[np.float32], resolution: float, most: int = MOST_POINTS
+) -> NDArray[np.float32]:
+    """One point of each cube that has any, with larger cubes where there are still too many.
+
+    Parameters
+    ----------
+    points : (N, K) float32
+        x, y, z and more.
+    resolution : float
+        Side of the cubes, metres; 0 for all points.
+    most : int
+    """
+    while resolution > 0 and len(points):
+        cubes = np.floor(points[:, :3] / resolution).astype(np.int64)
+        cubes -= cubes.min(axis=0)
+        across, _, high = cubes.max(axis=0) + 1
+        key = (cubes[:, 1] * across + cubes[:, 0]) * high + cubes[:, 2]
+        kept = np.sort(np.unique(key, return_index=True)[1])
+        if len(kept) <= most:
+            return points[kept]
+        resolution *= 2**0.5
+    return points
+
+
+def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+    """Where the rays that end in a drop cross the ground continued, as `_crossings`."""
+    return _crossings(image.rays, image, terrain, terrain.classes == DROP)
+
+
+def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
+    """Crossings of rays without a measurement, as `_crossings`.
+
+    As far as ground is seen, reached or not, and not nearer: no sensor sees below its own nearest
+    or farthest range. Not where the robot's own body is in the way. Single pixels do not count:
+    sensors miss some everywhere. Clouds do not tell the rays of what they have not measured:
+    those between measured points, where their grid is smooth (see `completed_rays`).
+    """
+    seen = image.inverse[(terrain.classes <= GROUND) & image.valid]
+    missing = ~image.valid if image.body is None else ~(image.valid | image.body)
+    opened = cv2.morphologyEx(missing.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    rays = image.rays
+    if len(seen) and image.camera is None:
+        completed = completed_rays(image)
+        if completed is None:
+            seen = seen[:0]
+        else:
+            rays = completed[0]
+            opened[~completed[1]] = 0
+    if not len(seen):
+        return np.zeros((0, 4), np.float32)
+    return _crossings(rays, image, terrain, opened > 0, (float(seen.min()), float(seen.max())))
+
+
+def _crossings(
+    rays: NDArray[np.float32],
+    image: RangeImage,
+    terrain: Terrain,
+    where: NDArray[np.bool_],
+    bounds: tuple[float, float] = (0.0, np.inf),
+) -> NDArray[np.float32]:
+    """Points where rays cross the ground continued.
+
+    Parameters
+    ----------
+    rays : (H, W, 3) float32
+    image : RangeImage
+        (H, W).
+    terrain : Terrain
+    where : (H, W) bool
+        Which rays; those that do not cross the ground in front of the sensor are left out.
+    bounds : (float, float)
+        Least and largest inverse range of the ground at a crossing, 1/m.
+
+    Returns
+    -------
+    (N, 4) float32
+        x, y, z in the frame of the image, metres, and the height of what was measured along the
+        ray, NaN where nothing was.
+    """
+    rows, columns = np.nonzero(where)
+    crossing, rays, inside = _cross(rays, terrain, rows, columns)
+    inside &= (crossing >= bounds[0]) & (crossing <= bounds[1])
+    points = rays[inside] / crossing[inside][:, None] + image.place
+    height = terrain.height[rows[inside], columns[inside]]
+    return np.column_stack([points, height]).astype(np.float32)
+
+
+def _cross(
+    rays: NDArray[np.float32], terrain: Terrain, rows: NDArray[np.intp], columns: NDArray[np.intp]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+    """Inverse range of the ground along the rays of pixels, these rays, and whether they meet."""
+    field = terrain.field
+    theta = field.theta[:, rows // field.size.rows, columns // field.size.columns].T
+    rays = rays[rows, columns]
+    inverse = (theta * rays).sum(axis=1)
+    return inverse, rays, inverse > 0
+
+
+def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
+    """Closed lines (N, 3) around the ground, metres, in the frame of the image."""
+    ground = (terrain.classes == GROUND).astype(np.uint8)
+    rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    lines = []
+    for ring in rings:
+        line = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0]
+        if len(line) > 2:  # holes of single pixels have no outline
+            inverse, rays, inside = _cross(image.rays, terrain, line[:, 1], line[:, 0])
+            points = rays[inside] / inverse[inside][:, None] + image.place
+            lines.append(points.astype(np.float32))
+    return lines

@@ -1,0 +1,372 @@
+"""What the pixels of an image are to a robot: ground, in the way, or below.
+
+One estimate of the ground under the robot (`estimate`), one reachability (`reach`), the ground
+continued (`field`), and heights above it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued, first_plane
+from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
+from rangeseg_ros.core.ground.reach import reach
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel, systematic_variance
+
+# Standard deviations of the noise within which the ground is the ground, and beyond which it is
+# known to be none.
+_CERTAIN = 3.0
+# Of the least obstacle or drop: what ground differs by however precise the sensor is, what is none
+# of it where it was reached, and where no chain leads.
+_FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
+# Cells over which the relief of the ground is measured.
+_RELIEF = (9, 25)
+# Surfaces that are tried, the nearest first, until one agrees with the stated height.
+_TRIALS = 3
+SURE = 0.99
+"""Confidence from which on the ground is the ground; less is unknown."""
+FURNITURE = 1.5
+"""Metres: what is longer, along or across the view, is no table (without a stated height)."""
+
+
+class Limits(NamedTuple):
+    """What is ground.
+
+    Attributes
+    ----------
+    slope : float
+        Steepest ground, radians.
+    obstacle : float
+        What stands so high is an obstacle, metres.
+    drop : float
+        What lies so deep is a drop, metres.
+    tilt : float
+        Standard deviation of the direction that is up, radians.
+    """
+
+    slope: float
+    obstacle: float
+    drop: float
+    tilt: float = float(np.radians(Config().up_sd))
+
+    @property
+    def least(self) -> float:
+        """The least step that is none of the ground, metres."""
+        return min(self.obstacle, self.drop)
+
+
+class CellTerrain(NamedTuple):
+    """What the cells of an image are, (rows, columns).
+
+    Attributes
+    ----------
+    place : (3, ...) float32
+        See `Cells`.
+    height : (...) float32
+        Above the ground, metres; NaN where not measured.
+    kind : (...) int8
+        See `classes`.
+    unsure : (...) float32
+        The noise of a pixel's height, metres.
+    crossing : (2, ...) float32
+        Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
+    turned : bool
+        Whether up is down along the columns.
+    """
+
+    place: NDArray[np.float32]
+    height: NDArray[np.float32]
+    kind: NDArray[np.int8]
+    unsure: NDArray[np.float32]
+    crossing: NDArray[np.float32]
+    turned: bool
+
+
+class Terrain(NamedTuple):
+    """What the pixels of an image are to a robot.
+
+    Attributes
+    ----------
+    classes : (H, W) uint8
+        See `classes`.
+    height : (H, W) float32
+        Metres along up above the ground; NaN where not measured or no ground is known.
+    stand : Stand
+        The ground under the robot.
+    field : GroundField
+        The ground continued everywhere; zeros where none is known.
+    cells : CellTerrain or None
+        The same of cells, where ground is known.
+    remembered : float
+        How far below the camera the ground was, metres, when it is out of view; 0 for unknown.
+    """
+
+    classes: NDArray[np.uint8]
+    height: NDArray[np.float32]
+    stand: Stand
+    field: GroundField
+    cells: CellTerrain | None = None
+    remembered: float = 0.0
+
+    def __str__(self) -> str:
+        """Where the ground is and how sure that is, in a few words."""
+        if not self.stand.surface:
+            where = f': it was {self.remembered:.2f} m below' if self.remembered else ''
+            return '; '.join([f'no ground in view{where}', *self.stand.reasons])
+        height, confidence = self.stand.height(self.field.up), self.stand.confidence
+        return f'ground {height:.2f} m below, confidence {confidence:.2f}'
+
+
+def terrain_of(
+    image: RangeImage,
+    sensor: SensorModel,
+    up: NDArray[np.float64],
+    known: tuple[float, float],
+    limits: Limits,
+) -> Terrain:
+    """Class and height of every pixel.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    sensor : SensorModel
+    up : (3,) float64
+        Unit vector in the frame of the image.
+    known : (float, float)
+        Height of the camera above the ground below it and its standard deviation, metres; 0, 0
+        when nothing is known.
+    limits : Limits
+    """
+    right, down, _ = up @ image.axes
+    if abs(right) <= abs(down):
+        return _upright(image, sensor, up, known, limits, bool(down > 0))
+    # A camera on its side: columns are along up in the image with rows and columns exchanged.
+    rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
+    rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
+    turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
+    found = _upright(turned, sensor, up, known, limits, bool(right > 0))
+    return found._replace(
+        classes=np.ascontiguousarray(found.classes.T),
+        height=np.ascontiguousarray(found.height.T),
+        field=found.field.turned(),
+    )
+
+
+def _upright(
+    image: RangeImage,
+    sensor: SensorModel,
+    up: NDArray[np.float64],
+    known: tuple[float, float],
+    limits: Limits,
+    turned: bool,
+) -> Terrain:
+    """The same for an image whose columns are along up; `turned` where up is down in it."""
+    size = CellSize.for_image(image.shape)
+    cells = cells_of(image, size, up, sensor)
+    place, variance = _smoothed(cells, size, sensor, limits.least)
+    height, height_sd = known
+    height = height or _lowest(place, variance, turned)
+    place[0] += height
+    seen: list[Continuation] = []
+    left = variance.copy()
+    for _ in range(_TRIALS):
+        reached = _reach(place, left, height_sd, limits, turned)
+        if not reached.any():
+            break
+        smooth = _smooth_variance(place[:, reached], height, sensor, size)
+        error = 4 * variance[reached] + smooth
+        slope = float(np.tan(limits.slope))
+        found = continued(place[:, reached], error, height_sd, slope, limits.least)
+        # Without a height the ground is what the camera stands on: a table tells by its size.
+        sure = found.confidence >= SURE if height_sd > 0 else found.size >= FURNITURE
+        # What is nearer may be the robot's own floor, by another height than the stated one.
+        highest = HIGHEST if height_sd > 0 else np.inf
+        if sure and not any(found.behind_step(nearer, highest) for nearer in seen):
+            stand = Stand(1, _theta(found, height, up), found.confidence)
+            return _with_ground(image, cells, size, reached, stand, up, limits, turned)
+        seen.append(found)
+        left[reached] = 0
+    nearest = seen[0] if seen else None
+    return _without_ground(image, cells, size, nearest, up, known, limits)
+
+
+def _smoothed(
+    cells: Cells, size: CellSize, sensor: SensorModel, least: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places of cells and the variances of their heights, 0 where nothing is measured.
+
+    Where noise is a large part of the least step, heights are medians of neighbours.
+    """
+    place = cells.place.astype(np.float64)
+    there = cells.inverse > 0
+    share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
+    square = cells.error.astype(np.float64) ** 2
+    variance = np.where(there & ~cells.mixed, square * share + 1e-8, 0.0)
+    noisy = variance > (least / 8) ** 2
+    if noisy.any():
+        lowest = np.float32(-1e4)
+        median = cv2.medianBlur(np.where(there, cells.place[0], lowest), 5)
+        noisy &= median > lowest
+        place[0][noisy] = median[noisy]
+        variance[noisy] /= 4
+    return place, variance
+
+
+def _nearest(variance: NDArray[np.float64], turned: bool) -> NDArray[np.int64]:
+    """Row of the nearest measured cell of each column; -1 for none."""
+    there = variance > 0 if turned else variance[::-1] > 0
+    row = there.argmax(axis=0)
+    if not turned:
+        row = len(variance) - 1 - row
+    return np.where(there.any(axis=0), row, -1)
+
+
+def _lowest(place: NDArray[np.float64], variance: NDArray[np.float64], turned: bool) -> float:
+    """How far below the sensor the nearest cells are, metres, where no height is stated."""
+    nearest = _nearest(variance, turned)
+    columns = np.flatnonzero(nearest >= 0)
+    if not len(columns):
+        return 1.0
+    return max(-float(np.median(place[0, nearest[columns], columns])), 0.02)
+
+
+def _reach(
+    place: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    height_sd: float,
+    limits: Limits,
+    turned: bool,
+) -> NDArray[np.bool_]:
+    """Cells that a chain from the nearest ones leads to."""
+    nearest = _nearest(variance, turned)
+    errors = (2 * height_sd or 1.0, float(np.tan(limits.slope)) / 2)
+    plane = first_plane(place, variance, nearest, errors, limits.least)
+    steepest = float(np.tan(limits.slope + limits.tilt))
+    return reach(place, variance, nearest, plane, limits.least, steepest, turned)
+
+
+def _smooth_variance(
+    place: NDArray[np.float64], height: float, sensor: SensorModel, size: CellSize
+) -> NDArray[np.float64]:
+    """Variance (N,) of the heights of cells by the sensor's distortion, metres^2.
+
+    All of a patch of it errs alike, 4 pi times the square of its width: it counts for every cell.
+    """
+    square = (place[0] - height) ** 2 + place[1] ** 2 + place[2] ** 2
+    patch = max(4 * np.pi * sensor.distortion_length**2 / (size.rows * size.columns), 1.0)
+    variance: NDArray[np.float64] = (
+        patch * systematic_variance.py_func(sensor, 1 / square) * square * (place[0] - height) ** 2
+    )
+    return variance
+
+
+def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The plane of the ground under the robot: theta . ray is its inverse range."""
+    a, b, c = found.plane
+    lean = np.array([b, c]) @ axes_of(up)[1:]
+    theta: NDArray[np.float64] = -(up - lean) / (height - a)
+    return theta
+
+
+def _with_ground(
+    image: RangeImage,
+    cells: Cells,
+    size: CellSize,
+    reached: NDArray[np.bool_],
+    stand: Stand,
+    up: NDArray[np.float64],
+    limits: Limits,
+    turned: bool,
+) -> Terrain:
+    """Classes and heights by the ground that was reached, continued."""
+    field = ground_field(cells, reached, stand.theta, size, up)
+    height = field.heights(cells)
+    # Relief counts as noise: what the cells of the ground scatter by.
+    count = cv2.blur(reached.astype(np.float32), _RELIEF)
+    squares = cv2.blur(np.where(reached, height, 0) ** 2, _RELIEF)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        relief = np.where(count > 0, squares / count, 0)
+    noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
+    beside = cv2.dilate(reached.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    flat = np.clip(noise, _FLAT * limits.least, limits.least)
+    flat = np.where(reached, flat, np.minimum(flat, limits.least / 2))
+    share = np.where(reached, np.float32(_NEAR), np.float32(_APART))
+    bounds = np.empty((4, *reached.shape), np.float32)
+    sure = np.float32(_CERTAIN) * cells.error
+    bounds[0] = -np.maximum(share * limits.drop, np.minimum(sure, _CERTAIN * limits.drop))
+    bounds[3] = np.maximum(share * limits.obstacle, np.minimum(sure, _CERTAIN * limits.obstacle))
+    bounds[1] = np.where(beside, np.maximum(-flat, bounds[0]), np.inf)
+    bounds[2] = np.where(beside, np.minimum(flat, bounds[3]), -np.inf)
+    classes, heights = classify(image, field, bounds)
+    kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
+    kind[height > bounds[3]] = OBSTACLE
+    kind[height < bounds[0]] = DROP
+    along = (field.theta * cells.ray).sum(axis=0)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        flat_axes = axes_of(up)[1:].astype(np.float32)
+        along[along <= 0] = np.nan
+        crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
+    below = CellTerrain(cells.place, height, kind, sure, crossing, turned)
+    return Terrain(classes, heights, stand, field, below)
+
+
+def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
+    """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
+    steep = np.zeros(cells.inverse.shape, np.bool_)
+    if len(steep) < 3:
+        return steep
+    rise = np.abs(cells.place[0, 2:] - cells.place[0, :-2])
+    way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
+    noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
+    # Three times as steep as any ground, as what is hidden behind an edge is not.
+    steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
+    steep[0], steep[-1] = steep[1], steep[-2]
+    return steep
+
+
+def _without_ground(
+    image: RangeImage,
+    cells: Cells,
+    size: CellSize,
+    seen: Continuation | None,
+    up: NDArray[np.float64],
+    known: tuple[float, float],
+    limits: Limits,
+) -> Terrain:
+    """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
+    height, height_sd = known
+    reasons: tuple[str, ...] = ()
+    obstacle = _faces(cells, limits)
+    if height > 0:
+        # What is higher than any step is none, nor the ground by a wrong height.
+        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
+        distance = np.hypot(cells.place[1], cells.place[2])
+        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
+        obstacle |= cells.place[0] + height > bound
+    wide = size.enlarged(obstacle, image.shape)
+    classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
+    if seen and height > 0:
+        off, below = abs(seen.plane[0]), height - seen.plane[0]
+        why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
+        if off > _CERTAIN * seen.error:
+            why += f', {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
+        else:
+            why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
+        reasons = (why,)
+    elif height > 0:
+        reasons = (f'no ground that is seen is {height:.2f} m below, as is stated',)
+    elif seen:
+        reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
+    confidence = seen.confidence if seen and height > 0 else 0.0
+    nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
+    stand = Stand(0, np.zeros(3), confidence, reasons)
+    return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)

@@ -1,0 +1,72 @@
+"""The ground around the robot as an occupancy grid, and as points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.ground.classes import GROUND, UNKNOWN
+from rangeseg_ros.core.ground.grid import GroundGrid
+from rangeseg_ros.core.rotations import rotation_matrix
+from rangeseg_ros.messages.make import Make
+
+GRID = 'nav_msgs/msg/OccupancyGrid'
+"""Type of `grid_message`."""
+_LETHAL = 100
+
+
+def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
+    """nav_msgs/OccupancyGrid: 0 ground, 100 obstacle or drop, -1 unknown.
+
+    Parameters
+    ----------
+    make : Make
+    header : std_msgs/Header
+        Of the image: its frame is used where the grid has no fixed one.
+    grid : GroundGrid
+    """
+    values = np.where(grid.classes == GROUND, 0, _LETHAL).astype(np.int8)
+    values[grid.classes == UNKNOWN] = -1
+
+    def named(kind: str, numbers: NDArray[np.float64]) -> Any:
+        fields = dict(zip('xyzw', map(float, numbers), strict=False))
+        return make(f'geometry_msgs/msg/{kind}', **fields)
+
+    corner = make(
+        'geometry_msgs/msg/Pose',
+        position=named('Point', grid.origin),
+        orientation=named('Quaternion', grid.orientation),
+    )
+    info = make(
+        'nav_msgs/msg/MapMetaData',
+        map_load_time=header.stamp,
+        resolution=float(grid.resolution),
+        width=values.shape[1],
+        height=values.shape[0],
+        origin=corner,
+    )
+    return make(GRID, header=grid_header(make, header, grid), info=info, data=values.ravel())
+
+
+def grid_header(make: Make, header: Any, grid: GroundGrid) -> Any:
+    """Header of the messages of a grid: in the fixed frame where it has one."""
+    frame = grid.frame or header.frame_id
+    return make('std_msgs/msg/Header', stamp=header.stamp, frame_id=frame)
+
+
+def grid_points(grid: GroundGrid) -> NDArray[np.float32]:
+    """Cells (N, 6) of a grid that are known: x, y, z, variance of the height, class, age.
+
+    z is the height of the ground, or that of the ground below the camera where none was seen.
+    """
+    rows, columns = np.nonzero(grid.classes != UNKNOWN)
+    place = (np.column_stack([columns, rows]) + 0.5) * grid.resolution
+    place = np.column_stack([place, np.zeros(len(rows))]) @ rotation_matrix(grid.orientation).T
+    place += grid.origin
+    height = grid.height[rows, columns]
+    if grid.frame:
+        place[:, 2] = np.where(np.isnan(height), place[:, 2], height)
+    others = (values[rows, columns] for values in (grid.variance, grid.classes, grid.age))
+    return np.column_stack([place, *others]).astype(np.float32)

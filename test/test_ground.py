@@ -1,0 +1,89 @@
+"""Scenes built to have a landing, a slope or a table taken for the ground the robot stands on."""
+
+import cv2
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.terrain import Limits, terrain_of
+from rangeseg_ros.core.segmentation import STATED
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.kinect import Kinect
+from rangeseg_ros.simulation.solids import box, prism
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
+
+LIMITS = Limits(float(np.radians(12)), 0.05, 0.05)
+SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
+CAMERA = 0.8
+FLAT = slab(-3, FAR, 0, 0, ALL)
+
+
+def found(pieces, pitch, height, up=None, seed=0, camera=CAMERA):
+    pose = Pose.looking((0, 0, camera), 0, pitch, 0)
+    scene = Terrain('made', tuple(Piece(*piece) for piece in pieces), (FLAT,), pose)
+    frame = simulate_terrain(scene, Kinect(seed), seed=seed)
+    image = RangeImage.from_depth(frame.depth, Kinect(seed).camera)
+    known = (height, 0.015) if height else (0.0, 0.0)
+    return terrain_of(image, STATED, scene.up if up is None else up, known, LIMITS), frame
+
+
+def drop_at(edge, depth):
+    return [(slab(-3, edge, 0, 0, ALL), GROUND), (slab(edge, FAR, -depth, -depth, ALL), DROP, 1.0)]
+
+
+def share(terrain, frame, true, called):
+    inside = cv2.erode((frame.terrain == true).astype(np.uint8), np.ones((7, 7)))  # 3 px
+    near = (inside > 0) & (frame.depth < 3000)
+    assert near.sum() > 1000
+    return (terrain.classes[near] == called).mean()
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('depth', [0.06, 0.08, 0.1, 0.12, 0.15])
+def test_a_landing_whose_edge_is_out_of_view_is_no_ground(depth, seed):
+    """The floor is hidden up to 1.5 m ahead, and ends before."""
+    pitch = np.degrees(np.arctan2(CAMERA, 1.5)) - SEEN
+    terrain, frame = found(drop_at(0.9, depth), pitch, CAMERA, seed=seed)
+    assert share(terrain, frame, DROP, GROUND) < 0.01
+    assert not terrain.stand.surface
+    assert 'stated height is 0.80 m' in terrain.stand.reasons[0]
+
+
+@pytest.mark.parametrize('depth', [0.06, 0.08, 0.1])
+def test_a_strip_of_floor_at_the_lower_border_is_the_ground(depth):
+    edge = CAMERA / np.tan(np.radians(28 + SEEN)) + 0.06
+    terrain, frame = found(drop_at(edge, depth), 28, CAMERA + 0.01)
+    assert share(terrain, frame, GROUND, GROUND) > 0.97
+    assert share(terrain, frame, DROP, GROUND) < 0.01
+
+
+@pytest.mark.parametrize('error', [-0.1, 0.1])
+def test_a_wrong_height_is_named_and_nothing_is_ground(error):
+    terrain, _ = found(drop_at(1.5, 0.1), 30, CAMERA + error)
+    assert not (terrain.classes == GROUND).any()
+    assert f'stated height is {CAMERA + error:.2f} m' in terrain.stand.reasons[0]
+
+
+def test_what_falls_to_the_side_by_20_degrees_is_no_ground():
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # from x, y to y, z of the world
+    level = prism(np.array([(-0.2, -4), (8, -4), (8, 0), (-0.2, 0)]), 20, turn, (0, 0, 0))
+    fall = -7.8 * np.tan(np.radians(20))
+    side = prism(np.array([(-8, -9), (-0.2, -9), (-0.2, 0), (-8, fall)]), 20, turn, (0, 0, 0))
+    terrain, frame = found([(level, GROUND), (side, DROP, 1.0)], 28, CAMERA)
+    assert share(terrain, frame, GROUND, GROUND) > 0.97
+    assert share(terrain, frame, DROP, GROUND) < 0.01
+
+
+def test_a_table_alone_is_no_floor():
+    table = box((1.2, 1.6, 0.03), np.eye(3), (0.8, 0, 0.7))
+    pieces = [(FLAT, GROUND), (table, OBSTACLE, 0.7)]
+    for height in (0.0, 1.2):
+        terrain, frame = found(pieces, 50, height, camera=1.2)
+        assert not (terrain.classes[frame.terrain == OBSTACLE] == GROUND).any()
+
+
+def test_a_level_up_of_a_camera_that_looks_down_makes_nothing_ground():
+    terrain, _ = found([(FLAT, GROUND)], 30, CAMERA, up=np.array([0.0, -1.0, 0.0]))
+    assert not (terrain.classes == GROUND).any() and terrain.stand.reasons
