@@ -108,14 +108,13 @@ Segmenter(Config(method='normals')).segment(image)
 
 
 def test_the_first_frame_says_that_kernels_are_compiled(tmp_path):
-    """In Python, without the command line: before the first one is."""
+    """In Python, without the command line, as the configuration needs them."""
     environment = {**os.environ, 'NUMBA_CACHE_DIR': os.fspath(tmp_path)}
     run = subprocess.run(
         [sys.executable, '-c', FIRST_FRAME], capture_output=True, text=True, env=environment
     )
     begin = 'rangeseg_ros: compiling kernels, once after the installation'
     assert run.stderr.splitlines() == [begin, "('image',), normals"]
-    assert not [*tmp_path.rglob('*.nbi')]
 
 
 def test_a_terminal_shows_a_bar(monkeypatch, capsys):

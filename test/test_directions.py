@@ -41,19 +41,6 @@ def test_even_distributions_leave_no_large_gap(distribution, count):
     assert nearest.max() < 9
 
 
-def test_platonic_neighbours_are_evenly_spaced():
-    """Great-circle steps of a thrice subdivided icosahedron: 63.4 degrees / 8 and a little up."""
-    found = platonic(3)
-    nearest = np.degrees(np.arccos(np.sort(found @ found.T)[:, -2]))
-    assert nearest.min() == pytest.approx(63.4349 / 8, abs=0.01)
-    assert nearest.max() < 10.5
-
-
-def test_regular_steps_are_multiples_of_the_angle():
-    elevation = np.degrees(np.arcsin(-regular(3)[:, 2])).round(9)
-    assert sorted(set(elevation)) == pytest.approx([30, 60, 90])
-
-
 def test_rejection_is_uniform_over_the_hemisphere():
     """Height is uniform on a hemisphere (Archimedes): mean 1/2, variance 1/12."""
     height = -directions('random', 5000, seed=3)[:, 2]

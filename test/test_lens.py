@@ -90,16 +90,6 @@ def test_opencv_sees_the_rays_at_their_pixels(model, d):
     np.testing.assert_allclose(rows, v.ravel(), atol=2e-4)
 
 
-def test_binning_and_skew_go_together():
-    skewed = [[300, 30, 159.5], [0, 310, 119.5], [0, 0, 1]]
-    full, binned = (
-        camera_from_matrices(320, 240, skewed, binning=binning) for binning in ((1, 1), (2, 4))
-    )
-    block = full.rays[4:8, 6:8].reshape(-1, 3).mean(axis=0)
-    np.testing.assert_allclose(binned.rays[1, 3], block, atol=1e-6)
-    assert not full.pinhole
-
-
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
 @pytest.mark.parametrize('method', ['planes', 'normals'])
 def test_planes_behind_a_lens(model, method):

@@ -14,9 +14,6 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
 GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
-CHUNK = 16
-"""Pixels of a row that are compared with their neighbours at a time."""
-
 
 class Grid(NamedTuple):
     """Weights of the edges between neighbouring pixels, 0 where disconnected.
