@@ -97,13 +97,18 @@ class Config:
         low=0.0,
         high=10000.0,
     )
-    flatness: float = option(
-        0.007,
-        'method planes: a bend of less than this share of its width, root mean square, is a '
-        'plane; of hand-annotated planes none bent by more than 0.5 %, while a sphere in pieces '
-        'of a third of its radius bends by 3 %, a cylinder in strips as wide as its radius by 2 %',
+    plane_probability: float = option(
+        0.3,
+        'method planes: a region is a plane from this probability on, and otherwise a curved '
+        'surface; 0 makes planes of all',
         low=0.0,
         high=1.0,
+    )
+    plane_prior: float = option(
+        0.5,
+        'share of planes among the regions that are found, before their bend is looked at',
+        low=0.001,
+        high=0.999,
     )
     moves: str = option(
         'expansion',
@@ -448,14 +453,27 @@ RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 
 
+# Former parameters that nothing reads any more, and why.
+DROPPED: dict[str, str] = {
+    'flatness': 'plane_probability decides what is a plane',
+}
+
+
 def known_name(name: object) -> bool:
     """Whether a parameter is, or was, called so."""
-    return name in RENAMED or any(name == option_field.name for option_field in fields(Config))
+    return name in RENAMED or name in DROPPED or any(name == option_field.name for option_field in fields(Config))
 
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
-    result = {name: value for name, value in mapping.items() if name not in RENAMED}
+    result = {
+        name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)
+    }
+    for former, reason in DROPPED.items():
+        if former in mapping:
+            warnings.warn(
+                f'parameter {former} is not read any more: {reason}', FutureWarning, stacklevel=3
+            )
     for former, (name, convert) in RENAMED.items():
         if former in mapping:
             result.setdefault(name, convert(mapping[former]))

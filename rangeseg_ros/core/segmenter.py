@@ -98,9 +98,11 @@ class Segmenter:
             labelling, view = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            flat = by_planes.flat_regions(regions, view, config.flatness)
+            flat = by_planes.flat_regions(
+                regions, view, config.plane_probability, config.plane_prior
+            )
             watch.lap('regions')
-            regions, fits = by_planes.unite_regions(*flat, view)
+            regions, probability, fits = by_planes.unite_regions(*flat, view)
         else:
             regions, labelling = self._by_normals(view, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
