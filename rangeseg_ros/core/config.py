@@ -461,14 +461,16 @@ DROPPED: dict[str, str] = {
 
 def known_name(name: object) -> bool:
     """Whether a parameter is, or was, called so."""
-    return name in RENAMED or name in DROPPED or any(name == option_field.name for option_field in fields(Config))
+    return (
+        name in RENAMED
+        or name in DROPPED
+        or any(name == option_field.name for option_field in fields(Config))
+    )
 
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
-    result = {
-        name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)
-    }
+    result = {name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)}
     for former, reason in DROPPED.items():
         if former in mapping:
             warnings.warn(

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.descent import REACH, descend, nearest
+from rangeseg_ros.core.by_planes.candidates import REACH, nearest
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     Models,
@@ -77,7 +77,7 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    smooth, block = sensor.distortion_pixels, problem.block * problem.step
+    smooth, block = sensor.distortion_pixels, problem.block
     models = _shifted(Models.of(moments, smooth), surfaces, blocks, sensor, block)
     labels, cost = nearest(problem, surfaces, models)
     domains = _domains(surfaces, problem, len(moments)) if exact else None
@@ -123,16 +123,14 @@ def _minimise(
     domains: Sites | None,
     cuts: float,
 ) -> None:
-    """Descend, then expand the labels near their boundaries, or in their domains; in place.
-
-    Near boundaries once, in domains until no expansion helps.
+    """Expand the labels near their boundaries once, or in their domains until that helps no more;
+    in place.
     """
     height = len(labels) // problem.width
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
     if domains is None:
-        run_halves(_improve, height, labelling, problem, models, cuts)
+        run_halves(_expand_near, height, labelling, problem, models, cuts)
         return
-    run_halves(descend, height, labels, cost, problem, models)
     labelling = labelling._replace(data=costs(labels, problem, models))
     chosen = 0, len(models.theta)
     while _expand_each(chosen, (0, height), labelling, problem, models, domains, 1):
@@ -151,18 +149,6 @@ def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites
         domains.append(np.flatnonzero(pixels[:height, :width] & measured))
     start = np.cumsum([0, *map(len, domains)])
     return start, np.concatenate(domains).astype(np.int32)
-
-
-def _improve(
-    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models, cuts: float
-) -> None:
-    """Descend in some rows, then expand the labels there; in place.
-
-    Both in one go, as a half of the image in which the one takes long may soon be through with
-    the other.
-    """
-    descend(rows, labelling.labels, labelling.data, problem, models)
-    _expand_near(rows, labelling, problem, models, cuts)
 
 
 @njit(cache=True, nogil=True)

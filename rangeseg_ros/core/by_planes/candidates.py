@@ -1,4 +1,4 @@
-"""The labels that cuts begin with: the nearest planes, then iterated conditional modes."""
+"""The labels that expansions begin with: of the surfaces near a pixel the one that fits best."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.plane_energy import (
     CAP,
-    LEAST_GAIN,
     NO_PLANE,
     Models,
     Problem,
-    data_cost,
     plane_cost,
     shifted_plane,
 )
 from rangeseg_ros.core.by_planes.shifts import shift_at
-from rangeseg_ros.core.graphcut.sites import room_for_unlike, unlike_sites
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.ray_rows import first_rays, next_rays
 
@@ -189,86 +186,3 @@ def _take_first(
         measured, better = weight[j] > 0, value < np.float32(NO_PLANE)
         labels[j] = label[j] if measured & better else np.int32(0)
         cost[j] = (value if better else np.float32(NO_PLANE)) if measured else np.float32(0)
-
-
-@njit(cache=True, nogil=True)
-def descend(
-    rows: tuple[int, int],
-    labels: NDArray[np.int32],
-    cost: NDArray[np.float32],
-    problem: Problem,
-    models: Models,
-) -> None:
-    """Iterated conditional modes (Besag 1986): pixels take a neighbour's label where it pays.
-
-    In place, until no pixel of the rows from the first to before the second changes. It leaves the
-    energy in a poor local minimum, but one from which the cuts have only the boundaries left to
-    move.
-    """
-    width = problem.width
-    begin, end = rows[0] * width, rows[1] * width
-    offsets = 1, width, -1, -width
-    links = problem.links
-    around = np.zeros(4, np.int32)
-    link = np.zeros(4)
-    # A ring, long enough as no pixel is in it twice.
-    queue = np.empty(max(end - begin, 1), np.int32)
-    queued = np.zeros(end - begin, np.bool_)
-    waiting = 0
-    marks, unlike = room_for_unlike(width)
-    for row in range(max(rows[0] - 1, 0), rows[1]):
-        for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
-            p = unlike[s]
-            for k in range(2):
-                q = p + offsets[k]
-                if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
-                    for site in (p, q):
-                        if begin <= site < end and not queued[site - begin]:
-                            queue[waiting] = site
-                            queued[site - begin] = True
-                            waiting += 1
-    first, last = 0, waiting % len(queue)
-    while waiting > 0:
-        p = queue[first]
-        first = first + 1 if first + 1 < len(queue) else 0
-        waiting -= 1
-        queued[p - begin] = False
-        here = labels[p]
-        least = np.float64(cost[p]) - LEAST_GAIN
-        for k in range(4):
-            q = p + offsets[k]
-            link[k] = links[k % 2, min(p, q)]
-            around[k] = labels[q] if link[k] > 0 else here
-            if around[k] != here:
-                least += link[k]
-        for k in range(5):
-            label = around[k] if k < 4 else np.int32(0)
-            if label == here:
-                continue
-            # Where the links alone cost too much, the data are not asked.
-            if _plus_links(np.float64(0), int(label), around, link) >= least:
-                continue
-            data = np.float32(data_cost(int(label), int(p), problem, models))
-            total = _plus_links(np.float64(data), int(label), around, link)
-            if total < least:
-                least, labels[p], cost[p] = total, label, data
-        if labels[p] == here:
-            continue
-        for k in range(4):
-            q = p + offsets[k]
-            if link[k] > 0 and begin <= q < end and not queued[q - begin]:
-                queued[q - begin] = True
-                queue[last] = q
-                last = last + 1 if last + 1 < len(queue) else 0
-                waiting += 1
-
-
-@njit(cache=True, inline='always')
-def _plus_links(
-    total: np.float64, label: int, around: NDArray[np.int32], link: NDArray[np.float64]
-) -> np.float64:
-    """A cost and those of the links to the neighbours `around`, as far as their labels differ."""
-    for k in range(4):
-        if around[k] != label:
-            total += link[k]
-    return total
