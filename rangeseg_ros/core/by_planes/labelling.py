@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.candidates import REACH, nearest
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     Models,
@@ -31,9 +30,9 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
 _BAND = BLOCK // 2
-# Blocks from a surface that its label is expanded to when exact: where two surfaces may both win
-# pixels. Its plane may well explain pixels anywhere in the image, rarely the surface's.
-_DOMAIN = 2 * REACH
+# Blocks from a surface that shifts of its plane are known for, and that its label is expanded to
+# when exact. Its plane may well explain pixels anywhere in the image, rarely the surface's.
+_DOMAIN = BLOCK
 
 
 def refine(
@@ -79,7 +78,8 @@ def refine(
     """
     smooth, block = sensor.distortion_pixels, problem.block
     models = _shifted(Models.of(moments, smooth), surfaces, blocks, sensor, block)
-    labels, cost = nearest(problem, surfaces, models)
+    labels = _of_blocks(surfaces, problem)
+    cost = costs(labels, problem, models)
     domains = _domains(surfaces, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
     value = energy(labels, problem, models) if refits else 0.0
@@ -97,6 +97,14 @@ def refine(
             break
         labels, models = better, refitted
     return labels, models
+
+
+def _of_blocks(surfaces: NDArray[np.int32], problem: Problem) -> NDArray[np.int32]:
+    """Labels (n,) of the blocks (rows, columns) for their pixels that were measured."""
+    size, width = problem.block, problem.width
+    pixels = surfaces.repeat(size, axis=0)[: len(problem.inverse) // width]
+    pixels = pixels.repeat(size, axis=1)[:, :width]
+    return pixels.ravel() * (problem.weight > 0)
 
 
 def _shifted(
