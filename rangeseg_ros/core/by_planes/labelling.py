@@ -170,7 +170,7 @@ def _expand_near(
     """Expand every label once in some rows, near its boundaries; in place.
 
     In the order of the labels, until the share `cuts` of the pixels at boundaries is used up.
-    Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
+    Label 0 is not expanded: what no plane explains costs it little more, and it gains nothing.
     """
     count = len(models.theta)
     near = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
