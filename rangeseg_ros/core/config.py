@@ -97,13 +97,18 @@ class Config:
         low=0.0,
         high=10000.0,
     )
-    flatness: float = option(
-        0.007,
-        'method planes: a bend of less than this share of its width, root mean square, is a '
-        'plane; of hand-annotated planes none bent by more than 0.5 %, while a sphere in pieces '
-        'of a third of its radius bends by 3 %, a cylinder in strips as wide as its radius by 2 %',
+    plane_probability: float = option(
+        0.3,
+        'method planes: a region is a plane from this probability on, and otherwise a curved '
+        'surface; 0 makes planes of all',
         low=0.0,
         high=1.0,
+    )
+    plane_prior: float = option(
+        0.5,
+        'share of planes among the regions that are found, before their bend is looked at',
+        low=0.001,
+        high=0.999,
     )
     moves: str = option(
         'expansion',
@@ -468,8 +473,11 @@ RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     'sensor_height_noise': ('sensor_height_sd', _as_it_is),
     'up_noise': ('up_sd', _as_it_is),
 }
-# Former parameters that nothing reads any more.
-DROPPED = ('warm_start',)
+# Former parameters that nothing reads any more, and why.
+DROPPED: dict[str, str] = {
+    'flatness': 'plane_probability decides what is a plane',
+    'warm_start': 'no frame depends on those before',
+}
 
 
 def known_name(name: object) -> bool:
@@ -479,11 +487,12 @@ def known_name(name: object) -> bool:
 
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
-    gone = (*RENAMED, *DROPPED)
-    result = {name: value for name, value in mapping.items() if name not in gone}
-    for name in DROPPED:
-        if name in mapping:
-            warnings.warn(f'parameter {name} is no longer read', FutureWarning, stacklevel=3)
+    result = {name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)}
+    for former, reason in DROPPED.items():
+        if former in mapping:
+            warnings.warn(
+                f'parameter {former} is not read any more: {reason}', FutureWarning, stacklevel=3
+            )
     for former, (name, convert) in RENAMED.items():
         if former in mapping:
             result.setdefault(name, convert(mapping[former]))

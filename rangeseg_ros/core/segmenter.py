@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
-from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
@@ -27,10 +26,10 @@ from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
 from rangeseg_ros.core.sensing.grid import GridEdges, weights
-from rangeseg_ros.core.sensing.jump_edges import edges_of_all, jump_edges
+from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.verdict import replication
+from rangeseg_ros.core.sensing.verdict import Cells, replication
 from rangeseg_ros.core.sensing.view import View
 
 
@@ -72,54 +71,56 @@ class Segmenter:
         return with_kernels(lambda: self._segment(image), self.config, image.camera is None)
 
     def _segment(self, image: RangeImage) -> Segmentation:
-        if cells := replication(image):
-            result = self._segment(cells.reduced(image))
-            labels = cells.enlarged(result.labels, image.shape)
-            return replace(result, labels=labels, image=image, cells=cells)
-        config = self.config
+        config, work = self.config, Work.within(self.config.work_budget)
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
                 'distortion_map is not subtracted yet: segment corrected(image, config)'
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
+        cells = replication(image)
+        if cells is None and work.step > 1:
+            cells, config = Cells(work.step, 0, 0), _for_every(work.step, config)
+        if cells is None:
+            return self._find_planes(image, config, work.cuts)
+        result = self._find_planes(cells.reduced(image), config, work.cuts)
+        labels = cells.enlarged(result.labels, image.shape) * image.valid
+        return replace(result, labels=labels, image=image, cells=cells)
+
+    def _find_planes(self, image: RangeImage, config: Config, cuts: float) -> Segmentation:
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        step = Work.within(config.work_budget).step
-        if step > 1:
-            config = _for_every(step, config)
         watch = Stopwatch()
-        view, jumps = _seen(image.every(step) if step > 1 else image, config, step, watch)
-        whole = view.whole if step == 1 else image
+        view, jumps = _preprocessed(image, config, watch)
         labelling: Labelling
         if config.method == 'planes':
-            labelling, view = by_planes.segment(view, config, watch.lap)
+            labelling = by_planes.segment(view, config, cuts, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            flat = by_planes.flat_regions(regions, view, config.flatness)
+            flat = by_planes.flat_regions(
+                regions, view, config.plane_probability, config.plane_prior
+            )
             watch.lap('regions')
-            regions, fits = by_planes.unite_regions(*flat, view)
+            regions, _probability, fits = by_planes.unite_regions(*flat, view)
         else:
             regions, labelling = self._by_normals(view, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, view.image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
-        sensor = view.sensor.magnified(view.step)
-        regions, labels, fits = _of_all(regions, fits, view, sensor, image, whole, config)
-        planes = describe_regions(regions, whole, fits)
-        if len(planes) < len(fits.theta) - 1:
-            # Of some no plane is known: a pixel or two, or so steep that they have no end.
-            kept = np.zeros(len(fits.theta), np.uint16)
-            kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
-            labels = relabel(labels, kept)
+        planes = describe_regions(regions, view.whole, fits)
+        # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
+        # or so steep that they have no end.
+        kept = np.zeros(len(fits.theta), np.uint16)
+        kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
+        labels = relabel(regions, kept) * image.valid
         watch.lap('planes')
         reason = _reason(image, planes)
-        survey = Survey.of(image, sensor, config)
-        if jumps is not None and step > 1:
-            jumps = edges_of_all(jumps, step, image.valid)
+        survey = Survey.of(image, view.sensor, config)
         upright = config.role_tolerance, config.role_area, config.ground_slope
         others = jumps, survey, upright, config.work_budget
-        return Segmentation(labels, planes, watch.laps, reason, sensor, labelling, *others, image)
+        return Segmentation(
+            labels, planes, watch.laps, reason, view.sensor, labelling, *others, image
+        )
 
     def _by_normals(
         self, view: View, config: Config, watch: Stopwatch
@@ -144,8 +145,8 @@ def _for_every(step: int, config: Config) -> Config:
     )
 
 
-def _seen(
-    image: RangeImage, config: Config, step: int, watch: Stopwatch
+def _preprocessed(
+    image: RangeImage, config: Config, watch: Stopwatch
 ) -> tuple[View, GridEdges | None]:
     """What is known of an image before planes are looked for, and its jump edges."""
     blocks = Blocks.of(image)
@@ -164,31 +165,13 @@ def _seen(
     if config.edge_step > 0:
         given = np.full_like(steps.windows, config.edge_step)
         steps = steps._replace(windows=given, pixels=given)
-    # What was measured tells the planes; where they end is told with small holes bridged.
+    # Planes are fitted to what was measured; where they end is found with small holes bridged.
     whole = bridge_holes(image, steps.windows, steps.slopes, holes.result())
-    told = steps.windows, steps.slopes, steps.pixels
-    jumps = jump_edges(whole, config.jump_edges, *told)
+    jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = weights(whole, jumps, config.weighting)
     watch.lap('edges')
     least = least_pixels(config.min_pixels, image.shape)
-    return View(image, whole, blocks, grid, sensor, least, step), jumps
-
-
-def _of_all(
-    regions: NDArray[np.uint16],
-    fits: Fits,
-    view: View,
-    sensor: SensorModel,
-    image: RangeImage,
-    whole: RangeImage,
-    config: Config,
-) -> tuple[NDArray[np.uint16], NDArray[np.uint16], Fits]:
-    """Regions and labels of all pixels of an image, without bridged ones, and the fits of both."""
-    if view.step == 1:
-        return regions, regions * image.valid, fits
-    planes = fits.theta, sensor, config.plane_smoothness * sensor.patch
-    regions, labels, pixels = labels_of_all(regions, view.step, image, whole, *planes)
-    return regions, labels, fits.magnified(view.step, pixels)
+    return View(image, whole, blocks, grid, sensor, least), jumps
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

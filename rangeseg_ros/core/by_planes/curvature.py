@@ -1,4 +1,4 @@
-"""Which regions bend more than the sensor's distortion bends a plane."""
+"""Sums that tell a bent region from one that the sensor's distortion bends."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.bends import Allowed, Residuals, find_bent, find_facets
+from rangeseg_ros.core.by_planes.posterior import Residuals, plane_probabilities
 from rangeseg_ros.core.by_planes.quadratics import add_terms
-from rangeseg_ros.core.fitting.borders import Borders
 from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.interior import find_loose
 from rangeseg_ros.core.runtime.threads import map_halves
@@ -21,16 +20,15 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
 
-def find_curved(
+def probabilities(
     regions: NDArray[np.uint16],
     first: FirstPlanes,
-    borders: Borders,
     image: RangeImage,
     blocks: Blocks,
     sensor: SensorModel,
-    flatness: float,
-) -> NDArray[np.bool_]:
-    """Test the second-order part of the residuals of each region, and of those that touch.
+    prior: float,
+) -> NDArray[np.float64]:
+    """Probability of each region to be a plane, by the second-order part of its residuals.
 
     What is asked for is smooth: of a block of 4 x 4 pixels that a region fills its sums tell it,
     elsewhere the pixels that `first` looks at.
@@ -41,20 +39,18 @@ def find_curved(
         0...M, 0 for no region.
     first : FirstPlanes
         Of the regions.
-    borders : Borders
-        Of the regions.
     image : RangeImage
         (H, W).
     blocks : Blocks
         Of the image.
     sensor : SensorModel
-    flatness : float
-        A bend of less than this share of its width, root mean square, is a plane.
+    prior : float
+        Share of planes among regions.
 
     Returns
     -------
-    (M + 1,) bool
-        Never true for 0.
+    (M + 1,) float64
+        0 for region 0.
     """
     filled, moments, theta, stride = first
     covered = np.maximum(moments[:, COUNT], 1)
@@ -67,21 +63,7 @@ def find_curved(
     powers, right, (square, area, scale) = (a + b for a, b in zip(*parts, strict=True))
     residuals = Residuals(powers, right, square, area, scale, covered, ratio)
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
-    allowed = Allowed(around, alike, float(flatness))
-    bent = find_bent(residuals, allowed)
-    if image.camera is None or not image.camera.pinhole:
-        return bent
-    return find_facets(bent, borders, residuals, allowed, _planes(theta, image.rays), sensor)
-
-
-def _planes(theta: NDArray[np.float64], rays: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Planes as `find_facets` takes them."""
-    height, width = rays.shape[:2]
-    first = rays[0, 0].astype(np.float64)
-    # Pixels are 2 / width apart, and the first is at -1 and -height / width.
-    across = (rays[0, -1] - first) * width / (2 * max(width - 1, 1))
-    down = (rays[-1, 0] - first) * width / (2 * max(height - 1, 1))
-    return theta @ np.array([first + across + down * height / width, across, down]).T
+    return plane_probabilities(residuals, around, alike, prior)
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.descent import REACH, descend, nearest
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     Models,
@@ -31,9 +30,9 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
 _BAND = BLOCK // 2
-# Blocks from a surface that its label is expanded to when exact: where two surfaces may both win
-# pixels. Its plane may well explain pixels anywhere in the image, rarely the surface's.
-_DOMAIN = 2 * REACH
+# Blocks from a surface that shifts of its plane are known for, and that its label is expanded to
+# when exact. Its plane may well explain pixels anywhere in the image, rarely the surface's.
+_DOMAIN = BLOCK
 
 
 def refine(
@@ -77,9 +76,10 @@ def refine(
     models : Models
         The planes the labelling was found for.
     """
-    smooth, block = sensor.distortion_pixels, problem.block * problem.step
+    smooth, block = sensor.distortion_pixels, problem.block
     models = _shifted(Models.of(moments, smooth), surfaces, blocks, sensor, block)
-    labels, cost = nearest(problem, surfaces, models)
+    labels = _of_blocks(surfaces, problem)
+    cost = costs(labels, problem, models)
     domains = _domains(surfaces, problem, len(moments)) if exact else None
     _minimise(labels, cost, problem, models, domains, cuts)
     value = energy(labels, problem, models) if refits else 0.0
@@ -97,6 +97,14 @@ def refine(
             break
         labels, models = better, refitted
     return labels, models
+
+
+def _of_blocks(surfaces: NDArray[np.int32], problem: Problem) -> NDArray[np.int32]:
+    """Labels (n,) of the blocks (rows, columns) for their pixels that were measured."""
+    size, width = problem.block, problem.width
+    pixels = surfaces.repeat(size, axis=0)[: len(problem.inverse) // width]
+    pixels = pixels.repeat(size, axis=1)[:, :width]
+    return pixels.ravel() * (problem.weight > 0)
 
 
 def _shifted(
@@ -123,16 +131,14 @@ def _minimise(
     domains: Sites | None,
     cuts: float,
 ) -> None:
-    """Descend, then expand the labels near their boundaries, or in their domains; in place.
-
-    Near boundaries once, in domains until no expansion helps.
+    """Expand the labels near their boundaries once, or in their domains until that helps no more;
+    in place.
     """
     height = len(labels) // problem.width
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
     if domains is None:
-        run_halves(_improve, height, labelling, problem, models, cuts)
+        run_halves(_expand_near, height, labelling, problem, models, cuts)
         return
-    run_halves(descend, height, labels, cost, problem, models)
     labelling = labelling._replace(data=costs(labels, problem, models))
     chosen = 0, len(models.theta)
     while _expand_each(chosen, (0, height), labelling, problem, models, domains, 1):
@@ -153,18 +159,6 @@ def _domains(surfaces: NDArray[np.int32], problem: Problem, count: int) -> Sites
     return start, np.concatenate(domains).astype(np.int32)
 
 
-def _improve(
-    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models, cuts: float
-) -> None:
-    """Descend in some rows, then expand the labels there; in place.
-
-    Both in one go, as a half of the image in which the one takes long may soon be through with
-    the other.
-    """
-    descend(rows, labelling.labels, labelling.data, problem, models)
-    _expand_near(rows, labelling, problem, models, cuts)
-
-
 @njit(cache=True, nogil=True)
 def _expand_near(
     rows: tuple[int, int],
@@ -176,7 +170,7 @@ def _expand_near(
     """Expand every label once in some rows, near its boundaries; in place.
 
     In the order of the labels, until the share `cuts` of the pixels at boundaries is used up.
-    Label 0 is not expanded: every pixel has had that choice, and it gains next to nothing.
+    Label 0 is not expanded: what no plane explains costs it little more, and it gains nothing.
     """
     count = len(models.theta)
     near = fronts(labelling.labels, labelling.links, labelling.width, count, rows)

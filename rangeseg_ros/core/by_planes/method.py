@@ -8,19 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
-from rangeseg_ros.core.by_planes.curvature import find_curved
+from rangeseg_ros.core.by_planes.curvature import probabilities
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
-from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.borders import Borders, find_borders
 from rangeseg_ros.core.fitting.coplanar import group_coplanar
-from rangeseg_ros.core.fitting.first_planes import STRIDE, FirstPlanes
+from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.regions import by_falling_size, drop_regions, relabel
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.runtime.work import Work
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.view import View
 
@@ -34,56 +32,31 @@ class Labelling:
         0 = no plane.
     """
 
-    def __init__(
-        self,
-        labels: NDArray[np.int32],
-        problem: Problem,
-        models: Models,
-        view: View,
-        smoothness: float,
-    ) -> None:
+    def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
         self.labels = labels
         self._problem = problem
         self._models = models
-        # Of all pixels, where the labels are of every second one.
-        self._view = view
-        self._smoothness = smoothness
 
     def energy(self) -> float:
-        """Value of eq. 5.3 for all pixels, those left out with the labels of `labels_of_all`."""
-        labels, problem, view = self.labels, self._problem, self._view
-        if problem.step > 1:
-            size, sensor = problem.block * problem.step, view.sensor
-            few, planes = labels.astype(np.uint16), (self._models.theta, sensor)
-            pixels = view.image, view.whole, *planes, self._smoothness * sensor.patch
-            labels = labels_of_all(few, problem.step, *pixels)[0].astype(np.int32)
-            problem = Problem.of(view.whole, sensor, view.grid, size, self._smoothness)
-        return energy(labels.ravel(), problem, self._models)
+        """Value of eq. 5.3."""
+        return energy(self.labels.ravel(), self._problem, self._models)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""
 
 
-def segment(view: View, config: Config, lap: Callable[[str], None]) -> tuple[Labelling, View]:
+def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None]) -> Labelling:
     """Label pixels with planes.
 
     Parameters
     ----------
     view : View
     config : Config
-        `plane_smoothness`, `exact`, `refits` and `work_budget` are read.
+        `plane_smoothness`, `exact` and `refits` are read.
+    cuts : float
+        Share of the pixels near boundaries whose labels graph cuts decide.
     lap : callable
         Told the name of every stage that ends.
-
-    Returns
-    -------
-    labelling : Labelling
-        Of the pixels of the view that follows.
-    seen : View
-        The one given. Where neighbours repeat each other, so that one pixel of four tells more
-        than half of what they do, every second one of every second row, unless `exact` or `refits`
-        ask for all. (Of graph cuts at several resolutions: Lombaert et al., A multilevel banded
-        graph cuts method, ICCV 2005.)
     """
     whole, blocks, grid, sensor = view.whole, view.blocks, view.grid, view.sensor
     size = block_size(whole.shape)
@@ -94,74 +67,80 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> tuple[Lab
         blocks = Blocks.of(whole, size)
     nodes = Nodes.of(whole.inverse, grid, blocks, sensor, size)
     lap('blocks')
-    patches = Patches.of(nodes, size, sensor)
     smoothness = config.plane_smoothness
-    thorough = config.exact or config.refits > 0
-    step = 2 if sensor.patch > 2 and size >= BLOCK and not thorough else 1
-    pending = submit(_posed, view, step, size, smoothness)
+    pending = submit(Problem.of, whole, sensor, grid, size, smoothness)
+    patches = Patches.of(nodes, size, sensor)
     # Surfaces as large as regions: smaller ones are clutter.
     surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, view.least)
-    seen, problem = pending.result()
+    problem = pending.result()
     lap('surfaces')
-    cuts = Work.within(config.work_budget).cuts
     labels, models = refine(
         problem, surface, nodes.moments, moments, sensor, config.exact, config.refits, cuts
     )
     lap('labels')
-    labels = labels.reshape(seen.image.shape)
-    return Labelling(labels, problem, models, view, smoothness), seen
-
-
-def _posed(view: View, step: int, block: int, smoothness: float) -> tuple[View, Problem]:
-    """Every `step`-th pixel of every such row, and what they have to explain."""
-    seen = view.every(step) if step > 1 else view
-    grid, block = seen.grid, block // step
-    return seen, Problem.of(seen.whole, view.sensor, grid, block, smoothness, step)
+    return Labelling(labels.reshape(whole.shape), problem, models)
 
 
 def flat_regions(
-    regions: NDArray[np.uint16], view: View, flatness: float
-) -> tuple[NDArray[np.uint16], FirstPlanes, Borders]:
-    """Regions (H, W) without those that bend, numbered anew, their first planes and borders.
+    regions: NDArray[np.uint16], view: View, least: float, prior: float
+) -> tuple[NDArray[np.uint16], NDArray[np.float64], FirstPlanes, Borders]:
+    """Regions (H, W) whose probability to be a plane is not below the `least`, numbered anew.
 
-    See `find_curved`.
+    With these probabilities (M + 1,), their first planes and borders. `prior` is the share of
+    planes among regions.
     """
     seen = view.whole, view.blocks, view.sensor
     pending = submit(find_borders, regions, view.grid, int(regions.max()) + 1)
-    # Of a view of every second pixel all of them, as many as of one of all.
-    first = FirstPlanes.of(regions, *seen, max(STRIDE // view.step, 1))
-    borders = pending.result()
-    curved = find_curved(regions, first, borders, *seen, flatness)
+    first = FirstPlanes.of(regions, *seen)
+    probability = probabilities(regions, first, *seen, prior)
+    curved = probability < least
+    curved[0] = False
     flat = submit(drop_regions, regions, curved)
-    others = first.without(curved), borders.without(curved)
-    return flat.result(), *others
+    others = first.without(curved), pending.result().without(curved)
+    return flat.result(), probability[~curved], *others
 
 
 def unite_regions(
-    regions: NDArray[np.uint16], first: FirstPlanes, borders: Borders, view: View
-) -> tuple[NDArray[np.uint16], Fits]:
-    """Unite regions that touch and whose planes agree; the regions and their planes.
+    regions: NDArray[np.uint16],
+    probability: NDArray[np.float64],
+    first: FirstPlanes,
+    borders: Borders,
+    view: View,
+) -> tuple[NDArray[np.uint16], NDArray[np.float64], Fits]:
+    """Unite regions that touch and whose planes agree.
 
     Parameters
     ----------
     regions : (H, W) uint16
         0...M.
+    probability : (M + 1,) float64
+        Of the regions to be planes.
     first : FirstPlanes
         Of the regions.
     borders : Borders
         Of the regions.
     view : View
         (H, W).
+
+    Returns
+    -------
+    regions : (H, W) uint16
+    probability : (N + 1,) float64
+        Of the united regions: that of their likeliest part, as a plane has no other parts.
+    fits : Fits
+        Of these.
     """
     count = len(first.theta)
     fits = Fits.of(regions, view.image, view.sensor, view.blocks, first, borders)
     group = group_coplanar(fits, borders, view.sensor.agreement)
     if (group == np.arange(count)).all():
-        return regions, fits
+        return regions, probability, fits
     pixels = np.zeros(count, np.intp)
     np.add.at(pixels, group, fits.pixels)
     pixels[0] = 0
     table = by_falling_size(pixels)[group]
     united = submit(relabel, regions, table)
     fits = fits.united(table, view.image.camera is not None)
-    return united.result(), fits
+    likeliest = np.zeros(len(fits.theta))
+    np.maximum.at(likeliest, table, probability)
+    return united.result(), likeliest, fits

@@ -51,8 +51,6 @@ class Problem(NamedTuple):
         Columns of the image.
     block : int
         Rows and columns of the blocks that surfaces are grown from.
-    step : int
-        Columns and rows of the image that the blocks are of, from one pixel to the next.
     """
 
     inverse: NDArray[np.float32]
@@ -62,7 +60,6 @@ class Problem(NamedTuple):
     links: NDArray[np.float32]
     width: int
     block: int
-    step: int
 
     @classmethod
     def of(
@@ -72,19 +69,17 @@ class Problem(NamedTuple):
         grid: Grid,
         block: int,
         smoothness: float,
-        step: int = 1,
     ) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor.
 
         The prior is `smoothness` for each pixel that counts as one measurement with its
-        neighbours. Of every `step`-th column and row borders are `step` times shorter and the data
-        fewer by the square, so that an edge costs that much less for the energy to be alike.
+        neighbours.
         """
         inverse, rays = image.inverse.ravel(), image.rays.reshape(-1, 3)
         weight = _weights(inverse, sensor)
-        prior = link_costs(grid, smoothness * sensor.patch / step)
+        prior = link_costs(grid, smoothness * sensor.patch)
         width = image.shape[1]
-        return cls(inverse, rays, image.pinhole, weight, prior, width, block, step)
+        return cls(inverse, rays, image.pinhole, weight, prior, width, block)
 
 
 # Divides by zero where numpy does, and without branches, so that many pixels are taken at a time.

@@ -43,42 +43,13 @@ def explained(powers: NDArray[np.float64], right: NDArray[np.float64]) -> tuple[
     With the normal equations A = L L^T (Cholesky), b^T A^-1 b is |L^-1 b|^2, and the first terms
     have the first rows to themselves.
     """
-    _, half = _halved(powers, right)
+    half = _halved(powers, right)
     return (half[:3] ** 2).sum(), (half[3:] ** 2).sum()
 
 
 @njit(cache=True)
-def fitted(powers: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Coefficients (6,) of the quadratic."""
-    root, result = _halved(powers, right)
-    for a in range(5, -1, -1):
-        for b in range(a + 1, 6):
-            result[a] -= root[b, a] * result[b]
-        result[a] /= root[a, a]
-    return result
-
-
-@njit(cache=True)
-def taken_off(
-    powers: NDArray[np.float64],
-    right: NDArray[np.float64],
-    square: float,
-    quadratic: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], float]:
-    """Right side (6,) and sum of squares of residuals from which a quadratic (6,) is taken."""
-    less = right.copy()
-    for a in range(6):
-        for b in range(6):
-            less[a] -= powers[_PRODUCTS[a, b]] * quadratic[b]
-        square -= quadratic[a] * (right[a] + less[a])
-    return less, square
-
-
-@njit(cache=True)
-def _halved(
-    powers: NDArray[np.float64], right: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """L and L^-1 b."""
+def _halved(powers: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """L^-1 b."""
     ridge = 1e-9 * max(powers[0], 1.0)
     root, half = np.zeros((6, 6)), np.zeros(6)
     for a in range(6):
@@ -93,4 +64,4 @@ def _halved(
                 root[a, b] = entry / root[b, b]
                 half[a] -= root[a, b] * half[b]
         half[a] /= root[a, a]
-    return root, half
+    return half

@@ -1,16 +1,15 @@
-"""First planes: blocks grow to patches, patches join to surfaces.
+"""Surfaces: blocks grow to patches, patches are agglomerated to planar surfaces.
 
 Agglomerative clustering on the adjacency of blocks, as in Feng, Taguchi and Kamat (ICRA 2014),
-with tests that count the sensor's variances. Real sensors bend planes smoothly, so how far two
-parts may leave their common plane cannot be one number: the plane a patch of a wall suggests is
-off by the distortion where the wall ends, yet the patch beside it agrees. Hence two steps. Blocks
-merge to patches small enough for the distortion to be nearly constant; patches join where they
-agree with their neighbours, averaged along the common border, and the surface as a whole stays
-within the distortion.
+with tests that count the sensor's variances. Real sensors bend planes smoothly: the plane that a
+patch of a wall suggests is off by the distortion where the wall ends, yet the patch beside it
+agrees. Hence two steps: blocks merge to patches over which the distortion is nearly constant, and
+patches to surfaces.
 
-Where noise is strong, chance alone leaves parts of a face apart, and looser tests would join faces
-that meet. What decides then is the energy that the labelling minimises: surfaces unite as long as
-one plane costs their pixels less than their common border does.
+Two parts are one surface for either of two reasons. They agree: one plane explains both as well as
+noise and distortion let expect, and the patches on either side of their border fit each other on
+average. Or one plane costs their pixels less than their common border does in the energy that is
+minimised afterwards (thesis eq. 5.3).
 """
 
 from __future__ import annotations
@@ -22,15 +21,10 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.contacts import (
-    Contacts,
-    absorb,
-    find_contacts,
-    least_contact,
-)
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
+from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit_all
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
@@ -41,6 +35,8 @@ _BETWEEN_PATCHES, _WITHIN_SURFACE = chi2_quantile(1), 2 * OUTLIER**2
 # Blocks of the smallest patch, two by two: fewer hardly determine the direction of a plane, and
 # where a face is rough they are splinters of it.
 _BLOCKS_OF_PATCH = 4
+# What a plane more costs at least: evidence that is no chance for its three parameters.
+_PLANE = chi2_quantile(3) / 2
 
 
 class Patches(NamedTuple):
@@ -114,8 +110,8 @@ def join_surfaces(
     """
     # What a block's side of border costs.
     side = smoothness * sensor.patch * block
-    smooth, agreement = sensor.distortion_pixels, sensor.agreement
-    return _surfaces(patches, nodes.right, nodes.below, smooth, agreement, side, float(least))
+    errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
+    return _surfaces(patches, nodes.right, nodes.below, errors, side, float(least))
 
 
 @njit(cache=True, nogil=True)
@@ -123,18 +119,15 @@ def _surfaces(
     patches: Patches,
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
-    smooth: float,
-    agreement: float,
+    sensor: tuple[float, float, float],
     side: float,
     least: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """What `join_surfaces` returns."""
     labels, moments = patches.labels.copy(), patches.moments
     contacts = find_contacts(labels, right, below, len(moments))
-    part, moments = _renumber(_join(moments, contacts, smooth, agreement), moments, 1.0)
-    _rename(labels, part)
-    contacts = find_contacts(labels, right, below, len(moments))
-    surface, moments = _renumber(_unite(moments, contacts, side, smooth), moments, least)
+    roots = _agglomerate(moments, contacts, sensor, side)
+    surface, moments = _renumber(roots, moments, least)
     _rename(labels, surface)
     return labels, moments
 
@@ -196,124 +189,68 @@ def _renumber(
 
 
 @njit(cache=True, nogil=True)
-def _join(
-    moments: NDArray[np.float64], contacts: Contacts, smooth: float, agreement: float
+def _agglomerate(
+    moments: NDArray[np.float64],
+    contacts: Contacts,
+    sensor: tuple[float, float, float],
+    side: float,
 ) -> NDArray[np.intp]:
-    """Join patches 1...P to surfaces, those that agree best first; returns the roots.
+    """Merge parts 1...P, those that are likeliest one surface first; returns the roots.
 
-    The strain between two surfaces is the mean misfit of the patches on either side of their
-    border. `smooth` is `SensorModel.distortion_pixels`, `agreement` as in `misfit`. The contacts
-    are used up.
+    `sensor` are `distortion_pixels`, `agreement` and `patch` of the sensor model, `side` is what
+    the length of a border costs. The contacts are used up.
     """
     moments, parent = moments.copy(), np.arange(len(moments))
-    residual = _residuals(moments)
+    residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
-    # Of contacts: the strain along the border, and its mean where surfaces may join. Of each
-    # surface: the contact with a later one of least mean strain, and this.
-    strain, mean = np.zeros(len(length)), np.zeros(len(length))
+    # Of contacts: the misfits of the patches along the border, and how far two parts are from one
+    # surface, 1 being too far. Of each part: the nearest later one, and how far that is.
+    strain, apart = np.zeros(len(length)), np.zeros(len(length))
     nearest, least = np.full(len(moments), -1), np.full(len(moments), np.inf)
     for e in range(len(length)):
         a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
         extra = common_residual(moments, a, b) - residual[a] - residual[b]
-        apart = misfit(extra, moments, a, b, _BETWEEN_PATCHES, agreement)
-        strain[e] = apart * length[e]
-        mean[e] = strain[e] / length[e]
+        strain[e] = length[e] * misfit(extra, moments, a, b, _BETWEEN_PATCHES, sensor[1])
+        apart[e] = strain[e] / length[e]
     for a in range(len(moments)):
-        nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
+        nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
     while True:
-        a, strained = _smallest(least)
-        if not strained < 1:
+        a = int(least.argmin())
+        if not least[a] < 1:
             break
         b = target[nearest[a]]
-        chi2 = common_residual(moments, a, b)
-        extra = chi2 - residual[a] - residual[b]
-        pixels = moments[a, COUNT] + moments[b, COUNT]
-        within = _WITHIN_SURFACE * pixels / (pixels + smooth)
-        if misfit(extra, moments, a, b, within, agreement) >= 1:
-            mean[nearest[a] // 2] = np.inf
-            nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
-            continue
-        parent[b], residual[a], least[b] = a, chi2, np.inf
+        residual[a] = common_residual(moments, a, b)
+        parent[b], least[b] = a, np.inf
         moments[a] += moments[b]
         absorb(contacts, strain, a, b)
         h = contacts.head[a]
         while h >= 0:
-            mean[h // 2] = strain[h // 2] / length[h // 2]
-            c = target[h]
-            nearest[c], least[c] = least_contact(contacts, mean, c, np.inf)
+            c, e = target[h], h // 2
+            apart[e] = _apart(moments, residual, a, c, strain[e], length[e], sensor, side)
+            nearest[c], least[c] = least_contact(contacts, apart, c, 1.0)
             h = contacts.link[h]
-        nearest[a], least[a] = least_contact(contacts, mean, a, np.inf)
-    return find_roots(parent)
-
-
-@njit(cache=True, nogil=True)
-def _unite(
-    moments: NDArray[np.float64], contacts: Contacts, side: float, smooth: float
-) -> NDArray[np.intp]:
-    """Unite surfaces 1...K as long as the energy falls, those first by which it falls most.
-
-    The energy is that of eq. 5.3; `side` is what the length of borders costs, `smooth` is
-    `SensorModel.distortion_pixels`. Returns the roots. The contacts are used up.
-    """
-    moments, parent = moments.copy(), np.arange(len(moments))
-    residual = _residuals(moments)
-    length, target = contacts.length, contacts.target
-    # Of contacts: by how much the energy changes if the two unite. Of each surface: the
-    # contact with a later one by which it falls most, and by how much.
-    change = np.zeros(len(length))
-    nearest, least = np.full(len(moments), -1), np.zeros(len(moments))
-    for e in range(len(length)):
-        a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
-        change[e] = _energy_change(moments, residual, a, b, smooth) - side * length[e]
-    for a in range(len(moments)):
-        nearest[a], least[a] = least_contact(contacts, change, a, 0.0)
-    while True:
-        a, falls = _smallest(least)
-        if not falls < 0:
-            break
-        b = target[nearest[a]]
-        parent[b], least[b] = a, 0
-        residual[a] = common_residual(moments, a, b)
-        moments[a] += moments[b]
-        absorb(contacts, change, a, b)
-        h = contacts.head[a]
-        while h >= 0:
-            c = target[h]
-            apart = _energy_change(moments, residual, a, c, smooth)
-            change[h // 2] = apart - side * length[h // 2]
-            nearest[c], least[c] = least_contact(contacts, change, c, 0.0)
-            h = contacts.link[h]
-        nearest[a], least[a] = least_contact(contacts, change, a, 0.0)
+        nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
     return find_roots(parent)
 
 
 @njit(cache=True)
-def _residuals(moments: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Chi-squared that the plane of each of some moments leaves."""
-    theta = np.zeros(3)
-    residual = np.zeros(len(moments))
-    for a in range(len(moments)):
-        residual[a] = fit(moments[a], theta)
-    return residual
-
-
-@njit(cache=True)
-def _energy_change(
-    moments: NDArray[np.float64], residual: NDArray[np.float64], a: int, b: int, smooth: float
+def _apart(
+    moments: NDArray[np.float64],
+    residual: NDArray[np.float64],
+    a: int,
+    b: int,
+    strain: float,
+    length: float,
+    sensor: tuple[float, float, float],
+    side: float,
 ) -> float:
-    """What one plane costs the pixels of two surfaces beyond their own planes."""
+    """How far two parts are from one surface, 1 being too far: by their fit, or by the energy."""
+    smooth, agreement, patch = sensor
     extra = common_residual(moments, a, b) - residual[a] - residual[b]
-    # The distortion that a region so large is granted, as in `Models`.
     pixels = moments[a, COUNT] + moments[b, COUNT]
+    within = _WITHIN_SURFACE * pixels / (pixels + smooth)
+    fits = max(misfit(extra, moments, a, b, within, agreement), strain / length)
+    # The distortion that a region so large is granted, as in `Models`.
     granted = 1 + (moments[a, RATIO] + moments[b, RATIO]) / (pixels + smooth)
-    return 0.5 * extra / granted
-
-
-@njit(cache=True)
-def _smallest(values: NDArray[np.float64]) -> tuple[int, float]:
-    """The smallest of some values: its index, the first of equals, and itself."""
-    index, smallest = 0, values[0]
-    for k in range(1, len(values)):
-        if values[k] < smallest:
-            index, smallest = k, values[k]
-    return index, smallest
+    change = (0.5 * extra / granted - side * length) / patch
+    return min(fits, 1 + change / _PLANE)

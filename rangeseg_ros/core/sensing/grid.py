@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -28,19 +27,6 @@ class Grid(NamedTuple):
 
     right: NDArray[np.float32]
     below: NDArray[np.float32]
-
-    def every(self, step: int) -> Grid:
-        """Between every `step`-th column and row: what is least of the edges on the way.
-
-        Of ceil(H / step) rows and ceil(W / step) columns.
-        """
-        rows, columns = len(self.right), self.below.shape[1]
-        right = self.right[::step, : (columns - 1) // step * step]
-        below = self.below[: (rows - 1) // step * step, ::step]
-        return Grid(
-            reduce(np.minimum, (right[:, k::step] for k in range(step))),
-            reduce(np.minimum, (below[k::step] for k in range(step))),
-        )
 
 
 def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform') -> Grid:

@@ -128,13 +128,3 @@ def _joins(pattern: int) -> bool:
 
 
 _JOINS = np.array([_joins(pattern) for pattern in range(256)])
-
-
-def edges_of_all(edges: GridEdges, step: int, valid: NDArray[np.bool_]) -> GridEdges:
-    """Jump edges between all measured pixels (H, W), beside the pixels that were looked at."""
-    height, width = valid.shape
-    across = np.zeros((height, width - 1), np.bool_)
-    across[:, step - 1 :: step] = edges[0].repeat(step, axis=0)[:height]
-    down = np.zeros((height - 1, width), np.bool_)
-    down[step - 1 :: step] = edges[1].repeat(step, axis=1)[:, :width]
-    return across & valid[:, 1:] & valid[:, :-1], down & valid[1:] & valid[:-1]

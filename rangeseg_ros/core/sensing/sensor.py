@@ -92,16 +92,6 @@ class SensorModel(NamedTuple):
         steps = ('steps of', self.quantum, '1/m'), ('steps of', self.range_quantum, 'm')
         return ', '.join(said + _listed(*steps))
 
-    def magnified(self, factor: float) -> SensorModel:
-        """Of images with `factor` times as many rows and columns: lengths are in pixels."""
-        return self._replace(
-            correlation=factor * self.correlation,
-            distortion_length=factor * self.distortion_length,
-            shown_length=factor * self.shown_length,
-            column_noise=factor * self.column_noise,
-            row_noise=factor * self.row_noise,
-        )
-
     @property
     def patch(self) -> float:
         """Pixels that count as one measurement of the labelling, which compares neighbours.

@@ -1,4 +1,4 @@
-"""A range image as planes are looked for in it, at the resolution at which they are."""
+"""A range image with what is known of it before planes are looked for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 
 
 class View(NamedTuple):
-    """What is known of a range image before planes are looked for.
+    """A range image, its blocks, neighbourhood and errors.
 
     Attributes
     ----------
@@ -27,8 +27,6 @@ class View(NamedTuple):
         Errors of the image.
     least : int
         Pixels of the smallest plane.
-    step : int
-        1 where it has all pixels of the image, n where it has every n-th column of such rows.
     """
 
     image: RangeImage
@@ -37,17 +35,3 @@ class View(NamedTuple):
     grid: Grid
     sensor: SensorModel
     least: int
-    step: int
-
-    def every(self, step: int) -> View:
-        """Every `step`-th column of every such row, with all jumps between these."""
-        image = self.image.every(step)
-        return View(
-            image,
-            self.whole.every(step),
-            Blocks.of(image),
-            self.grid.every(step),
-            self.sensor.magnified(1 / step),
-            -(-self.least // step**2),
-            self.step * step,
-        )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.contacts import absorb, find_contacts, least_contact
+from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts, least_contact
 
 
 def borders(part, right, below, count):
