@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
+from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
@@ -98,19 +99,19 @@ class Segmenter:
             labelling, view = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            flat = by_planes.flat_regions(
+            regions, probability, fits = by_planes.flat_regions(
                 regions, view, config.plane_probability, config.plane_prior
             )
             watch.lap('regions')
-            regions, probability, fits = by_planes.unite_regions(*flat, view)
         else:
             regions, labelling = self._by_normals(view, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, view.image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
+            probability = plane_probabilities(fits, config.plane_prior)
         sensor = view.sensor.magnified(view.step)
         regions, labels, fits = _of_all(regions, fits, view, sensor, image, whole, config)
-        planes = describe_regions(regions, whole, fits)
+        planes = describe_regions(regions, whole, fits, probability)
         if len(planes) < len(fits.theta) - 1:
             # Of some no plane is known: a pixel or two, or so steep that they have no end.
             kept = np.zeros(len(fits.theta), np.uint16)
