@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
+from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
@@ -97,17 +98,21 @@ class Segmenter:
             labelling = by_planes.segment(view, config, cuts, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            flat = by_planes.flat_regions(
-                regions, view, config.plane_probability, config.plane_prior
+            regions, probability, fits = by_planes.flat_regions(
+                regions,
+                view,
+                config.plane_smoothness,
+                config.plane_probability,
+                config.plane_prior,
             )
             watch.lap('regions')
-            regions, _probability, fits = by_planes.unite_regions(*flat, view)
         else:
             regions, labelling = self._by_normals(view, config, watch)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, view.image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
-        planes = describe_regions(regions, view.whole, fits)
+            probability = plane_probabilities(fits, config.plane_prior)
+        planes = describe_regions(regions, view.whole, fits, probability)
         # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
         # or so steep that they have no end.
         kept = np.zeros(len(fits.theta), np.uint16)

@@ -8,16 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
-from rangeseg_ros.core.by_planes.curvature import probabilities
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
-from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
+from rangeseg_ros.core.by_planes.posterior import plane_probabilities
+from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces, unite_regions
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.borders import Borders, find_borders
-from rangeseg_ros.core.fitting.coplanar import group_coplanar
-from rangeseg_ros.core.fitting.first_planes import FirstPlanes
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.regions import by_falling_size, drop_regions, relabel
+from rangeseg_ros.core.regions import drop_regions
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.view import View
@@ -82,65 +79,16 @@ def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None])
 
 
 def flat_regions(
-    regions: NDArray[np.uint16], view: View, least: float, prior: float
-) -> tuple[NDArray[np.uint16], NDArray[np.float64], FirstPlanes, Borders]:
+    regions: NDArray[np.uint16], view: View, smoothness: float, least: float, prior: float
+) -> tuple[NDArray[np.uint16], NDArray[np.float64], Fits]:
     """Regions (H, W) whose probability to be a plane is not below the `least`, numbered anew.
 
-    With these probabilities (M + 1,), their first planes and borders. `prior` is the share of
-    planes among regions.
+    With these probabilities (M + 1,), and their fits. `prior` is the share of planes among
+    regions.
     """
-    seen = view.whole, view.blocks, view.sensor
-    pending = submit(find_borders, regions, view.grid, int(regions.max()) + 1)
-    first = FirstPlanes.of(regions, *seen)
-    probability = probabilities(regions, first, *seen, prior)
+    regions = unite_regions(regions, view.whole, view.grid, view.sensor, smoothness)
+    fits = Fits.of(regions, view.image, view.sensor, view.blocks)
+    probability = plane_probabilities(fits, prior)
     curved = probability < least
     curved[0] = False
-    flat = submit(drop_regions, regions, curved)
-    others = first.without(curved), pending.result().without(curved)
-    return flat.result(), probability[~curved], *others
-
-
-def unite_regions(
-    regions: NDArray[np.uint16],
-    probability: NDArray[np.float64],
-    first: FirstPlanes,
-    borders: Borders,
-    view: View,
-) -> tuple[NDArray[np.uint16], NDArray[np.float64], Fits]:
-    """Unite regions that touch and whose planes agree.
-
-    Parameters
-    ----------
-    regions : (H, W) uint16
-        0...M.
-    probability : (M + 1,) float64
-        Of the regions to be planes.
-    first : FirstPlanes
-        Of the regions.
-    borders : Borders
-        Of the regions.
-    view : View
-        (H, W).
-
-    Returns
-    -------
-    regions : (H, W) uint16
-    probability : (N + 1,) float64
-        Of the united regions: that of their likeliest part, as a plane has no other parts.
-    fits : Fits
-        Of these.
-    """
-    count = len(first.theta)
-    fits = Fits.of(regions, view.image, view.sensor, view.blocks, first, borders)
-    group = group_coplanar(fits, borders, view.sensor.agreement)
-    if (group == np.arange(count)).all():
-        return regions, probability, fits
-    pixels = np.zeros(count, np.intp)
-    np.add.at(pixels, group, fits.pixels)
-    pixels[0] = 0
-    table = by_falling_size(pixels)[group]
-    united = submit(relabel, regions, table)
-    fits = fits.united(table, view.image.camera is not None)
-    likeliest = np.zeros(len(fits.theta))
-    np.maximum.at(likeliest, table, probability)
-    return united.result(), likeliest, fits
+    return drop_regions(regions, curved), probability[~curved], fits.without(curved)

@@ -82,6 +82,11 @@ class Problem(NamedTuple):
         return cls(inverse, rays, image.pinhole, weight, prior, width, block)
 
 
+def pixel_weights(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float32]:
+    """1 / random variance of inverse ranges; 0 where nothing was measured."""
+    return _weights(inverse.ravel(), sensor).reshape(inverse.shape)
+
+
 # Divides by zero where numpy does, and without branches, so that many pixels are taken at a time.
 @njit(cache=True, nogil=True, error_model='numpy')
 def _weights(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float32]:

@@ -10,13 +10,15 @@ compares both hypotheses, the likelihood of each integrated over these (Gauss-He
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.quadratics import explained
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, POINT, RAY, SCATTER, WEIGHT
+from rangeseg_ros.core.fitting.uncertainty import is_empty, level_of
+from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 # Medians and logarithmic standard deviations, by maximum likelihood over 96 planes and curved
 # regions of 17 annotated frames of 12 sensors: bend over width of planes and of curved surfaces,
@@ -28,47 +30,13 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(5)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
-class Residuals(NamedTuple):
-    """What planes leave of regions 0...M, in standard deviations of the noise of a pixel.
-
-    Attributes
-    ----------
-    powers, right : (M + 1, 15), (M + 1, 6) float64
-        Normal equations of a quadratic in the pixel coordinates, see `quadratics`.
-    square : (M + 1,) float64
-        Sum of squares.
-    area, scale : (M + 1,) float64
-        Sums of the area of each pixel on the plane, square metres, and of its standard deviation
-        across it, metres.
-    covered : (M + 1,) float64
-        Number of pixels, holes included.
-    ratio : (M + 1,) float64
-        Of the variances of distortion and noise.
-    """
-
-    powers: NDArray[np.float64]
-    right: NDArray[np.float64]
-    square: NDArray[np.float64]
-    area: NDArray[np.float64]
-    scale: NDArray[np.float64]
-    covered: NDArray[np.float64]
-    ratio: NDArray[np.float64]
-
-
-@njit(cache=True, nogil=True)
-def plane_probabilities(
-    residuals: Residuals, around: float, alike: float, prior: float
-) -> NDArray[np.float64]:
+def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
     """Posterior probability of each region to be a plane and no curved surface.
 
     Parameters
     ----------
-    residuals : Residuals
+    fits : Fits
         Of M + 1 regions.
-    around : float
-        Pixels of a square as wide as the distortion.
-    alike : float
-        Pixels whose noise is alike.
     prior : float
         Share of planes among regions.
 
@@ -77,20 +45,120 @@ def plane_probabilities(
     (M + 1,) float64
         The prior where nothing tells; 0 for region 0.
     """
-    result = np.zeros(len(residuals.covered))
-    for k in range(1, len(result)):
-        size = max(residuals.powers[k, 0], 1.0)
-        linear, bend = explained(residuals.powers[k], residuals.right[k])
+    sums, sensor = fits.sums, fits.sensor
+    around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
+    cells = sums.cells, sums.start, sums.box
+    return _probabilities(*cells, fits.total, fits.theta, sensor, around, alike, prior)
+
+
+@njit(cache=True, nogil=True)
+def _probabilities(
+    cells: NDArray[np.float64],
+    start: NDArray[np.intp],
+    box: NDArray[np.intp],
+    total: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    sensor: SensorModel,
+    around: float,
+    alike: float,
+    prior: float,
+) -> NDArray[np.float64]:
+    result = np.zeros(len(theta))
+    for k in range(1, len(theta)):
+        result[k] = prior
+        if not theta[k].any():
+            continue
+        own = cells[start[k] : start[k + 1]]
+        size, square, linear, bend, scale, ratio = _residuals(own, theta[k], sensor, box[k])
         # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
-        noise = alike * max((residuals.square[k] - linear - bend) / size, 1.0)
-        covered = residuals.covered[k]
-        distortion = residuals.ratio[k] * (covered / around) ** _EXPONENT * size / 3
+        noise = alike * max((square - linear - bend) / size, 1.0)
+        distortion = ratio * (size / around) ** _EXPONENT * size / 3
         # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
-        width = residuals.area[k] * covered / max(residuals.scale[k], 1e-300) ** 2 * size**2 / 3
+        width = _area(total[k]) * size / (3 * scale**2)
         plane = prior * _likelihood(bend, noise, distortion, width, _PLANE)
         curved = (1 - prior) * _likelihood(bend, noise, distortion, width, _CURVED)
         result[k] = plane / (plane + curved) if plane + curved > 0 else 0.0
     return result
+
+
+@njit(cache=True)
+def _residuals(
+    cells: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    sensor: SensorModel,
+    box: NDArray[np.intp],
+) -> tuple[float, float, float, float, float, float]:
+    """What a plane leaves of a region, in standard deviations of the noise of a pixel.
+
+    Number of pixels, sum of the squared residuals, of what a linear fit to the means of cells
+    explains of them, and of what the other terms of a quadratic add; mean standard deviation
+    across the plane, metres, and mean ratio of the variances of distortion and noise.
+    """
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    size = square = scale = ratio = 0.0
+    slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
+    half = max(box[2] - box[0], box[3] - box[1]) / 2
+    for cell in cells:
+        if is_empty(cell):
+            continue
+        count, level = cell[COUNT], level_of(cell, theta)
+        variance = random_variance(sensor, level**2)
+        # Weights of a cloud are not those of its errors.
+        unit = count / (variance * cell[WEIGHT])
+        mean = cell[INVERSE]
+        for a in range(3):
+            mean -= theta[a] * cell[RAY + a]
+        mean /= cell[WEIGHT] * np.sqrt(variance)
+        v = (cell[PLACE] / count - (box[0] + box[2]) / 2) / half
+        u = (cell[PLACE + 1] / count - (box[1] + box[3]) / 2) / half
+        terms = 1.0, u, v, u * u, u * v, v * v
+        for a in range(6):
+            right[a] += count * terms[a] * mean
+            for b in range(a + 1):
+                normal[a, b] += count * terms[a] * terms[b]
+        size += count
+        square += max(squares_left(cell, theta), 0.0) * unit
+        # An error of the inverse leaves the plane by distance / inverse times as much.
+        scale += count * np.sqrt(variance) / (slope * level)
+        ratio += count * systematic_variance(sensor, level**2) / variance
+    linear, bend = _explained(normal, right)
+    return size, square, linear, bend, max(scale / size, 1e-300), ratio / size
+
+
+@njit(cache=True)
+def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> tuple[float, float]:
+    """Sums of squares that the linear terms of a fit explain, and that its quadratic ones add.
+
+    With the normal equations A = L L^T (Cholesky), b^T A^-1 b is |L^-1 b|^2, and the first terms
+    have the first rows to themselves.
+    """
+    ridge = 1e-9 * max(normal[0, 0], 1.0)
+    root, half = np.zeros((6, 6)), np.zeros(6)
+    for a in range(6):
+        half[a] = right[a]
+        for b in range(a + 1):
+            entry = normal[a, b]
+            for c in range(b):
+                entry -= root[a, c] * root[b, c]
+            if a == b:
+                root[a, a] = np.sqrt(max(entry, 0.0) + ridge)
+            else:
+                root[a, b] = entry / root[b, b]
+                half[a] -= root[a, b] * half[b]
+        half[a] /= root[a, a]
+    return (half[:3] ** 2).sum(), (half[3:] ** 2).sum()
+
+
+@njit(cache=True)
+def _area(total: NDArray[np.float64]) -> float:
+    """Area of the rectangle whose points have the same covariance, square metres."""
+    count, scatter = total[COUNT], total[SCATTER : SCATTER + 6] / total[COUNT]
+    x, y, z = total[POINT] / count, total[POINT + 1] / count, total[POINT + 2] / count
+    a, b, c = scatter[0] - x * x, scatter[1] - x * y, scatter[2] - x * z
+    d, e, f = scatter[3] - y * y, scatter[4] - y * z, scatter[5] - z * z
+    aa, _, _, dd, _, ff, _ = cofactors(a, b, c, d, e, f)
+    # The product of the two larger eigenvalues: there is hardly a third one.
+    return 12 * np.sqrt(max(aa + dd + ff, 0.0))
 
 
 @njit(cache=True)

@@ -22,9 +22,13 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
+from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
 from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
+from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.runtime.threads import map_halves
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit_all
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
@@ -112,6 +116,39 @@ def join_surfaces(
     side = smoothness * sensor.patch * block
     errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
     return _surfaces(patches, nodes.right, nodes.below, errors, side, float(least))
+
+
+def unite_regions(
+    regions: NDArray[np.uint16], image: RangeImage, grid: Grid, sensor: SensorModel, prior: float
+) -> NDArray[np.uint16]:
+    """Unite regions whose pixels touch, for the reasons for which patches are.
+
+    Where holes or jumps leave no blocks beside each other, their pixels may still touch.
+
+    Parameters
+    ----------
+    regions : (H, W) uint16
+        0...M.
+    image : RangeImage
+        (H, W), holes bridged.
+    grid : Grid
+    sensor : SensorModel
+    prior : float
+        Of the energy, see `Problem.of`.
+
+    Returns
+    -------
+    (H, W) uint16
+        0...N.
+    """
+    count = int(regions.max(initial=0)) + 1
+    weight = pixel_weights(image.inverse, sensor)
+    moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
+    contacts = find_contacts(regions.astype(np.int32), grid.right > 0, grid.below > 0, count)
+    errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
+    roots = _agglomerate(moments, contacts, errors, prior * sensor.patch)
+    pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
+    return relabel(regions, by_falling_size(pixels)[roots])
 
 
 @njit(cache=True, nogil=True)

@@ -11,14 +11,20 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.outlines import Outline, lies_ahead, triangles
 from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
-from rangeseg_ros.core.fitting.cells import POINT, SCATTER, is_empty, level_of
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
+from rangeseg_ros.core.fitting.uncertainty import (
+    is_empty,
+    level_of,
+    plane_jacobians,
+    sandwiches,
+)
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
     random_variance,
     systematic_variance,
 )
@@ -56,6 +62,9 @@ class Plane:
         0...1: the share of the pixels that the plane explains, times the mean square residual that
         the sensor model expects of them over the observed one where that is larger. About 1 for
         planes, less for what is bent, rough or spills over its border.
+    probability : float
+        0...1: posterior probability that the region is a plane and no curved surface, see
+        `by_planes.posterior`.
     shape : Shape or RegionShape
         What `area`, `extents`, `centre` and `orientation` are of, worked out when first asked
         for.
@@ -75,6 +84,7 @@ class Plane:
     count: int
     rms: float
     confidence: float
+    probability: float
     shape: Shape | RegionShape = field(repr=False)
     outline: Outline = field(repr=False)
     role: str = ''
@@ -167,7 +177,12 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
 
 
-def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) -> list[Plane]:
+def describe_regions(
+    labels: NDArray[np.uint16],
+    image: RangeImage,
+    fits: Fits,
+    probability: NDArray[np.float64],
+) -> list[Plane]:
     """Uncertainty, place and shape of every region's plane.
 
     Parameters
@@ -179,6 +194,8 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         (H, W).
     fits : Fits
         Of these labels.
+    probability : (M + 1,) float64
+        Of the regions to be planes.
 
     Returns
     -------
@@ -189,8 +206,12 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []
-    surfaces = submit(common_surfaces, fits)
-    normal, distance, covariance, centroid, rms, confidence = _described(fits)
+    theta_covariance = fits.covariances()
+    surfaces = submit(common_surfaces, fits, theta_covariance)
+    cells, start = fits.sums.cells, fits.sums.start
+    normal, distance, covariance, centroid, rms, confidence = _described(
+        cells, start, fits.total, theta, theta_covariance, fits.outlier_share(), fits.sensor
+    )
     if image.place.any():
         # They are seen from the sensor, and told in the frame of the points.
         told = np.eye(4)
@@ -210,64 +231,70 @@ def describe_regions(labels: NDArray[np.uint16], image: RangeImage, fits: Fits) 
         found = np.setdiff1d(found, doubtful[~kept])
     surface = surfaces.result()
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    group, offset, pixels, residual, certainty = (
-        column[found].tolist() for column in (surface, distance, fits.pixels, rms, confidence)
-    )
+    columns = surface, distance, fits.pixels, rms, confidence, probability
+    group, offset, *figures = (column[found].tolist() for column in columns)
     known = found.tolist()
     forms = [RegionShape(shapes, k) for k in known], [outlines[k] for k in known]
     equations = normal[found], offset, covariance[found]
-    figures = centroid[found], pixels, residual, certainty
-    return list(map(Plane, known, known, group, *equations, *figures, *forms))
+    return list(map(Plane, known, known, group, *equations, centroid[found], *figures, *forms))
 
 
 @njit(cache=True, nogil=True)
-def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
+def _described(
+    cells: NDArray[np.float64],
+    start: NDArray[np.intp],
+    total: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    theta_covariance: NDArray[np.float64],
+    outlier_share: NDArray[np.float64],
+    sensor: SensorModel,
+) -> tuple[NDArray[np.float64], ...]:
     """Normal, distance, covariance, centroid, rms and confidence of regions 0...M; see `Plane`."""
-    regions = len(fits.theta)
+    regions = len(theta)
     normal, distance = np.zeros((regions, 3)), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
     for k in range(regions):
-        x, y, z = fits.theta[k]
+        x, y, z = theta[k]
         slope = np.sqrt(x * x + y * y + z * z)
         if slope > 0:
             distance[k] = 1 / slope
         for a in range(3):
-            normal[k, a] = -fits.theta[k, a] * distance[k]
-        sums, n, inliers = fits.explained[k], normal[k], max(fits.explained[k, COUNT], 1.0)
+            normal[k, a] = -theta[k, a] * distance[k]
+        n, inliers = normal[k], max(total[k, COUNT], 1.0)
         offset = square = 0.0
         for a in range(3):
-            centroid[k, a] = sums[POINT + a] / inliers
+            centroid[k, a] = total[k, POINT + a] / inliers
             offset += n[a] * centroid[k, a]
         entry = SCATTER
         for a in range(3):
             for b in range(a, 3):
-                square += (1 if a == b else 2) * n[a] * n[b] * sums[entry] / inliers
+                square += (1 if a == b else 2) * n[a] * n[b] * total[k, entry] / inliers
                 entry += 1
         square += distance[k] * (2 * offset + distance[k])
         rms[k] = np.sqrt(max(square, 0.0))
         centroid[k] -= (offset + distance[k]) * n
-        expected = distance[k] ** 2 * _expected_square(fits, k)
-        share = 1 - fits.outliers[k] / max(fits.pixels[k], 1)
-        confidence[k] = share * min(1.0, expected / max(square, 1e-18))
-    covariance = sandwiches(plane_jacobians(normal, distance), fits.covariance)
+        expected = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
+        expected *= distance[k] ** 2
+        confidence[k] = (1 - outlier_share[k]) * min(1.0, expected / max(square, 1e-18))
+    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     return normal, distance, covariance, centroid, rms, confidence
 
 
 @njit(cache=True)
-def _expected_square(fits: Fits, k: int) -> float:
+def _expected_square(
+    cells: NDArray[np.float64], theta: NDArray[np.float64], sensor: SensorModel
+) -> float:
     """Mean square distance from a plane, over distance^2, that the sensor's errors make."""
-    cells, theta, total, pixels = fits.cells, fits.theta[k], 0.0, 0.0
-    for part in fits.parts[fits.start[k] : fits.start[k + 1]]:
-        for c in range(cells.start[part], cells.start[part + 1]):
-            if is_empty(cells.sums[c]):
-                continue
-            level, count = level_of(cells.sums[c], theta), cells.sums[c, COUNT]
-            # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
-            squared = level * level if level > 0 else 1.0
-            variance = random_variance(fits.sensor, squared)
-            variance += systematic_variance(fits.sensor, squared)
-            total += count * variance / squared
-            pixels += count
+    total = pixels = 0.0
+    for cell in cells:
+        if is_empty(cell):
+            continue
+        level, count = level_of(cell, theta), cell[COUNT]
+        # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
+        squared = level * level if level > 0 else 1.0
+        variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+        total += count * variance / squared
+        pixels += count
     return total / max(pixels, 1.0)
 
 

@@ -7,8 +7,8 @@ A^-1 sum_i w_i r_i e_i, with A = sum_i w_i r_i r_i^T, whence the sandwich
 
 The sensor's errors are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)),
 sigma the width of the kernel they look smoothed with. Their sum over pairs of pixels is taken over
-pairs of cells, one axis after the other; where cells are wider than the field, as a sum
-over the pixels of which each counts for the number that agree with it.
+pairs of cells: pixels of a cell spread around its middle like a Gaussian of their variance, over
+which the mean of the correlation has a closed form.
 """
 
 from __future__ import annotations
@@ -19,18 +19,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.cells import WEIGHT, WEIGHTED_RAY, Cells, is_empty, level_of
+from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT
-from rangeseg_ros.core.sensing.sensor import (
-    FLOOR,
-    SensorModel,
-    random_variance,
-    systematic_variance,
-)
+from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
-# Widths of a field that a cell may span and still be treated as a unit.
-_FINE = 2.0
+# Standard deviations of a correlation beyond which it is zero.
+_FAR = 5.0
+# Of a row of `field_units`: mean row and column, their variances, pixels, the deviation and the
+# weighted ray (3) times it.
+_UNIT = 9
 
 
 class Field(NamedTuple):
@@ -44,24 +42,21 @@ class Field(NamedTuple):
     quartic: float
 
 
-def systematic_field(sensor: SensorModel) -> Field:
-    """The smooth errors of a sensor."""
+def distortion_field(sensor: SensorModel) -> Field:
+    """The smooth systematic errors of a sensor."""
     return Field(
         sensor.distortion_length, np.square(sensor.distortion), np.square(sensor.range_distortion)
     )
 
 
 def theta_covariances(
-    cells: Cells,
-    theta: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    sensor: SensorModel,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Covariance of each plane in the form theta . ray = inverse range, and the sum within it.
+    sums: RegionSums, theta: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
+) -> NDArray[np.float64]:
+    """Covariance of each plane in the form theta . ray = inverse range.
 
     Parameters
     ----------
-    cells : Cells
+    sums : RegionSums
         Of M + 1 regions.
     theta : (M + 1, 3) float64
         Their planes; zeros where there is none.
@@ -72,16 +67,17 @@ def theta_covariances(
     Returns
     -------
     (M + 1, 3, 3) float64
-        The covariances; zeros where there is no plane.
-    (M + 1, 3, 3) float64
-        The sums over pairs of pixels between A^-1 and A^-1.
+        Zeros where there is no plane.
     """
+    smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     random = Field(
-        sensor.correlation, FLOOR + np.square(sensor.noise), np.square(sensor.range_noise)
+        sensor.correlation,
+        smooth * (FLOOR + np.square(sensor.noise)),
+        smooth * np.square(sensor.range_noise),
     )
-    fields = random, systematic_field(sensor)
-    result = np.zeros_like(inverse), np.zeros_like(inverse)
-    map_halves(_covariances, len(theta), cells, theta, inverse, sensor, *fields, *result)
+    fields = random, distortion_field(sensor)
+    result = np.zeros_like(inverse)
+    map_halves(_covariances, len(theta), sums, theta, inverse, sensor, 1 - smooth, *fields, result)
     return result
 
 
@@ -157,151 +153,151 @@ def plane_jacobians(
 def _covariances(
     first: int,
     after: int,
-    cells: Cells,
+    sums: RegionSums,
     theta: NDArray[np.float64],
     inverse: NDArray[np.float64],
     sensor: SensorModel,
+    white: float,
     random: Field,
-    systematic: Field,
-    covariance: NDArray[np.float64],
-    middle: NDArray[np.float64],
+    distortion: Field,
+    result: NDArray[np.float64],
 ) -> None:
-    """What `theta_covariances` returns, of the regions from the first to before the second.
-
-    More than seven parameters: the first two are the share of a thread, and the errors of the
-    sensor are two fields.
-    """
-    white = sensor.white if sensor.correlation > 0 else 1.0
+    """What `theta_covariances` returns, of the regions from the first to before the second."""
     for k in range(max(first, 1), after):
         if not theta[k].any():
             continue
-        own = cells.sums[cells.start[k] : cells.start[k + 1]]
-        random_square = np.zeros((3, 3))
-        systematic_square = np.zeros((3, 3))
-        count = 0.0
-        for c in range(len(own)):
-            if is_empty(own[c]):
+        cells = sums.cells[sums.start[k] : sums.start[k + 1]]
+        middle = np.zeros((3, 3))
+        for c in range(len(cells)):
+            if is_empty(cells[c]):
                 continue
-            count += own[c, COUNT]
             # Squares of the same scale as the rays: variance times weight.
-            level = level_of(own[c], theta[k])
-            mean = own[c, WEIGHT] / own[c, COUNT]
-            of_random = mean * random_variance(sensor, level**2)
-            of_systematic = mean * systematic_variance(sensor, level**2)
-            entry = 0
-            for a in range(3):
-                for b in range(a, 3):
-                    random_square[a, b] += of_random * own[c, entry]
-                    systematic_square[a, b] += of_systematic * own[c, entry]
-                    entry += 1
-        for a in range(3):
-            for b in range(a):
-                random_square[a, b] = random_square[b, a]
-                systematic_square[a, b] = systematic_square[b, a]
-        result = white * random_square
-        # Sides of pixels overstate the length of a border by 4 / pi on average.
-        share = np.pi / 4 * cells.border[k] / max(count, 1.0)
-        if white < 1:
-            result += (1 - white) * _field(cells, k, theta[k], random, random_square, share)
-        if systematic.constant + systematic.quartic > 0:
-            result += _field(cells, k, theta[k], systematic, systematic_square, share)
-        middle[k] = result
-        sandwich(inverse[k], result, covariance[k])
+            variance = white * random_variance(sensor, level_of(cells[c], theta[k]) ** 2)
+            _add_symmetric(middle, cells[c], variance * cells[c, WEIGHT] / cells[c, COUNT], False)
+        for field in (random, distortion):
+            if field.constant + field.quartic > 0:
+                _add_field(middle, cells, theta[k], field)
+        sandwich(inverse[k], middle, result[k])
 
 
 @njit(cache=True)
-def _field(
-    cells: Cells,
-    k: int,
+def _add_symmetric(
+    middle: NDArray[np.float64], cell: NDArray[np.float64], factor: float, centred: bool
+) -> None:
+    """Add so many times the sum of w r r^T of a cell, around its mean ray where `centred`."""
+    entry = 0
+    for a in range(3):
+        for b in range(a, 3):
+            value = cell[entry]
+            if centred:
+                value -= cell[RAY + a] * cell[RAY + b] / cell[WEIGHT]
+            middle[a, b] += factor * value
+            if a != b:
+                middle[b, a] += factor * value
+            entry += 1
+
+
+@njit(cache=True)
+def _add_field(
+    middle: NDArray[np.float64],
+    cells: NDArray[np.float64],
     theta: NDArray[np.float64],
     field: Field,
-    square: NDArray[np.float64],
-    border: float,
-) -> NDArray[np.float64]:
-    """Sum over pairs of pixels of region `k`.
-
-    `square` is the sum over the single pixels, `border` the length of border per pixel.
-    """
-    if cells.size[k] <= _FINE * field.width:
-        return pairs(cells, k, theta, k, theta, field)
-    # Along each row and column, as many pixels agree as the correlation sums to.
-    line = 1.0
-    for lag in range(1, int(8 * field.width) + 2):
-        if field.width > 0:
-            line += 2 * np.exp(-((lag / field.width) ** 2) / 4)
-    # Those within width / sqrt(pi) of the border miss half of them on average.
-    inside = max(1 - border * field.width / np.sqrt(np.pi), 0.5)
-    return max(line * line * inside, 1.0) * square
+) -> None:
+    """Add the sum over pairs of pixels of a region."""
+    middle += common_errors(cells, theta, cells, theta, field)
+    variance = 2 * field.width**2
+    for c in range(len(cells)):
+        if is_empty(cells[c]):
+            continue
+        # Within a cell the error varies as far as the field is narrower.
+        unit = np.empty(_UNIT)
+        _fill_unit(unit, cells[c], theta, field)
+        spread = (unit[2] + unit[3]) / 2
+        alike = unit[4] * _mean_correlation(unit, unit, field.width)
+        share = spread / (variance + spread) if spread > 0 else 0.0
+        mean = cells[c, WEIGHT] / cells[c, COUNT]
+        _add_symmetric(middle, cells[c], share * alike * unit[5] ** 2 * mean, True)
 
 
 @njit(cache=True)
-def pairs(
-    cells: Cells,
-    a: int,
+def common_errors(
+    cells_a: NDArray[np.float64],
     theta_a: NDArray[np.float64],
-    b: int,
+    cells_b: NDArray[np.float64],
     theta_b: NDArray[np.float64],
     field: Field,
 ) -> NDArray[np.float64]:
-    """Sum over pairs of pixels, the first of region a, the second of b, (3, 3)."""
-    rays_a, rays_b = _scaled_rays(cells, a, theta_a, field), _scaled_rays(cells, b, theta_b, field)
-    along = _correlation(cells, a, b, rays_a.shape[1], rays_b.shape[1], 1, field.width)
-    down = _correlation(cells, a, b, rays_a.shape[0], rays_b.shape[0], 0, field.width)
-    # First the columns, then the rows: cubes instead of fourth powers of the grid's side.
-    half = np.zeros((rays_b.shape[0], rays_a.shape[1], 3))
-    for i in range(rays_b.shape[0]):
-        for j in range(rays_b.shape[1]):
-            for m in range(rays_a.shape[1]):
+    """Sum over pairs of pixels (3, 3), the first of region a, the second of b: of cells' means."""
+    units_a, units_b = _units(cells_a, theta_a, field), _units(cells_b, theta_b, field)
+    result, seen = np.zeros((3, 3)), np.zeros(3)
+    for i in range(len(units_a)):
+        seen[:] = 0
+        for j in range(len(units_b)):
+            correlation = _mean_correlation(units_a[i], units_b[j], field.width)
+            if correlation > 0:
                 for p in range(3):
-                    half[i, m, p] += along[m, j] * rays_b[i, j, p]
-    result = np.zeros((3, 3))
-    seen = np.zeros(3)
-    for i in range(rays_a.shape[0]):
-        for j in range(rays_a.shape[1]):
-            seen[:] = 0
-            for m in range(rays_b.shape[0]):
-                for p in range(3):
-                    seen[p] += down[i, m] * half[m, j, p]
-            for p in range(3):
-                for q in range(3):
-                    result[p, q] += rays_a[i, j, p] * seen[q]
+                    seen[p] += correlation * units_b[j, 6 + p]
+        for p in range(3):
+            for q in range(3):
+                result[p, q] += units_a[i, 6 + p] * seen[q]
     return result
 
 
 @njit(cache=True)
-def _scaled_rays(
-    cells: Cells, k: int, theta: NDArray[np.float64], field: Field
+def _units(
+    cells: NDArray[np.float64], theta: NDArray[np.float64], field: Field
 ) -> NDArray[np.float64]:
-    """Sums of weighted rays times the field's standard deviation, (rows, columns, 3)."""
-    own = cells.sums[cells.start[k] : cells.start[k + 1]]
-    columns = cells.columns[k]
-    rays = np.zeros((len(own) // columns, columns, 3))
-    for c in range(len(own)):
-        if not is_empty(own[c]):
-            level = level_of(own[c], theta)
-            deviation = np.sqrt(field.constant + field.quartic * level**4)
-            for p in range(3):
-                rays[c // columns, c % columns, p] = deviation * own[c, WEIGHTED_RAY + p]
-    return rays
+    """Cells as a field sees them, (N, 9), see `_UNIT`."""
+    units, count = np.empty((len(cells), _UNIT)), 0
+    for c in range(len(cells)):
+        if not is_empty(cells[c]):
+            _fill_unit(units[count], cells[c], theta, field)
+            count += 1
+    return units[:count]
 
 
-@njit(cache=True)
-def _correlation(
-    cells: Cells, a: int, b: int, count_a: int, count_b: int, axis: int, width: float
-) -> NDArray[np.float64]:
-    """Mean correlation between the pixels of two rows of cells, (count_a, count_b)."""
-    size_a, size_b = cells.size[a], cells.size[b]
-    # The offsets within both cells widen the correlation by their variances.
+@njit(cache=True, inline='always')
+def _fill_unit(
+    unit: NDArray[np.float64],
+    cell: NDArray[np.float64],
+    theta: NDArray[np.float64],
+    field: Field,
+) -> None:
+    count = cell[COUNT]
+    for axis in range(2):
+        unit[axis] = cell[PLACE + axis] / count
+        unit[2 + axis] = max(cell[PLACE + 2 + axis] / count - unit[axis] ** 2, 0.0)
+    unit[4] = count
+    unit[5] = np.sqrt(field.constant + field.quartic * level_of(cell, theta) ** 4)
+    for p in range(3):
+        unit[6 + p] = unit[5] * cell[RAY + p]
+
+
+@njit(cache=True, inline='always')
+def _mean_correlation(one: NDArray[np.float64], other: NDArray[np.float64], width: float) -> float:
+    """Mean correlation between the pixels of two cells; 0 where they are far apart."""
     variance = 2 * width**2
-    wide = variance + (size_a**2 + size_b**2 - 2) / 12
-    gain = np.sqrt(variance / wide)
-    result = np.empty((count_a, count_b))
-    for i in range(count_a):
-        for j in range(count_b):
-            if a == b and min(i, j) > 0:
-                result[i, j] = result[i - 1, j - 1]
-                continue
-            lag = cells.origin[a, axis] + (i + 0.5) * size_a
-            lag -= cells.origin[b, axis] + (j + 0.5) * size_b
-            result[i, j] = gain * np.exp(-(lag**2) / (2 * wide))
-    return result
+    down, across = variance + one[2] + other[2], variance + one[3] + other[3]
+    lag = (one[0] - other[0]) ** 2 / max(down, 1e-300)
+    lag += (one[1] - other[1]) ** 2 / max(across, 1e-300)
+    if lag > _FAR**2:
+        return 0.0
+    mean = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
+    # A pixel agrees with itself.
+    return mean if lag > 0 else max(mean, 1 / min(one[4], other[4]))
+
+
+@njit(cache=True)
+def is_empty(cell: NDArray[np.float64]) -> bool:
+    """Whether no pixel is in a cell, or none that weighs anything."""
+    return cell[COUNT] == 0 or cell[WEIGHT] <= 0
+
+
+@njit(cache=True)
+def level_of(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
+    """Inverse range of a plane at the middle of a cell."""
+    total = 0.0
+    for a in range(3):
+        total += theta[a] * cell[RAY + a]
+    return total / cell[WEIGHT]

@@ -23,7 +23,7 @@ class MapPlane(Plane):
     All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
     seen from. `extents`, `centre` and `orientation` are those of the least rectangle around all
     parts, `count` is the number of pixels of all observations, `rms` and
-    `confidence` are means over them, and `role` is what most observations found.
+    `confidence` are means over them, `probability` is the largest, and `role` is what most observations found.
 
     Attributes
     ----------
@@ -60,6 +60,7 @@ class Record:
     pixels: int = 0
     squares: float = 0.0
     confidence: float = 0.0
+    probability: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
     outline: shapely.Geometry = field(default_factory=shapely.Polygon)
     margin: shapely.Geometry | None = None
@@ -91,6 +92,7 @@ class Record:
         self.pixels += plane.count
         self.squares += plane.count * plane.rms**2
         self.confidence += plane.count * plane.confidence
+        self.probability = max(self.probability, plane.probability)
         self.roles[plane.role] += 1
 
     def reshape(self, outline: shapely.Geometry, margin: shapely.Geometry | None = None) -> None:
@@ -108,6 +110,7 @@ class Record:
         self.pixels += other.pixels
         self.squares += other.squares
         self.confidence += other.confidence
+        self.probability = max(self.probability, other.probability)
         self.roles += other.roles
 
 
@@ -146,6 +149,7 @@ def describe(
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
+        probability=record.probability,
         shape=Shape(
             area=record.outline.area,
             extents=extents,
