@@ -135,7 +135,7 @@ def test_ground_and_obstacles_share_out_the_points(bench):
         )
     image = RangeImage.from_depth(depth, bench.camera)
     terrain = Segmenter(Config()).segment(image).terrain
-    for cloud, class_, fields in ((ground, GROUND, 'xyz'), (obstacles, OBSTACLE, 'xyz ')):
+    for cloud, class_, fields in ((ground, GROUND, 'xyz '), (obstacles, OBSTACLE, 'xyz ')):
         assert cloud.header == message.header
         step = 4 * len(fields)
         assert (cloud.height, cloud.point_step, cloud.is_dense) == (1, step, True)
@@ -159,7 +159,7 @@ def test_without_a_floor_all_are_obstacles(bench):
             bench.until(lambda name=name: bench.find(name, image))
             for name in ('ground', 'obstacles')
         )
-    assert ground.width == 0 and len(ground.fields) == 3
+    assert ground.width == 0 and len(ground.fields) == 4
     assert obstacles.width == bench.camera.width * bench.camera.height
 
 
