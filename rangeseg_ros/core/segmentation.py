@@ -255,6 +255,6 @@ class Segmentation:
     def __getstate__(self) -> dict[str, Any]:
         kept = WorkedOut(self.energy, self.labelling.normals())
         survey, stairs = self.ground, self.stairs
-        found = {'survey': survey, 'stairs': stairs, 'grid': self.grid, 'tilt': self.tilt}
+        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt}
         judged = {'verdict': self.verdict, 'image': None}
         return {**self.__dict__, 'labelling': kept, **found, **judged}

@@ -41,7 +41,7 @@ def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
     )
     info = make(
         'nav_msgs/msg/MapMetaData',
-        map_load_time=header.stamp,
+        map_load_time=make('builtin_interfaces/msg/Time', sec=0, nanosec=0),
         resolution=float(grid.resolution),
         width=values.shape[1],
         height=values.shape[0],
@@ -52,8 +52,9 @@ def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
 
 def grid_header(make: Make, header: Any, grid: GroundGrid) -> Any:
     """Header of the messages of a grid: in the fixed frame where it has one."""
-    frame = grid.frame or header.frame_id
-    return make('std_msgs/msg/Header', stamp=header.stamp, frame_id=frame)
+    if not grid.frame:
+        return header
+    return make('std_msgs/msg/Header', stamp=header.stamp, frame_id=grid.frame)
 
 
 def grid_points(grid: GroundGrid) -> NDArray[np.float32]:

@@ -2,5 +2,3 @@
 
 UNKNOWN, GROUND, OBSTACLE, DROP = range(4)
 """Values of `Segmentation.terrain`: not measured or not known, ground, in the way, below."""
-HIDDEN = -1
-"""Of cells: unknown, and not ground whatever the height of a pixel."""

@@ -287,7 +287,10 @@ def _with_ground(
     limits: Limits,
     turned: bool,
 ) -> Terrain:
-    """Classes and heights by the ground that was reached, continued."""
+    """Classes and heights by the ground that was reached, continued.
+
+    More than seven parameters: all that was found on the way.
+    """
     field = ground_field(cells, reached, stand.theta, size, up)
     height = field.heights(cells)
     # Relief counts as noise: what the cells of the ground scatter by.

@@ -1,0 +1,111 @@
+"""The grid of the ground around a robot: what it remembers and what it forgets."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rangeseg_ros import Config, RangeImage
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.points import thinned
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.simulation.scenes import Pose
+from rangeseg_ros.simulation.sensors.kinect import Kinect
+from rangeseg_ros.simulation.sensors.sensor import resize
+from rangeseg_ros.simulation.solids import box
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
+
+CAMERA = resize(Kinect().camera, 320, 240)
+HEIGHT, EDGE = 0.8, 2.0
+FLOOR = Piece(slab(-3, EDGE, 0, 0, ALL), GROUND)
+LANDING = Piece(slab(EDGE, FAR, -0.15, -0.15, ALL), DROP, 0.15)
+BOX = Piece(box((0.2, 0.2, 0.3), np.eye(3), (1.4, 0.3, 0.15)), OBSTACLE, 0.3)
+
+
+class Drive:
+    """A camera on a robot that is at x, looking ahead; world: z up."""
+
+    def __init__(self, pitch=30, posed=True, **parameters):
+        self.pose = Pose.looking((0, 0, HEIGHT), 0, pitch, 0)
+        up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, self.pose.rotation[2]), strict=True))
+        fixed = {'fixed_frame': 'map'} if posed else {}
+        self.sequence = SequenceSegmenter(
+            Config(**up, **fixed, sensor_height=HEIGHT, **parameters)
+        )
+
+    def grid(self, x, second, pieces=(FLOOR, LANDING, BOX)):
+        pose = replace_position(self.pose, (x, 0, HEIGHT))
+        scene = Terrain('', tuple(pieces), (slab(-3, FAR, 0, 0, ALL),), pose)
+        frame = simulate_terrain(scene, Kinect(), CAMERA, seed=int(second))
+        at = Transform(pose.rotation, pose.position) if self.sequence.config.map_frame else None
+        image = RangeImage.from_depth(frame.depth, CAMERA)
+        return self.sequence.segment(image, int(1e9 * second), pose=at).grid
+
+
+def replace_position(pose, position):
+    position = np.array(position, float)
+    return (
+        pose._replace(position=position)
+        if hasattr(pose, '_replace')
+        else replace(pose, position=position)
+    )
+
+
+def at(grid, x, y, values=None):
+    """Of the cell of a place in the frame of the grid."""
+    column, row = np.floor((np.array([x, y]) - grid.origin[:2]) / grid.resolution).astype(int)
+    return (grid.classes if values is None else values)[row, column]
+
+
+def test_what_has_left_the_view_is_remembered_where_it_was():
+    drive = Drive()
+    for k in range(12):
+        grid = drive.grid(0.1 * k, 0.2 * k)
+    assert grid.frame == 'map' and grid.resolution == 0.05
+    # 1.1 m on, the box is 0.3 m ahead and below the view.
+    assert at(grid, 1.4, 0.3) == OBSTACLE
+    assert at(grid, 1.4, -0.3) == GROUND
+    assert at(grid, 1.4, -0.3, grid.height) == pytest.approx(0, abs=0.02)
+    assert at(grid, 1.4, -0.3, grid.age) > 0.3
+    # Lethal is what lies beyond the edge, as long as rays cross the ground there.
+    beyond = {at(grid, EDGE + 0.1 + 0.05 * k, 0.05 * n) for k in range(6) for n in range(-8, 8)}
+    assert GROUND not in beyond and DROP in beyond
+    assert at(grid, -1.0, 0.0) == UNKNOWN
+
+
+def test_ground_that_is_seen_again_takes_danger_back_and_age_forgets():
+    drive = Drive(grid_memory=5.0)
+    for k in range(3):
+        assert at(drive.grid(0, 0.1 * k), 1.4, 0.3) == OBSTACLE
+    gone = [at(drive.grid(0, 1 + 0.1 * k, (FLOOR, LANDING)), 1.4, 0.25) for k in range(12)]
+    assert gone[0] == OBSTACLE and gone[-1] == GROUND
+    # At once when it is back.
+    assert at(drive.grid(0, 3), 1.4, 0.25) == OBSTACLE
+    wall = Piece(box((1, 20, 12), np.eye(3), (1.1, 0, 0)), OBSTACLE, 3.0)
+    hidden = drive.grid(0, 9, (wall, FLOOR))
+    assert at(hidden, 1.8, -0.3) == UNKNOWN and np.isinf(at(hidden, 1.8, -0.3, hidden.age))
+
+
+def test_without_poses_the_grid_is_of_one_image_and_in_its_frame():
+    drive = Drive(posed=False)
+    drive.grid(0, 0)
+    grid = drive.grid(0, 1, (FLOOR, LANDING))
+    assert grid.frame == ''
+    assert OBSTACLE not in grid.classes and (grid.classes == GROUND).sum() > 300
+
+
+def test_time_that_goes_back_forgets():
+    drive = Drive()
+    drive.grid(0, 5)
+    assert OBSTACLE not in drive.grid(0, 1, (FLOOR, LANDING)).classes
+
+
+def test_a_thinned_cloud_has_a_point_of_every_cube_that_has_any():
+    points = np.random.default_rng(0).uniform(-2, 2, (5000, 4)).astype(np.float32)
+    kept = thinned(points, 0.5)
+    cubes = {tuple(cube) for cube in np.floor(points[:, :3] / 0.5).astype(int)}
+    assert {tuple(cube) for cube in np.floor(kept[:, :3] / 0.5).astype(int)} == cubes
+    assert len(kept) == len(cubes) and len(thinned(points, 0.01, 1000)) <= 1000
+    assert (thinned(points, 0.0) == points).all()
