@@ -22,8 +22,8 @@ class MapPlane(Plane):
 
     All that `Plane` tells is of the fixed frame; the normal points to the side that the plane was
     seen from. `extents`, `centre` and `orientation` are those of the least rectangle around all
-    parts, `count` is the number of pixels of all observations, `rms` and
-    `confidence` are means over them, `probability` is the largest, and `role` is what most observations found.
+    parts, `count` is the number of pixels of all observations, `rms` and `confidence` are means
+    over them, `probability` is the largest, and `role` is what most observations found.
 
     Attributes
     ----------
