@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid, weights
+from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
@@ -45,18 +45,3 @@ def test_shadow_is_disconnected_and_small_images_pass(shape, weighting):
     horizontal, vertical = weights(image_of(np.zeros(shape)), None, weighting)
     assert horizontal.shape == (shape[0], shape[1] - 1) and not horizontal.any()
     assert vertical.shape == (shape[0] - 1, shape[1]) and not vertical.any()
-
-
-@pytest.mark.parametrize('step', [2, 3])
-@pytest.mark.parametrize('shape', [(1, 1), (4, 6), (5, 8), (7, 3)])
-def test_coarser_edges_are_the_least_on_the_way(shape, step):
-    random = np.random.default_rng(3).random
-    height, width = shape
-    grid = Grid(random((height, width - 1)), random((height - 1, width)))
-    coarse = grid.every(step)
-    assert coarse.right.shape == (-(-height // step), -(-width // step) - 1)
-    assert coarse.below.shape == (-(-height // step) - 1, -(-width // step))
-    for (i, j), weight in np.ndenumerate(coarse.right):
-        assert weight == min(grid.right[i * step, j * step + k] for k in range(step))
-    for (i, j), weight in np.ndenumerate(coarse.below):
-        assert weight == min(grid.below[i * step + k, j * step] for k in range(step))

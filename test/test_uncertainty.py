@@ -4,14 +4,11 @@ import numpy as np
 import pytest
 from planes_of_labels import fit_planes
 
-from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.uncertainty import (
     plane_jacobians,
     sandwiches,
-    theta_covariances,
 )
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.fields import smooth_field
@@ -51,15 +48,6 @@ def full(height, width):
     return np.ones((height, width), bool)
 
 
-def without_rim(mask):
-    """Pixels that their diagonal neighbours two steps away, within the image, are like."""
-    above, below = np.maximum(np.arange(len(mask)) - 2, 0), np.arange(len(mask)) + 2
-    left, right = np.maximum(np.arange(mask.shape[1]) - 2, 0), np.arange(mask.shape[1]) + 2
-    below, right = np.minimum(below, len(mask) - 1), np.minimum(right, mask.shape[1] - 1)
-    corners = [mask[np.ix_(i, j)] for i in (above, below) for j in (left, right)]
-    return mask & np.logical_and.reduce(corners)
-
-
 @pytest.mark.parametrize('kind', models(1))
 @pytest.mark.parametrize(
     ('view', 'shape'),
@@ -78,7 +66,6 @@ def test_sums_over_cells_are_those_over_pixels(kind, view, shape):
     image = RangeImage(camera.rays, exact.astype(np.float32), camera)
     (plane,) = fit_planes(mask.astype(np.uint16), image, sensor)
 
-    mask = without_rim(mask)
     rows, columns = np.nonzero(mask)
     squared = (rows[:, None] - rows) ** 2 + (columns[:, None] - columns) ** 2
     level = exact[mask] ** 4
@@ -179,34 +166,6 @@ def test_no_variance_is_negative():
     (plane,) = fit_planes(labels, image, SensorModel(0, 0, 0.33, 2, 0.0014, 0, 7))
     values = np.linalg.eigvalsh(plane.covariance)
     assert values[0] > -1e-9 * values[-1]
-
-
-def test_uniting_nothing_changes_no_covariance():
-    """Of 23 pixels across a hundredth of a degree A^-1 magnifies any rounding."""
-    camera = Camera(49, 12, 1e5, 1e5, 24, 5.5, 0.0, 'plumb_bob', (-0.2, 0.05, 0.001, 0, 0))
-    labels = np.zeros(camera.shape, np.uint16)
-    labels[5, :23] = 1
-    image = RangeImage.from_depth(np.full(camera.shape, 47.625), camera)
-    fits = Fits.of(labels, image, SensorModel(0.1, 0, 0.33, 2, 0.00145, 0, 35))
-    united = fits.united(np.arange(2), central=True)
-    assert np.array_equal(united.covariance, fits.covariance)
-
-
-def test_cells_whose_weight_is_lost_by_rounding_count_for_nothing():
-    camera = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
-    labels = np.ones(camera.shape, np.uint16)
-    image = RangeImage.from_depth(np.full(camera.shape, 2.0), camera)
-    sensor = SensorModel(0.001, 0, 0.33, 2, 0.001, 0, 7)
-    fits = Fits.of(labels, image, sensor)
-    covariances = []
-    for count in (0, 5):
-        sums = fits.cells.sums.copy()
-        cell = np.flatnonzero(sums[:, COUNT])[0]
-        sums[cell] = 0
-        sums[cell, COUNT] = count
-        cells = fits.cells._replace(sums=sums)
-        covariances.append(theta_covariances(cells, fits.theta, fits.inverse, sensor)[0])
-    np.testing.assert_array_equal(*covariances)
 
 
 @pytest.mark.parametrize('rank', [0, 1, 2, 3])

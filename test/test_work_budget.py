@@ -8,11 +8,8 @@ import pytest
 from clouds import cloud_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.by_planes.upsampling import labels_of_all
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.runtime.work import Work
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
-from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -86,88 +83,6 @@ def test_the_sensor_is_said_in_pixels_of_the_image(results):
     assert coarse.noise == pytest.approx(full.noise, rel=0.5)
     # Half of an odd number of rows is rounded up.
     assert coarse.distortion_length == pytest.approx(full.distortion_length, rel=0.01)
-
-
-def labels_by_hand(few, step, image, whole, theta, sensor, smoothness):
-    """Of each pixel, the label around it of the least energy, the upper left one first."""
-    regions = np.zeros(whole.shape, np.uint16)
-    for row, column in np.argwhere(whole.inverse > 0):
-        y = whole.inverse[row, column]
-        variance = random_variance(sensor, y**2) + systematic_variance(sensor, y**2)
-        around = [
-            (i, j)
-            for j in (column // step, min(-(-column // step), few.shape[1] - 1))
-            for i in (row // step, min(-(-row // step), len(few) - 1))
-        ]
-        known = [few[i, j] for i, j in around if whole.inverse[i * step, j * step] > 0]
-        costs = {}
-        for i, j in around:
-            label = few[i, j]
-            residual = y - theta[label] @ whole.rays[row, column]
-            data = min(residual**2 / variance / 2, 8) if label else chi2_quantile(1) / 2
-            unlike = np.mean([other != label for other in known]) if known else 0
-            costs[label] = data + 4 * smoothness * unlike
-        regions[row, column] = min(costs, key=costs.get)
-    labels = regions * (image.inverse > 0).astype(np.uint16)
-    counts = np.bincount(labels.ravel(), minlength=len(theta))
-    counts[0] = 0
-    return regions, labels, counts
-
-
-@pytest.mark.parametrize('step', [2, 4])
-@pytest.mark.parametrize('shape', [(1, 1), (8, 9), (13, 22), (20, 75)])
-@pytest.mark.parametrize('kinds', [1, 4])
-def test_pixels_between_take_the_label_of_the_least_energy(shape, step, kinds):
-    draw = np.random.default_rng(7)
-    camera = Camera(shape[1], shape[0], 20.0, 20.0, shape[1] / 2, shape[0] / 2)
-    theta = np.vstack([np.zeros(3), draw.normal((0, 0, 0.5), 0.01, (3, 3))])
-    few = draw.integers(4 - kinds, 4, (-(-shape[0] // step), -(-shape[1] // step)))
-    few = few.astype(np.uint16)
-    few[:, -12:] = 1
-    truth = draw.integers(1, 4, shape)
-    inverse = (theta[truth] * camera.rays).sum(axis=2).astype(np.float32)
-    inverse[draw.random(shape) < 0.1] = 0
-    whole = RangeImage(camera.rays, inverse, camera)
-    # As of a cloud, which has rays where something was measured.
-    measured = (inverse > 0) & (draw.random(shape) > 0.1)
-    image = RangeImage(camera.rays * measured[..., None], inverse * measured)
-    sensor = SensorModel.from_config(Config(noise=0.003, distortion=0.002))
-    told = few, step, image, whole, theta, sensor, 0.7
-    for found, expected in zip(labels_of_all(*told), labels_by_hand(*told), strict=True):
-        np.testing.assert_array_equal(found, expected)
-
-
-def overlap(labels, truth, valid):
-    """Mean IoU of the regions of at least 1000 pixels."""
-    found = []
-    for face in np.unique(truth[truth > 0]):
-        region = (truth == face) & valid
-        if np.count_nonzero(region) >= 1000:
-            best = labels == np.bincount(labels[region], minlength=2)[1:].argmax() + 1
-            found.append(np.count_nonzero(best & region) / np.count_nonzero(best & valid | region))
-    return np.mean(found)
-
-
-@pytest.mark.parametrize(('budget', 'loss'), [(0.8, 0.005), (0.0, 0.03)])
-def test_borders_are_found_among_the_pixels_left_out(room, image, results, budget, loss):
-    """A border that keeps to the rows and columns looked at costs three times as much."""
-    full, less = (overlap(results[b].labels, room[0].labels, image.valid) for b in (1.0, budget))
-    assert less > full - loss
-
-
-def test_no_jump_beside_what_was_not_measured(image, results):
-    across, down = results[0.8].jumps
-    valid = image.valid
-    assert across.any() and down.any()
-    assert not (across & ~(valid[:, 1:] & valid[:, :-1])).any()
-    assert not (down & ~(valid[1:] & valid[:-1])).any()
-
-
-@pytest.mark.parametrize(('step', 'shape'), [(2, (3, 4)), (4, (2, 2))])
-def test_a_coarser_camera_sees_every_second_or_fourth_pixel(step, shape):
-    camera = Camera(7, 5, 6.0, 6.5, 3.2, 1.9, skew=0.3)
-    assert camera.every(step).shape == shape
-    assert camera.every(step).rays == pytest.approx(camera.rays[::step, ::step], abs=1e-6)
 
 
 def test_clouds_and_bodies_are_halved(image):

@@ -181,7 +181,7 @@ def describe_regions(
     labels: NDArray[np.uint16],
     image: RangeImage,
     fits: Fits,
-    probability: NDArray[np.float64],
+    probability: NDArray[np.float64] | None = None,
 ) -> list[Plane]:
     """Uncertainty, place and shape of every region's plane.
 
@@ -194,8 +194,8 @@ def describe_regions(
         (H, W).
     fits : Fits
         Of these labels.
-    probability : (M + 1,) float64
-        Of the regions to be planes.
+    probability : (M + 1,) float64, optional
+        Of the regions to be planes; 1 where it is not given.
 
     Returns
     -------
@@ -203,6 +203,7 @@ def describe_regions(
         In the order of the labels.
     """
     theta = fits.theta
+    probability = np.ones(len(theta)) if probability is None else probability
     found = np.flatnonzero(theta.any(axis=1))
     if not len(found):
         return []

@@ -193,16 +193,6 @@ class RangeImage:
         with np.errstate(divide='ignore'):
             return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
 
-    def every(self, step: int) -> RangeImage:
-        """Every `step`-th column of every such row, from the first on."""
-        camera = self.camera.every(step) if self.camera is not None else None
-        rays = self.rays[::step, ::step].copy() if camera is None else camera.rays
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
-        body = self.body[::step, ::step].copy() if self.body is not None else None
-        inverse = self.inverse[::step, ::step].copy()
-        return replace(self, rays=rays, inverse=inverse, camera=camera, body=body)
-
     def without(self, body: NDArray[np.bool_]) -> RangeImage:
         """Copy without the measurements of the robot's own body.
 
