@@ -85,8 +85,8 @@ class Segmentation:
     image : RangeImage or None
         What was segmented; None in a result that was pickled.
     cells : Cells or None
-        Squares of equal pixels, when the image was enlarged: what was found is found in an image
-        with one pixel for each, and `count` of planes counts those.
+        Squares of pixels of which one was looked at, when the image was enlarged, or the work
+        budget small; lengths of `sensor` are in such squares.
     work_budget : float
         Share of the full work that the image was given: with the same, its labels are the same.
     """

@@ -86,7 +86,9 @@ class Segmenter:
             return self._find_planes(image, config, work.cuts)
         result = self._find_planes(cells.reduced(image), config, work.cuts)
         labels = cells.enlarged(result.labels, image.shape) * image.valid
-        return replace(result, labels=labels, image=image, cells=cells)
+        counts = np.bincount(labels.ravel(), minlength=len(result.planes) + 1).tolist()
+        planes = [plane.named(count=counts[plane.label]) for plane in result.planes]
+        return replace(result, labels=labels, planes=planes, image=image, cells=cells)
 
     def _find_planes(self, image: RangeImage, config: Config, cuts: float) -> Segmentation:
         if config.dithering > 0:

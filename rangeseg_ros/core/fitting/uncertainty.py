@@ -44,8 +44,9 @@ class Field(NamedTuple):
 
 def distortion_field(sensor: SensorModel) -> Field:
     """The smooth systematic errors of a sensor."""
+    # A model whose numbers are given as integers is one of numbers all the same.
     return Field(
-        sensor.distortion_length, np.square(sensor.distortion), np.square(sensor.range_distortion)
+        *map(float, (sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2))
     )
 
 
@@ -70,11 +71,8 @@ def theta_covariances(
         Zeros where there is no plane.
     """
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
-    random = Field(
-        sensor.correlation,
-        smooth * (FLOOR + np.square(sensor.noise)),
-        smooth * np.square(sensor.range_noise),
-    )
+    variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
+    random = Field(*map(float, (sensor.correlation, *variances)))
     fields = random, distortion_field(sensor)
     result = np.zeros_like(inverse)
     map_halves(_covariances, len(theta), sums, theta, inverse, sensor, 1 - smooth, *fields, result)
