@@ -194,13 +194,15 @@ def stages(image, config):
     surface, _ = join_surfaces(patches, nodes, size, sensor, config.plane_smoothness, least)
     pictures['surfaces'] = over(image, surface, size)
 
-    view = View(image, bridges, fine, grid, sensor, least, 1)
-    labelling, view = method.segment(view, config, lambda stage: None)
+    view = View(image, bridges, fine, grid, sensor, least)
+    labelling = method.segment(view, config, 1.0, lambda stage: None)
     labels = labelling.labels
-    pictures['labels'] = overlay(image.inverse, of_all(labels, view.step, image))
+    pictures['labels'] = overlay(image.inverse, labels * image.valid)
     regions = plane_regions(labels, labels > 0, view.grid, config.noise_regions, view.least)
-    regions, *_ = method.flat_regions(regions, view, config.flatness)
-    pictures['regions'] = overlay(image.inverse, of_all(regions, view.step, image))
+    regions, *_ = method.flat_regions(
+        regions, view, config.plane_smoothness, config.plane_probability, config.plane_prior
+    )
+    pictures['regions'] = overlay(image.inverse, regions * image.valid)
     result = Segmenter(config).segment(image)
     pictures['planes'] = overlay(image.inverse, result.labels, result.planes)
     pictures['uncertainty'] = uncertainty(image, result)
