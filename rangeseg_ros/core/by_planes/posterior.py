@@ -15,7 +15,15 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, POINT, RAY, SCATTER, WEIGHT
+from rangeseg_ros.core.fitting.region_sums import (
+    INVERSE,
+    PLACE,
+    POINT,
+    RAY,
+    SCATTER,
+    WEIGHT,
+    fit_sums,
+)
 from rangeseg_ros.core.fitting.uncertainty import is_empty, level_of
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -48,7 +56,10 @@ def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
     sums, sensor = fits.sums, fits.sensor
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
     cells = sums.cells, sums.start, sums.box
-    return _probabilities(*cells, fits.total, fits.theta, sensor, around, alike, prior)
+    # The planes of least squares in inverse range: what those of clouds leave, which are of total
+    # least squares, is no bend to a scanner, whose planes are not linear in the pixels.
+    theta = fit_sums(fits.total)
+    return _probabilities(*cells, fits.total, theta, sensor, around, alike, prior)
 
 
 @njit(cache=True, nogil=True)
