@@ -71,7 +71,7 @@ def test_any_mapping_gives_a_valid_config_or_a_config_error(mapping):
 
 
 def test_former_names_are_taken_with_a_warning():
-    with pytest.warns(FutureWarning, match='warm_start is no longer read'):
+    with pytest.warns(FutureWarning, match='warm_start is not read any more'):
         assert Config.from_mapping({'warm_start': True}) == Config()
     with pytest.warns(FutureWarning, match='track_memory is called track_time now: track_time: 2'):
         assert Config.from_mapping({'track_memory': 60}).track_time == 2.0

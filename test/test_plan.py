@@ -193,6 +193,7 @@ def plane(number, normal, at, sigma, size=2.0):
         centroid=np.array(at, float),
         count=1000,
         rms=0.002,
+        probability=1.0,
         confidence=1.0,
         shape=shape,
         outline=MapOutline([[corners]]),

@@ -144,9 +144,9 @@ def unite_regions(
     count = int(regions.max(initial=0)) + 1
     weight = pixel_weights(image.inverse, sensor)
     moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
-    contacts = find_contacts(regions.astype(np.int32), grid.right > 0, grid.below > 0, count)
     errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
-    roots = _agglomerate(moments, contacts, errors, prior * sensor.patch)
+    touching = grid.right > 0, grid.below > 0
+    roots = _roots(regions.astype(np.int32), *touching, moments, errors, prior * sensor.patch)
     pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
     return relabel(regions, by_falling_size(pixels)[roots])
 
@@ -162,11 +162,24 @@ def _surfaces(
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """What `join_surfaces` returns."""
     labels, moments = patches.labels.copy(), patches.moments
-    contacts = find_contacts(labels, right, below, len(moments))
-    roots = _agglomerate(moments, contacts, sensor, side)
+    roots = _roots(labels, right, below, moments, sensor, side)
     surface, moments = _renumber(roots, moments, least)
     _rename(labels, surface)
     return labels, moments
+
+
+@njit(cache=True, nogil=True)
+def _roots(
+    labels: NDArray[np.int32],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    moments: NDArray[np.float64],
+    sensor: tuple[float, float, float],
+    side: float,
+) -> NDArray[np.intp]:
+    """Roots of the parts 1...P of an image of labels, see `_agglomerate`."""
+    contacts = find_contacts(labels, right, below, len(moments))
+    return _agglomerate(moments, contacts, sensor, side)
 
 
 @njit(cache=True, nogil=True)

@@ -109,7 +109,7 @@ def sum_regions(
         Sums over the cells of each region.
     """
     count = int(labels.max(initial=0)) + 1
-    layout = _lay_out(*map_halves(_find_boxes, len(labels), labels, count))
+    layout = Layout(*_lay_out(*map_halves(_find_boxes, len(labels), labels, count)))
     axis = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
     pixels = image.inverse, image.rays, image.pinhole, image.camera is not None, axis
     rows = len(blocks.squared)
@@ -161,8 +161,8 @@ def _find_boxes(
 
 
 @njit(cache=True)
-def _lay_out(box: NDArray[np.intp], lower: NDArray[np.intp]) -> Layout:
-    """Cells for the boxes of regions in the upper and in the lower half of an image."""
+def _lay_out(box: NDArray[np.intp], lower: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
+    """Fields of the `Layout`: cells for the boxes of regions in both halves of an image."""
     count = len(box)
     size, columns = np.full(count, BLOCK), np.zeros(count, np.intp)
     start = np.zeros(count + 1, np.intp)
@@ -179,7 +179,7 @@ def _lay_out(box: NDArray[np.intp], lower: NDArray[np.intp]) -> Layout:
             side += 1
         size[k], columns[k] = side * BLOCK, -(-across // side)
         start[k + 1] = start[k] + (-(-rows // side)) * columns[k]
-    return Layout(box, size, columns, start)
+    return box, size, columns, start
 
 
 @njit(cache=True, inline='always')
