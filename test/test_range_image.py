@@ -152,8 +152,7 @@ def test_the_camera_of_a_cloud_in_another_frame_is_found(camera, turn):
     # Frames share it, whatever their noise.
     again = RangeImage.from_points((1.5 * points @ turn.T).astype(np.float32))
     assert again.camera == image.camera and again.rays is image.rays
-    back = [pickle.loads(pickle.dumps(image.camera)), image.camera.every(2)]
-    assert back[0] == image.camera and back[1].turn == image.camera.turn
+    assert pickle.loads(pickle.dumps(image.camera)) == image.camera
 
 
 def bent(camera):

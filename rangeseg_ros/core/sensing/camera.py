@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import operator
 import warnings
-from dataclasses import astuple, dataclass, replace
-from functools import cached_property, lru_cache
+from dataclasses import astuple, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -148,10 +148,6 @@ class Camera:
         """Shape of an image of this camera: (height, width)."""
         return self.height, self.width
 
-    def every(self, step: int) -> Camera:
-        """The camera that sees every `step`-th column of every such row, from the first on."""
-        return _every(step, self)
-
     @property
     def pinhole(self) -> bool:
         """Whether rays are evenly spaced: neither skew nor a lens that distorts."""
@@ -225,23 +221,7 @@ def _finite(name: str, value: Any) -> float:
     return number
 
 
-@lru_cache(maxsize=64)
 def _shown(camera: Camera) -> NDArray[np.bool_]:
     """Which places of a grid over the image have a ray."""
     u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
     return np.isfinite(camera.rays_at(u, v)[..., 0])
-
-
-@lru_cache(maxsize=4)
-def _every(step: int, camera: Camera) -> Camera:
-    # Kept, as its rays are worked out only once.
-    return replace(
-        camera,
-        width=-(-camera.width // step),
-        height=-(-camera.height // step),
-        fx=camera.fx / step,
-        fy=camera.fy / step,
-        cx=camera.cx / step,
-        cy=camera.cy / step,
-        skew=camera.skew / step,
-    )
