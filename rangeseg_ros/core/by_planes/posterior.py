@@ -64,7 +64,8 @@ def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
     return _probabilities(*cells, fits.total, theta, sensor, around, alike, prior)
 
 
-@njit(cache=True, nogil=True)
+# Divisions by zero give inf: cells through which the plane passes edge on.
+@njit(cache=True, nogil=True, error_model='numpy')
 def _probabilities(
     cells: NDArray[np.float64],
     start: NDArray[np.intp],
@@ -83,6 +84,8 @@ def _probabilities(
             continue
         own = cells[start[k] : start[k + 1]]
         size, square, linear, bend, scale, ratio = _residuals(own, theta[k], sensor, box[k])
+        if size == 0:  # all its pixels are too far from the plane
+            continue
         # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
         noise = alike * max((square - linear - bend) / size, 1.0)
         distortion = ratio * (size / around) ** _EXPONENT * size / 3
@@ -94,7 +97,7 @@ def _probabilities(
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, error_model='numpy')
 def _residuals(
     cells: NDArray[np.float64],
     theta: NDArray[np.float64],
@@ -132,10 +135,10 @@ def _residuals(
         size += count
         square += max(squares_left(cell, theta), 0.0) * unit
         # An error of the inverse leaves the plane by distance / inverse times as much.
-        scale += count * np.sqrt(variance) / (slope * level)
+        scale += count * np.sqrt(variance) / (slope * abs(level))
         ratio += count * systematic_variance(sensor, level**2) / variance
     linear, bend = _explained(normal, right)
-    return size, square, linear, bend, max(scale / size, 1e-300), ratio / size
+    return size, square, linear, bend, scale / size, ratio / size
 
 
 @njit(cache=True)
