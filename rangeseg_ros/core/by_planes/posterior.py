@@ -26,16 +26,19 @@ from rangeseg_ros.core.fitting.region_sums import (
 )
 from rangeseg_ros.core.fitting.uncertainty import is_empty, level_of
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import (
+    SensorModel,
+    distortion_share,
+    random_variance,
+    systematic_variance,
+)
 
 # Medians and logarithmic standard deviations, by maximum likelihood over 96 planes and curved
 # regions of 17 annotated frames of 12 sensors: bend over width of planes and of curved surfaces,
-# root mean square, and share of the distortion's variance that a plane as wide as it shows. The
-# curved ones are wider spread than those of the frames, which were cut in pieces (0.013, 0.5):
-# whole curved objects of simulated scenes bend by up to 0.1.
-_PLANE, _CURVED, _SHARE = (0.0023, 0.5), (0.02, 0.9), (0.16, 0.32)
-# The distortion of real Kinects over planes of A pixels grows as A^0.39.
-_EXPONENT = 0.78
+# root mean square; and the deviation of the distortion's share. The curved ones are wider spread
+# than those of the frames, which were cut in pieces (0.013, 0.5): whole curved objects of
+# simulated scenes bend by up to 0.1.
+_PLANE, _CURVED, _SPREAD = (0.0023, 0.5), (0.02, 0.9), 0.32
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
@@ -88,7 +91,7 @@ def _probabilities(
             continue
         # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
         noise = alike * max((square - linear - bend) / size, 1.0)
-        distortion = ratio * (size / around) ** _EXPONENT * size / 3
+        distortion = ratio * distortion_share(size, around) * size / 3
         # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
         width = _area(total[k]) * size / (3 * scale**2)
         plane = prior * _likelihood(bend, noise, distortion, width, _PLANE)
@@ -184,7 +187,7 @@ def _likelihood(
     """Density of three squared Gaussian terms that sum to `bend`, but for a common factor."""
     total = 0.0
     for a in range(len(_NODES)):
-        shown = distortion * _SHARE[0] * np.exp(_SHARE[1] * _NODES[a])
+        shown = distortion * np.exp(_SPREAD * _NODES[a])
         for b in range(len(_NODES)):
             own = surface[0] * np.exp(surface[1] * _NODES[b])
             variance = noise + shown + width * own * own

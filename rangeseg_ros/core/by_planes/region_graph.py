@@ -85,10 +85,10 @@ def find_contacts(
 
 
 @njit(cache=True, nogil=True)
-def absorb(contacts: Contacts, values: NDArray[np.float64], a: int, b: int) -> None:
+def absorb(contacts: Contacts, strips: NDArray[np.float64], a: int, b: int) -> None:
     """Let part a take the contacts of part b over, in place; where both touch a third, add up.
 
-    Added are the lengths, and what `values` (E,) tells of the contacts.
+    Added are the lengths, and the `strips` (2E, N) of the half-edges.
     """
     head, link, target, length, place = contacts
     kept, h = -1, head[a]
@@ -97,15 +97,18 @@ def absorb(contacts: Contacts, values: NDArray[np.float64], a: int, b: int) -> N
         if c == b:
             length[h // 2] = 0
         elif length[h // 2] > 0:
-            place[c] = h // 2
+            place[c] = h
             link[h], kept = kept, h
         h = following
     h = head[b]
     while h >= 0:
         following, e, c = link[h], h // 2, target[h]
         if length[e] > 0 and place[c] >= 0:
-            values[place[c]] += values[e]
-            length[place[c]] += length[e]
+            other = place[c]
+            for k in range(strips.shape[1]):
+                strips[other, k] += strips[h, k]
+                strips[other ^ 1, k] += strips[h ^ 1, k]
+            length[other // 2] += length[e]
             length[e] = 0
         elif length[e] > 0:
             target[h ^ 1] = a

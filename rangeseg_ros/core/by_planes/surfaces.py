@@ -7,9 +7,9 @@ agrees. Hence two steps: blocks merge to patches over which the distortion is ne
 patches to surfaces.
 
 Two parts are one surface for either of two reasons. They agree: one plane explains both as well as
-noise and distortion let expect, and the patches on either side of their border fit each other on
-average. Or one plane costs their pixels less than their common border does in the energy that is
-minimised afterwards (thesis eq. 5.3).
+noise and distortion let expect, and so it does the patches along their border. Or one plane costs
+their pixels less than their common border does in the energy that is minimised afterwards (thesis
+eq. 5.3).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches, misfit
+from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches
 from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
 from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
 from rangeseg_ros.core.regions import by_falling_size, relabel
@@ -29,18 +29,47 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
+from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share
+from rangeseg_ros.core.significance import chi2_quantile
 
-# Systematic variances granted between neighbouring patches, which is no chance; and within a
-# surface, whose extremes are four standard deviations apart: the variance of a difference is twice
-# that of one.
-_BETWEEN_PATCHES, _WITHIN_SURFACE = chi2_quantile(1), 2 * OUTLIER**2
+# By how much the squares that two parts leave of a common plane may exceed those that a smooth
+# distortion lets expect, which has two parameters along a border: a step and a bend.
+_WITHIN = chi2_quantile(2)
+# What noise makes of the three parameters of a plane.
+_NOISE = chi2_quantile(3)
 # Blocks of the smallest patch, two by two: fewer hardly determine the direction of a plane, and
 # where a face is rough they are splinters of it.
 _BLOCKS_OF_PATCH = 4
 # What a plane more costs at least: evidence that is no chance for its three parameters.
 _PLANE = chi2_quantile(3) / 2
+
+
+class Expected(NamedTuple):
+    """What is expected of parts of one surface.
+
+    Attributes
+    ----------
+    smooth, agreement, patch : float
+        `distortion_pixels`, `agreement` and `patch` of the sensor model.
+    unit : float
+        Pixels of a unit of the length of borders.
+    border : float
+        What a unit of a border costs in the energy.
+    """
+
+    smooth: float
+    agreement: float
+    patch: float
+    unit: float
+    border: float
+
+    @classmethod
+    def of(cls, sensor: SensorModel, unit: int, smoothness: float) -> Expected:
+        """Of parts whose borders are counted in units of so many pixels."""
+        border = smoothness * sensor.patch * unit
+        return cls(
+            sensor.distortion_pixels, sensor.agreement, sensor.patch, float(unit), float(border)
+        )
 
 
 class Patches(NamedTuple):
@@ -112,10 +141,8 @@ def join_surfaces(
     moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
-    # What a block's side of border costs.
-    side = smoothness * sensor.patch * block
-    errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
-    return _surfaces(patches, nodes.right, nodes.below, errors, side, float(least))
+    expected = Expected.of(sensor, block, smoothness)
+    return _surfaces(patches, nodes.right, nodes.below, expected, float(least))
 
 
 def unite_regions(
@@ -144,9 +171,9 @@ def unite_regions(
     count = int(regions.max(initial=0)) + 1
     weight = pixel_weights(image.inverse, sensor)
     moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
-    errors = sensor.distortion_pixels, sensor.agreement, sensor.patch
     touching = grid.right > 0, grid.below > 0
-    roots = _roots(regions.astype(np.int32), *touching, moments, errors, prior * sensor.patch)
+    expected = Expected.of(sensor, 1, prior)
+    roots = _roots(regions.astype(np.int32), *touching, moments, expected)
     pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
     return relabel(regions, by_falling_size(pixels)[roots])
 
@@ -156,13 +183,12 @@ def _surfaces(
     patches: Patches,
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
-    sensor: tuple[float, float, float],
-    side: float,
+    expected: Expected,
     least: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """What `join_surfaces` returns."""
     labels, moments = patches.labels.copy(), patches.moments
-    roots = _roots(labels, right, below, moments, sensor, side)
+    roots = _roots(labels, right, below, moments, expected)
     surface, moments = _renumber(roots, moments, least)
     _rename(labels, surface)
     return labels, moments
@@ -174,12 +200,11 @@ def _roots(
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
     moments: NDArray[np.float64],
-    sensor: tuple[float, float, float],
-    side: float,
+    expected: Expected,
 ) -> NDArray[np.intp]:
     """Roots of the parts 1...P of an image of labels, see `_agglomerate`."""
     contacts = find_contacts(labels, right, below, len(moments))
-    return _agglomerate(moments, contacts, sensor, side)
+    return _agglomerate(moments, contacts, expected)
 
 
 @njit(cache=True, nogil=True)
@@ -242,26 +267,28 @@ def _renumber(
 def _agglomerate(
     moments: NDArray[np.float64],
     contacts: Contacts,
-    sensor: tuple[float, float, float],
-    side: float,
+    expected: Expected,
 ) -> NDArray[np.intp]:
     """Merge parts 1...P, those that are likeliest one surface first; returns the roots.
 
-    `sensor` are `distortion_pixels`, `agreement` and `patch` of the sensor model, `side` is what
-    the length of a border costs. The contacts are used up.
+    The contacts are used up.
     """
     moments, parent = moments.copy(), np.arange(len(moments))
     residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
-    # Of contacts: the misfits of the patches along the border, and how far two parts are from one
-    # surface, 1 being too far. Of each part: the nearest later one, and how far that is.
-    strain, apart = np.zeros(len(length)), np.zeros(len(length))
+    # Of half-edges: moments of the patches along the border. Of contacts: how far two parts are
+    # from one surface, 1 being too far. Of each part: the nearest later one, and how far that is.
+    strips, apart = np.zeros((2 * len(length), SIZE)), np.zeros(len(length))
     nearest, least = np.full(len(moments), -1), np.full(len(moments), np.inf)
     for e in range(len(length)):
         a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
-        extra = common_residual(moments, a, b) - residual[a] - residual[b]
-        strain[e] = length[e] * misfit(extra, moments, a, b, _BETWEEN_PATCHES, sensor[1])
-        apart[e] = strain[e] / length[e]
+        for h in range(2 * e, 2 * e + 2):
+            part = target[h ^ 1]
+            # The side of a square patch borders on one other, or on several in part.
+            weight = min(1.0, length[e] * expected.unit / np.sqrt(moments[part, COUNT]))
+            for k in range(SIZE):
+                strips[h, k] = weight * moments[part, k]
+        apart[e] = _apart(moments, residual, a, b, strips, 2 * e, length[e], expected)
     for a in range(len(moments)):
         nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
     while True:
@@ -272,11 +299,11 @@ def _agglomerate(
         residual[a] = common_residual(moments, a, b)
         parent[b], least[b] = a, np.inf
         moments[a] += moments[b]
-        absorb(contacts, strain, a, b)
+        absorb(contacts, strips, a, b)
         h = contacts.head[a]
         while h >= 0:
             c, e = target[h], h // 2
-            apart[e] = _apart(moments, residual, a, c, strain[e], length[e], sensor, side)
+            apart[e] = _apart(moments, residual, a, c, strips, 2 * e, length[e], expected)
             nearest[c], least[c] = least_contact(contacts, apart, c, 1.0)
             h = contacts.link[h]
         nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
@@ -289,18 +316,35 @@ def _apart(
     residual: NDArray[np.float64],
     a: int,
     b: int,
-    strain: float,
+    strips: NDArray[np.float64],
+    h: int,
     length: float,
-    sensor: tuple[float, float, float],
-    side: float,
+    expected: Expected,
 ) -> float:
-    """How far two parts are from one surface, 1 being too far: by their fit, or by the energy."""
-    smooth, agreement, patch = sensor
+    """How far two parts are from one surface, 1 being too far: by their fit, or by the energy.
+
+    `strips` h and h + 1 are those along their border.
+    """
     extra = common_residual(moments, a, b) - residual[a] - residual[b]
+    own = (common_residual(strips, h, h) + common_residual(strips, h + 1, h + 1)) / 2
+    crease = common_residual(strips, h, h + 1) - own
+    fits = _misfit(extra, moments, a, b, expected)
+    fits = max(fits, _misfit(crease, strips, h, h + 1, expected))
     pixels = moments[a, COUNT] + moments[b, COUNT]
-    within = _WITHIN_SURFACE * pixels / (pixels + smooth)
-    fits = max(misfit(extra, moments, a, b, within, agreement), strain / length)
-    # The distortion that a region so large is granted, as in `Models`.
-    granted = 1 + (moments[a, RATIO] + moments[b, RATIO]) / (pixels + smooth)
-    change = (0.5 * extra / granted - side * length) / patch
+    ratio = (moments[a, RATIO] + moments[b, RATIO]) / pixels
+    granted = 1 + ratio * distortion_share(pixels, expected.smooth)
+    change = (0.5 * extra / granted - expected.border * length) / expected.patch
     return min(fits, 1 + change / _PLANE)
+
+
+@njit(cache=True)
+def _misfit(
+    extra: float, moments: NDArray[np.float64], k: int, m: int, expected: Expected
+) -> float:
+    """What two parts leave of a common plane beyond their own, in what that may be at most."""
+    first, second = moments[k, COUNT], moments[m, COUNT]
+    pixels, smooth = first + second, expected.smooth
+    ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
+    smoothly = pixels * distortion_share(pixels, smooth)
+    smoothly -= first * distortion_share(first, smooth) + second * distortion_share(second, smooth)
+    return extra / (_NOISE * expected.agreement + _WITHIN * ratio * smoothly)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.alike import median, quantiles
+from rangeseg_ros.core.fitting.alike import median
 from rangeseg_ros.core.fitting.errors import Errors, explaining, variances
 from rangeseg_ros.core.fitting.scale import (
     ENOUGH,
@@ -20,19 +20,12 @@ from rangeseg_ros.core.fitting.scale import (
     variance_ratio,
 )
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, merged_alone, slope_of
-from rangeseg_ros.core.sensing.sensor import correlated_residuals
-from rangeseg_ros.core.significance import CLEARLY, SAMPLES, chi2_quantile
+from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 # Chi-squared of 9 degrees of freedom, of what one plane through four blocks leaves, over its mean:
 # what is rougher is no part of a plane, and the median.
 _BENT = chi2_quantile(9) / 9
 _MEDIAN = chi2_quantile(9, 0.5) / 9
-# Widths of a Gaussian kernel in quarters of a block's side. What one plane leaves beyond those of
-# four such blocks of a field smoothed with it, over that of white noise; and by how many times
-# this exceeds what it is of blocks half as large, which tells how wide it is.
-_WIDTHS = 1.4 * 2.0 ** (np.arange(13) / 4)
-_APART = np.array([correlated_residuals(width)[3] for width in _WIDTHS])
-_GROWTH = _APART / np.array([correlated_residuals(2 * width)[3] for width in _WIDTHS])
 
 
 class Compared(NamedTuple):
@@ -73,9 +66,6 @@ class Nested(NamedTuple):
         Measured share of most blocks.
     distortion : Errors
         The largest that any scale shows.
-    length : float
-        Width of the Gaussian kernel that it looks smoothed with there, pixels; 0 where one scale
-        does not tell.
     """
 
     within: NDArray[np.float64]
@@ -83,7 +73,6 @@ class Nested(NamedTuple):
     between: float
     filled: float
     distortion: Errors
-    length: float
 
 
 @njit(cache=True, nogil=True)
@@ -123,7 +112,6 @@ def over_scales(
     way: tuple[float, float],
     in_range: bool,
     shown: Errors,
-    length: float,
 ) -> Nested:
     """What blocks of 8 pixels show, and larger ones as long as there are enough of them.
 
@@ -145,11 +133,9 @@ def over_scales(
         Whether the sensor errs in range: lasers do so alone.
     shown : Errors
         Those new in every pixel, as the smallest blocks show them.
-    length : float
-        Of the distortion at most, pixels.
     """
-    found = _over_scales(flat, residual, level, blocks, rays, way, in_range, shown, length)
-    return Nested(*found[:4], Errors(*found[4]), found[5])
+    found = _over_scales(flat, residual, level, blocks, rays, way, in_range, shown)
+    return Nested(*found[:4], Errors(*found[4]))
 
 
 @njit(cache=True, nogil=True)
@@ -162,19 +148,16 @@ def _over_scales(
     way: tuple[float, float],
     in_range: bool,
     shown: Errors,
-    length: float,
-) -> tuple[
-    NDArray[np.float64], NDArray[np.float64], float, float, tuple[float, float, float], float
-]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float, tuple[float, float, float]]:
     """Fields of the `Nested`."""
     compared = compare(flat, residual, level, blocks, way)
     none = Errors(0.0, 0.0, 0.0)
-    distortion, side, clear = none, 2 * BLOCK, False
+    distortion, side = none, 2 * BLOCK
     within, freedom = [0.0], [0.0]
     within.clear()
     freedom.clear()
     between = filled = 1.0
-    before = most = width = wide = 0.0
+    most = 0.0
     while compared.enough:
         scale = compared.scale
         relative, excess = np.empty(len(scale.place)), np.empty(len(scale.place))
@@ -195,41 +178,21 @@ def _over_scales(
         # M(s) = v + D^2 n / 8, with n pixels in a block. What grows with the slope are creases.
         smooth = Errors(8 / pixels * bending.constant, 8 / pixels * bending.quartic, 0.0)
         typical = _typical(smooth, scale)
-        # Where smaller blocks show nothing, only that it may be as wide as it is known to be.
-        told = np.interp(typical / before, _GROWTH, _WIDTHS) if before > 0 else 0.0
-        width = min(told, 8 * length / side)
-        before = typical
-        if typical > most or wide == 0:
-            wide = width * side / 8
         if typical > most:
             most, distortion = typical, smooth
-        clear = _clearly_more(excess, shown, scale)
         flat = _not_bent(compared, blocks, way, shown, bending)
         side *= 2
         larger = merged_alone(blocks, rays, side)
         compared = compare(flat, blocks.residual, compared.level, larger, way)
         blocks = larger
-    # Where the largest blocks show the most, larger ones would show more; but what noise hides of
-    # creases shows in them first, too.
-    if before == most > 0 and width > 0 and clear:
-        hidden = max(2.0 / np.interp(width, _WIDTHS, _APART), 1.0)
-        distortion = Errors(hidden * distortion.constant, hidden * distortion.quartic, 0.0)
     errors = distortion.constant, distortion.quartic, distortion.tilt
-    return np.array(within), np.array(freedom), between, filled, errors, wide
+    return np.array(within), np.array(freedom), between, filled, errors
 
 
 @njit(cache=True, nogil=True)
 def _typical(errors: Errors, scale: Scale) -> float:
     """Median of the variance of errors."""
     return median(variances(errors, scale.squared, scale.slope))
-
-
-@njit(cache=True, nogil=True)
-def _clearly_more(excess: NDArray[np.float64], noise: Errors, scale: Scale) -> bool:
-    """Whether all sets of blocks of an `excess` (N,) show clearly more than the noise."""
-    expected = variances(noise, scale.squared, scale.slope)
-    seen = quantiles(excess, scale.sets, 0.5)
-    return bool((seen > CLEARLY * quantiles(expected, scale.sets, 0.5)).all())
 
 
 @njit(cache=True, nogil=True)

@@ -39,6 +39,7 @@ from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, slope_of
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
+from rangeseg_ros.core.sensing.verdict import Cells
 from rangeseg_ros.core.significance import CERTAIN, SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13
@@ -61,6 +62,17 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     prior : SensorModel
         Taken as far as the image says too little.
     """
+    found = _measured(image, blocks, prior)
+    few = image.inverse.size < ENOUGH * (2 * BLOCK) ** 2
+    if found.white > 0.5 or found.correlation < 1 or few:
+        return found
+    # What is correlated over more than a pixel hides from blocks of four: every second pixel then.
+    reduced = Cells(2, 0, 0).reduced(image)
+    return _measured(reduced, Blocks.of(reduced), prior.every(2)).every(0.5)
+
+
+def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
+    """The errors that blocks of an image show, or the prior where these are too few."""
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
     coarse = blocks.merged(image.rays, 2 * BLOCK)
@@ -88,9 +100,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     shown = noise.times(quantile / share(freedom))
     shown = shown._replace(constant=max(shown.constant, rounding**2))
     # Lasers err in range alone.
-    length = prior.distortion_length
     ways = way, noise.quartic > 0
-    nested = over_scales(flat, blocks.residual, level, coarse, image.rays, *ways, shown, length)
+    nested = over_scales(flat, blocks.residual, level, coarse, image.rays, *ways, shown)
     if not len(nested.within):
         return prior
     shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
@@ -110,7 +121,6 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),
         range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
-        shown_length=float(nested.length),
         quantum=quantum,
         range_quantum=range_quantum,
     )
