@@ -2,9 +2,9 @@
 
 A mechanism is a row of `mechanisms.py` beside this file: its modules, and the parameters and
 functions that are replaced to switch it off. Every frame (`ablation_frames.py`) is segmented with
-and without each of them, and the figures of the two are compared. Differences are averaged over the
-frames of a sensor and then over the sensors; standard errors are those of the mean over sensors, so
-that many frames of one sensor say no more of other sensors than a few do.
+and without each of them, and the figures of the two are compared. Differences are averaged over
+the frames of a sensor and then over the sensors; standard errors are those of the mean over
+sensors, so that many frames of one sensor say no more of other sensors than a few do.
 
 Frames are simulated, with a seed that nothing was made with, and those of real sensors in
 `--data FOLDER`.
@@ -185,8 +185,9 @@ measured.
   frame.
 - IoU, the best of each true region, of sensors by their kind, of simulated rooms, and of those in
   which 30 % of the pixels are lost (*holes*) or every second row and column (*enlarged*).
-  *curved*: share of what is not planar that is called a plane. In simulated rooms *border*: F measure of
-  borders within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median error of normals.
+  *curved*: share of what is not planar that is called a plane. In simulated rooms *border*: F
+  measure of borders within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median
+  error of normals.
 - *verdict*: earns by a gain above two standard errors in a column, or one over all sensors; harms
   by such a loss; *not shown*: all changes are within chance.
 """

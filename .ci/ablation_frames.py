@@ -207,8 +207,10 @@ def terrain_run(task: TerrainTask, parameters: Mapping[str, Any]) -> Figures:
     begin = time.process_time()
     found = replace(task, config=replace(task.config, **parameters)).run()
     spent = 1e3 * (time.process_time() - begin)
-    figures = shares(found.pixels)
-    return {'ms': spent, **{name: figures[name.replace(' ', '_')] for name in TERRAIN}}
+    return {
+        'ms': spent,
+        **{name.replace('_', ' '): share for name, share in shares(found.pixels).items()},
+    }
 
 
 def track_run(frames: Sequence[Any], parameters: Mapping[str, Any]) -> Figures:
@@ -220,8 +222,7 @@ def track_run(frames: Sequence[Any], parameters: Mapping[str, Any]) -> Figures:
         ids_of_faces(labels, {plane.label: plane.id for plane in planes}, truth, faces)
         for planes, (labels, _, _, truth, faces) in zip(tracked, frames, strict=True)
     ]
-    figures = track_figures(ids)
-    return {'ms': spent, **{name: figures[name] for name in TRACKS}}
+    return {'ms': spent, **track_figures(ids)}
 
 
 def tracked_room(seed: int, count: int = 12) -> list[Any]:
