@@ -197,7 +197,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Measure the mechanisms and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--data', type=Path, help='folder of sets of real frames')
-    parser.add_argument('--scenes', type=int, default=3, help='scenes of each simulated sensor')
+    parser.add_argument('--frames', type=int, default=10, help='of a real sensor, at most')
+    parser.add_argument('--scenes', type=int, default=2, help='scenes of each simulated sensor')
     parser.add_argument('--seed', type=int, default=41000, help='of the first scene')
     parser.add_argument('--only', default='', help='of the names of mechanisms: a pattern')
     parser.add_argument('--output', type=Path, help='page to write')
@@ -207,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def of_frames() -> Iterator[tuple[str, Run]]:
         for frame in simulated_frames(seed, scenes):
             yield f'{frame.kind} {frame.sensor}', frame.run
-        for frame in real_frames(given.data) if given.data else ():
+        for frame in real_frames(given.data, given.frames) if given.data else ():
             yield frame.sensor, frame.run
 
     def of_terrains() -> Iterator[tuple[str, Run]]:

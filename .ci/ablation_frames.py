@@ -13,6 +13,7 @@ import hashlib
 import re
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +82,7 @@ class Frame(NamedTuple):
             return {'ms': 1e3 * spent}
         iou = float(overlap.best_iou.mean())
         found = {'ms': 1e3 * spent, self.kind: iou, 'all': iou}
-        if judged is not None:
+        if judged is not None and (judged & (regions == 0)).any():
             sizes = np.bincount(result.labels.ravel())
             called = (sizes[result.labels] >= 3000) & (result.labels > 0)
             found['curved'] = float(called[judged & (regions == 0)].mean())
@@ -130,13 +131,17 @@ def border_f(truth: NDArray, labels: NDArray, valid: NDArray[np.bool_], reach: i
     return 2 * precision * recall / max(precision + recall, 1e-9)
 
 
-def real_frames(folder: Path) -> Iterator[Frame]:
-    """Frames of all sets in a folder; what has no truth is left out."""
+def real_frames(folder: Path, most: int) -> Iterator[Frame]:
+    """Frames of all sets in a folder, so many of a sensor; what has no truth is left out."""
+    count: Counter[str] = Counter()
     for part in sorted(path for path in folder.iterdir() if path.is_dir()):
         for name, load in _loaders(part):
             place = f'{part.name}/{name}'
             kind = next((k for k, v in KINDS.items() if re.search(v, place)), 'other')
             sensor = re.sub(r'[\d_.]+$', '', name) or part.name
+            count[sensor] += 1
+            if count[sensor] > most:
+                continue
             with contextlib.suppress(ValueError):
                 image, truth, least = load()
                 yield Frame(kind, sensor, image, truth, {}, least)
@@ -159,8 +164,17 @@ def _loaders(
         )
     with contextlib.suppress(EvaluationError):
         for case in find_cases(folder, 1):
-            least = 1000 if case.truth.suffix == '.png' else 1
-            yield case.name, lambda case=case, least=least: (*case.load()[:2], least)
+            if case.truth.suffix == '.png':
+                yield (
+                    case.name,
+                    lambda case=case: (
+                        case.load().image,
+                        _drawn(read_label_image(case.truth)),
+                        1000,
+                    ),
+                )
+            else:
+                yield case.name, lambda case=case: (*case.load()[:2], 1)
 
 
 def _of_8_bits(path: Path) -> tuple[RangeImage, Truth, int]:
@@ -169,8 +183,13 @@ def _of_8_bits(path: Path) -> tuple[RangeImage, Truth, int]:
     (height, width), focal = depth.shape, 518.9 * depth.shape[1] / 640
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     metres = depth.astype(np.float32) * np.float32(10 / 255)
-    truth = as_truth(np.where(labels == 255, 0, labels))
+    truth = _drawn(np.where(labels == 255, 0, labels))
     return RangeImage.from_depth(metres, camera), truth, 300
+
+
+def _drawn(labels: NDArray[np.uint16]) -> Truth:
+    """Truth by hand: what has no label was not judged."""
+    return as_truth(labels)._replace(judged=labels > 0)
 
 
 def simulated(command: str, seed: int, scenes: int) -> Path:
