@@ -59,6 +59,7 @@ TERRAIN = {
     'drop found': 1e-3,
     'drop called ground': -1e-3,
 }
+HAZARDS = ('obstacle called ground', 'drop called ground')
 TRACKS = {'switches': -1.0, 'transfers': -1.0, 'coverage': 1e-3, 'track_length': 0.1}
 
 Run = Callable[[Mapping[str, Any]], Figures]
@@ -109,7 +110,7 @@ def verdict(gains: Mapping[str, tuple[float, float]]) -> str:
     """Whether a mechanism earns its lines, from its gains and their errors in units of the table.
 
     It does by a gain above twice its standard error in any column, or above that over all sensors,
-    and it harms by such a loss; half a unit at least. Anything else is chance.
+    and it harms by such a loss; half a unit at least. Empty where all may be chance.
     """
     found = []
     for word, sign in (('earns', 1), ('harms', -1)):
@@ -119,7 +120,18 @@ def verdict(gains: Mapping[str, tuple[float, float]]) -> str:
             if sign * gain > max((1 if column == 'all' else 2) * error, 0.5)
         ]
         found += [f'{word}: {", ".join(columns)}'] if columns else []
-    return '; '.join(found) or 'not shown'
+    return '; '.join(found)
+
+
+def needed_for(row: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
+    """Kinds of scenes in which more than 1 % of a hazard is called ground without a mechanism."""
+    kinds = {
+        kind
+        for column in HAZARDS
+        for kind, gains in row.get(column, {}).items()
+        if not np.isnan(gains).all() and -np.nanmean(gains) > 0.01
+    }
+    return f'safety: {", ".join(sorted(kinds))}' if kinds else ''
 
 
 def source_of(modules: str) -> tuple[int, int]:
@@ -158,7 +170,8 @@ def as_table(columns: Mapping[str, float], rows: Gains, chosen: Sequence[Mechani
             cells.append('' if np.isnan(gain) else _change(-gain / abs(unit), error / abs(unit)))
         name = f'{mechanism.name} (an option)' if mechanism.option else mechanism.name
         size = map(str, source_of(mechanism.modules))
-        lines.append([name, *size, _ms(row), *cells, verdict(gains)])
+        words = [word for word in (needed_for(row), verdict(gains)) if word]
+        lines.append([name, *size, _ms(row), *cells, '; '.join(words) or 'not shown'])
     return '\n'.join(f'| {" | ".join(line)} |' for line in lines)
 
 
@@ -168,15 +181,15 @@ def _ms(row: Mapping[str, Mapping[str, Sequence[float]]]) -> str:
 
 def _change(change: float, error: float) -> str:
     digits = 0 if max(abs(change), error) >= 1 or change == 0 else 1
-    return f'{change + 0.0:.{digits}f} ± {error:.{digits}f}'
+    return f'{round(change, digits) + 0.0:.{digits}f} ± {error:.{digits}f}'
 
 
 PAGE = """\
 # Ledger
 
 What each mechanism of the core costs, and what switching it off costs: `make ablate`, before every
-release. {frames} The mechanisms are in `.ci/mechanisms.py`; `.ci/ablate.py` says how they are
-measured.
+release. The mechanisms are in `.ci/mechanisms.py`; `.ci/ablate.py` says how they are measured.
+{frames}
 
 - *lines*, *constants*: of its modules, or of its functions in them; *ms*: processor time it takes.
 - Other columns: the change when it is switched off, plus or minus the standard error over sensors,
@@ -189,7 +202,8 @@ measured.
   measure of borders within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median
   error of normals.
 - *verdict*: earns by a gain above two standard errors in a column, or one over all sensors; harms
-  by such a loss; *not shown*: all changes are within chance.
+  by such a loss; *safety*: the kinds of scenes in which more than 1 % of a hazard is called ground
+  without it; *not shown*: all changes are within chance.
 """
 
 
@@ -222,7 +236,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             frames = tracked_room(room)
             yield str(room), lambda parameters, frames=frames: track_run(frames, parameters)
 
-    parts = [PAGE.format(frames=f'{scenes} scenes a sensor from seed {seed} on.')]
+    real = f' and up to {given.frames} frames of each real sensor' if given.data else ''
+    told = f'Here with {scenes} scenes of each simulated sensor, from seed {seed} on{real}.'
+    parts = [PAGE.format(frames=told)]
     for name, columns, runs in (
         ('frames', FRAMES, of_frames),
         ('terrain', TERRAIN, of_terrains),

@@ -97,12 +97,18 @@ def test_a_mean_over_sensors_gives_each_the_same_weight(ablate):
     [
         ({'all': (3.0, 2.0), 'curved': (3.0, 2.0)}, 'earns: all'),
         ({'all': (0.4, 0.0), 'curved': (-5.0, 2.0)}, 'harms: curved'),
-        ({'all': (3.0, float('nan')), 'curved': (float('nan'), 1.0)}, 'not shown'),
+        ({'all': (3.0, float('nan')), 'curved': (float('nan'), 1.0)}, ''),
         ({'all': (-3.0, 2.0), 'border': (9.0, 1.0)}, 'earns: border; harms: all'),
     ],
 )
 def test_verdicts_ask_for_more_than_chance(ablate, gains, expected):
     assert ablate.verdict(gains) == expected
+
+
+def test_scenes_in_which_a_hazard_becomes_ground_are_named(ablate):
+    row = {'drop called ground': {'hole': [-0.03, 0.0], 'kerb': [-0.01], 'stairs': [np.nan]}}
+    assert ablate.needed_for(row) == 'safety: hole'
+    assert ablate.needed_for({'drop found': {'hole': [1.0]}}) == ''
 
 
 def test_borders_match_within_two_pixels(frames):
