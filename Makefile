@@ -10,7 +10,7 @@ SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-s
 # Most tests keep one core busy. All tests of a file run in the same process.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 
-.PHONY: test quick mutants demo demo-ros lint docs wheel release-check clean
+.PHONY: test quick mutants ablate demo demo-ros lint docs wheel release-check clean
 
 test: $(VENV)/installed
 	$(PYTEST)
@@ -24,6 +24,11 @@ COUNT ?= 300
 SEED ?= 0
 mutants: $(VENV)/installed
 	$(BIN)/python .ci/mutants.py --count $(COUNT) --seed $(SEED)
+
+# What every mechanism costs and what it buys, on simulated frames and those in DATA: a few minutes.
+DATA ?=
+ablate: $(VENV)/installed
+	$(BIN)/python .ci/ablate.py $(if $(DATA),--data $(DATA)) --output docs/ledger.md
 
 demo: $(VENV)/installed
 	rm -rf demo

@@ -64,7 +64,7 @@ def command(
     Known layouts of DIR:
       abw.test.N.range, perc.test.N (or train) with .gt-seg, .gt-ang
       depth/*.png, truth/*.png, camera.yaml, as `simulate kinect` writes
-      folders of depth.png, truth.png and camera.txt (fx fy cx cy)
+      folders of depth.png or .tiff, truth.png and camera.txt (fx fy cx cy)
       labelled laser scans *.pcd (x forward, z up, intensity >= 10)
       terrain.csv, as `simulate terrain` writes: terrain classes
 

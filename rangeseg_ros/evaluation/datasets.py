@@ -178,8 +178,8 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
 
     Known layouts: segcomp (`abw.test.N.range`, `perc.test.N` and train, with `.gt-seg`, perhaps
     `.gt-ang`); `depth/*.png` with `truth/*.png` and `camera.yaml` (perhaps `planes.csv`), as
-    `rangeseg simulate kinect` writes it; folders of `depth.png`, `truth.png` and `camera.txt` or
-    `camera.yaml`; labelled scans `*.pcd`.
+    `rangeseg simulate kinect` writes it; folders of `depth.png` or `depth.tiff`, `truth.png` and
+    `camera.txt` or `camera.yaml`; labelled scans `*.pcd`.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
 
 
 def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
-    for path in sorted(folder.glob('**/depth.png')):
+    for path in sorted([*folder.glob('**/depth.png'), *folder.glob('**/depth.tiff')]):
         truth = path.with_name('truth.png')
         _require(path, truth)
         camera = path.with_name('camera.txt')

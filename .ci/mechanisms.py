@@ -1,0 +1,209 @@
+"""What the core consists of, piece by piece, and how `ablate.py` switches each piece off.
+
+A change is a parameter of `Config` with its value, or a name below `rangeseg_ros.core` with what
+takes its place: a constant, or a function that makes the new function from the original one.
+Compiled kernels keep the functions they were compiled with, so that only what Python calls can be
+replaced. A name that is gone is an error: the table follows the code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rangeseg_ros.core.by_planes.shifts import Shifts
+from rangeseg_ros.core.fitting.errors import BOTH
+
+
+class Mechanism(NamedTuple):
+    """A rule, a pass or a special case.
+
+    Attributes
+    ----------
+    name : str
+    modules : str
+        Below `core/`, with `:function,function` where it is only a part of a module.
+    changes : mapping
+        What switches it off, or, of an option, on: see above.
+    table : {'frames', 'terrain', 'tracks'}
+        What it is measured on.
+    option : bool
+        Whether it is off by default.
+    """
+
+    name: str
+    modules: str
+    changes: Mapping[str, Any]
+    table: str = 'frames'
+    option: bool = False
+
+
+def _returning(value: Any) -> Callable[[Any], Any]:
+    return lambda original: lambda *given, **named: value
+
+
+def _unchanged(original: Any) -> Any:
+    return lambda first, *rest: first
+
+
+def _given(place: int, value: Any) -> Callable[[Any], Any]:
+    """The function with one of its arguments replaced."""
+    return lambda original: lambda *given: original(*given[:place], value, *given[place + 1 :])
+
+
+def _sensor(**fields: Callable[[Any, Any], float]) -> dict[str, Any]:
+    """The measured sensor with fields that follow from it and from the stated one."""
+
+    def changed(original: Any) -> Any:
+        def measured(image: Any, blocks: Any, stated: Any) -> Any:
+            found = original(image, blocks, stated)
+            return found._replace(**{name: new(found, stated) for name, new in fields.items()})
+
+        return measured
+
+    return {'segmenter.measured_sensor': changed}
+
+
+def _stated(*names: str) -> dict[str, Any]:
+    return _sensor(**{name: lambda _, stated, name=name: getattr(stated, name) for name in names})
+
+
+def _zero(*names: str) -> dict[str, Any]:
+    return _sensor(**{name: lambda _, stated: 0.0 for name in names})
+
+
+def _without_distortion_length(original: Any) -> Any:
+    return lambda nodes, block, sensor: original(
+        nodes, block, sensor._replace(distortion_length=0.0)
+    )
+
+
+def _near_first_plane(original: Any) -> Any:
+    def near(place: Any, variance: Any, nearest: Any, plane: Any, least: float, *rest: Any) -> Any:
+        off = place[0] - plane[0] - plane[1] * place[1] - plane[2] * place[2]
+        return (variance > 0) & (np.abs(off) < least / 2)
+
+    return near
+
+
+_DISTORTION = 'fitting/nested.py fitting/noise.py:_bounded'
+_CORRELATION = 'fitting/noise.py:_random,_white_and_correlated'
+_TURNING = 'fitting/errors.py:ByTurn,by_turn,_by_turn,turning'
+_NOISE = ('noise', 'nested', 'errors', 'scale', 'alike', 'quantisation')
+_NORMALS = ('method', 'angles', 'pyramid', 'normals', 'coarse_to_fine', 'directions')
+# Costs of borders that let nothing merge by the energy.
+_NO_BORDER = _given(4, -1e12)
+
+# fmt: off
+MECHANISMS = (
+    # The sensor.
+    Mechanism('sensor measured', ' '.join(f'fitting/{name}.py' for name in _NOISE),
+              {'sensor_model': 'fixed'}),
+    Mechanism('distortion measured, not stated', _DISTORTION,
+              _stated('distortion', 'range_distortion')),
+    Mechanism('distortion measured, not one sd of the noise', _DISTORTION,
+              _sensor(distortion=lambda found, _: found.noise,
+                      range_distortion=lambda found, _: found.range_noise)),
+    Mechanism('bound of the distortion', 'fitting/noise.py:_bounded',
+              {'fitting.noise._bounded': _unchanged}),
+    Mechanism('correlation of the noise measured, not stated', _CORRELATION,
+              _stated('white', 'correlation')),
+    Mechanism('noise is correlated', f'{_CORRELATION} sensing/sensor.py:correlated_residuals',
+              _sensor(white=lambda *_: 1.0, correlation=lambda *_: 0.0)),
+    Mechanism('quantisation found', 'fitting/quantisation.py',
+              {'fitting.noise.quantisation': _returning((0.0, 0.0))}),
+    Mechanism('noise of directions', _TURNING, _zero('column_noise', 'row_noise')),
+    Mechanism('scanners that turn', _TURNING,
+              {'fitting.noise.turning':
+               lambda _: lambda turns, variance, quantile, noise, least: (noise.tilt, BOTH)}),
+    Mechanism('errors in range', 'fitting/errors.py:_likeliest,_deviance',
+              {'fitting.noise.explaining': _given(3, False)}),
+    Mechanism('length of the distortion found', 'fitting/nested.py:_over_scales',
+              _zero('shown_length')),
+    # Edges and holes.
+    Mechanism('jump edges', 'sensing/jump_edges.py sensing/plane_deviation.py fitting/steps.py',
+              {'jump_edges': 'none'}),
+    Mechanism('jumps by the plane, not Sobel', 'sensing/plane_deviation.py fitting/steps.py',
+              {'jump_edges': 'sobel'}),
+    Mechanism('steps follow the noise', 'fitting/steps.py', {'edge_step': 0.0065}),
+    Mechanism('holes bridged', 'sensing/bridges.py',
+              {'segmenter.find_holes': _returning(np.empty(0, np.int32))}),
+    Mechanism('enlarged images found', 'sensing/verdict.py:Cells,replication,_period',
+              {'segmenter.replication': _returning(None)}),
+    Mechanism('weights by distance', 'sensing/grid.py:_connect', {'weighting': 'distance'},
+              option=True),
+    # Regions.
+    Mechanism('patches as wide as the distortion',
+              'by_planes/patches.py by_planes/surfaces.py:Patches,_patches,_put_together',
+              {'by_planes.method.Patches.of': _without_distortion_length}),
+    Mechanism('parts merge by the energy', 'by_planes/surfaces.py:_apart',
+              {'by_planes.method.join_surfaces': _NO_BORDER,
+               'by_planes.method.unite_regions': _NO_BORDER}),
+    Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
+              {'by_planes.method.unite_regions': _unchanged}),
+    Mechanism('planes shifted by the distortion', 'by_planes/shifts.py',
+              {'by_planes.labelling.shifts':
+               lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
+    Mechanism('labels expanded by cuts', 'by_planes/labelling.py graphcut/cut.py '
+              'graphcut/sites.py graphcut/expansion.py',
+              {'by_planes.labelling._minimise': _returning(None)}),
+    Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/shifts.py '
+              'graphcut/cut.py graphcut/sites.py graphcut/expansion.py',
+              {'by_planes.labelling._minimise': _returning(None),
+               'by_planes.labelling.shifts':
+               lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
+    Mechanism('labels expanded until nothing changes', 'by_planes/labelling.py:_domains',
+              {'exact': True}, option=True),
+    Mechanism('planes refitted to labels', 'by_planes/labelling.py:refine', {'refits': 3},
+              option=True),
+    Mechanism('every pixel, not every fourth', 'runtime/work.py', {'work_budget': 0.9}),
+    Mechanism('thin regions are noise', 'regions.py:_thin,merge', {'noise_regions': 'leave'}),
+    Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
+    Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
+              {'method': 'normals'}, option=True),
+    # Planes.
+    Mechanism('outliers left out of fits', 'fitting/region_sums.py:_trim',
+              {'fitting.region_sums._trim': lambda _: lambda start, cells, *rest: cells}),
+    Mechanism('parts of a surface found', 'fitting/coplanar.py',
+              {'description.planes.common_surfaces':
+               lambda _: lambda fits, covariance: np.arange(len(fits.theta))}),
+    # The ground.
+    Mechanism('ground reached by a chain', 'ground/reach.py',
+              {'ground.terrain.reach': _near_first_plane}, 'terrain'),
+    Mechanism('first plane fitted', 'ground/estimate.py:first_plane',
+              {'ground.terrain.first_plane': _returning((0.0, 0.0, 0.0))}, 'terrain'),
+    Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
+              {'ground.terrain.ground_field':
+               lambda original: lambda cells, ground, *rest: original(
+                   cells, np.zeros_like(ground), *rest)}, 'terrain'),
+    Mechanism('noisy heights are medians', 'ground/terrain.py:_smoothed',
+              {'ground.terrain._smoothed': _given(3, 1e9)}, 'terrain'),
+    Mechanism('confidence decides', 'ground/estimate.py:no_step',
+              {'ground.terrain.SURE': 0.0}, 'terrain'),
+    Mechanism('farther surfaces tried', 'ground/estimate.py:Continuation',
+              {'ground.terrain._TRIALS': 1}, 'terrain'),
+    Mechanism('floor of the robot before a step', 'ground/estimate.py:Continuation',
+              {'ground.estimate.Continuation.behind_step': _returning(False)}, 'terrain'),
+    Mechanism('distortion in the height', 'ground/terrain.py:_smooth_variance',
+              {'ground.terrain._smooth_variance':
+               lambda _: lambda place, *rest: np.zeros(place.shape[1])}, 'terrain'),
+    Mechanism('steep faces are obstacles', 'ground/terrain.py:_faces',
+              {'ground.terrain._faces':
+               lambda _: lambda cells, limits: np.zeros(cells.inverse.shape, bool)}, 'terrain'),
+    Mechanism('bounds apart from the ground', 'ground/terrain.py:_with_ground',
+              {'ground.terrain._APART': 0.8}, 'terrain'),
+    # Ids.
+    Mechanism('camera motion by the planes', 'tracking/tracker.py:_camera_motion',
+              {'tracking.tracker._camera_motion': _returning((np.eye(3), np.zeros(3)))}, 'tracks'),
+    Mechanism('gate of chi-squared', 'tracking/plane_errors.py:mahalanobis,with_floor',
+              {'tracking.tracker.GATE': 1e9}, 'tracks'),
+    Mechanism('gate of angles', 'tracking/tracks.py:near_planes',
+              {'tracking.tracker._TURN': np.pi}, 'tracks'),
+    Mechanism('planes found again without overlap', 'tracking/tracker.py:_assign',
+              {'tracking.tracker._UNSEEN_OVERLAP': 0.0}, 'tracks'),
+    Mechanism('planes remembered out of sight', 'tracking/tracker.py:Tracker',
+              {'track_time': 0.0}, 'tracks'),
+)
+# fmt: on

@@ -1,0 +1,145 @@
+"""The ledger of mechanisms: its table, its arithmetic, and cases whose outcome is known."""
+
+import importlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.evaluation.label_files import as_truth
+from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+
+
+@pytest.fixture(scope='module')
+def ablate():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(Path(__file__).parents[1] / '.ci'))
+        yield importlib.import_module('ablate')
+
+
+@pytest.fixture(scope='module')
+def frames(ablate):
+    return importlib.import_module('ablation_frames')
+
+
+@pytest.fixture(scope='module')
+def frame(frames):
+    seen = simulate_kinect(kinect_room(3), kinect_camera(320, 240), noise='none', seed=3)
+    image = RangeImage.from_depth(seen.depth, seen.camera)
+    planes = {plane.label: np.array([*plane.normal, plane.distance]) for plane in seen.planes}
+    return frames.Frame('simulated', 'kinect', image, as_truth(seen.labels), planes, 300)
+
+
+def test_every_mechanism_is_in_the_code(ablate):
+    names = [mechanism.name for mechanism in ablate.MECHANISMS]
+    assert len(set(names)) == len(names)
+    for mechanism in ablate.MECHANISMS:
+        assert ablate.source_of(mechanism.modules)[0] > 0
+        for entry in mechanism.modules.split():
+            name, _, functions = entry.partition(':')
+            for function in filter(None, functions.split(',')):
+                assert ablate.source_of(f'{name}:{function}')[0] > 0, (entry, function)
+        with ablate.switched(mechanism.changes) as parameters:
+            Config(**parameters)
+
+
+def test_lines_and_constants_of_a_module_and_of_its_functions(ablate, monkeypatch, tmp_path):
+    (tmp_path / 'a.py').write_text(
+        'ONE, TWO = 1, 2\n_THREE = 3\nlower = 4\n\n\n@decorated\ndef f():\n    return ONE\n\n\n'
+        'def g():\n    return 0\n'
+    )
+    monkeypatch.setattr(ablate, 'CORE', tmp_path)
+    assert ablate.source_of('a.py') == (12, 3)
+    assert ablate.source_of('a.py:f') == (3, 1)
+    assert ablate.source_of('a.py:f,g') == (5, 1)
+
+
+def test_what_is_switched_off_is_on_again(ablate):
+    module = importlib.import_module('rangeseg_ros.core.by_planes.method')
+    before = module.unite_regions
+    with ablate.switched({'by_planes.method.unite_regions': lambda _: abs, 'refits': 2}) as given:
+        assert module.unite_regions is abs
+        assert given == {'refits': 2}
+    assert module.unite_regions is before
+    with pytest.raises(AttributeError), ablate.switched({'by_planes.method.gone': 1}):
+        pass
+
+
+def test_without_any_plane_all_of_the_accuracy_is_lost_and_without_a_change_none(ablate, frame):
+    nothing = ablate.Mechanism('nothing', '', {'refits': Config().refits})
+    planes = ablate.Mechanism('planes', '', {'min_pixels': 10**8})
+    option = ablate.Mechanism('no planes', '', {'min_pixels': 10**8}, option=True)
+    gains = ablate.measure(iter([('kinect', frame.run)]), [nothing, planes, option])
+    result = Segmenter().segment(frame.image)
+    iou = frame.truth._replace(min_pixels=300).compare(result.labels)
+    iou = iou.best_iou[iou.truth_sizes >= 300].mean()
+    assert iou > 0.9
+    assert gains['']['simulated']['kinect'] == [pytest.approx(iou, abs=0.02)]
+    assert gains['planes']['simulated'] == gains['']['simulated']
+    assert gains['no planes']['simulated']['kinect'] == [-gains['']['simulated']['kinect'][0]]
+    for column in ('simulated', 'all', 'border', 'faces', 'angle'):
+        assert gains['nothing'][column]['kinect'] == [0.0]
+
+
+def test_a_mean_over_sensors_gives_each_the_same_weight(ablate):
+    mean, error = ablate.pooled({'a': [1.0, 3.0], 'b': [4.0, np.nan], 'c': [np.nan]})
+    assert (mean, error) == (3.0, 1.0)
+    assert np.isnan(ablate.pooled({'a': [1.0]})[1])
+
+
+@pytest.mark.parametrize(
+    'gains, expected',
+    [
+        ({'all': (3.0, 2.0), 'curved': (3.0, 2.0)}, 'earns: all'),
+        ({'all': (0.4, 0.0), 'curved': (-5.0, 2.0)}, 'harms: curved'),
+        ({'all': (3.0, float('nan')), 'curved': (float('nan'), 1.0)}, ''),
+        ({'all': (-3.0, 2.0), 'border': (9.0, 1.0)}, 'earns: border; harms: all'),
+    ],
+)
+def test_verdicts_ask_for_more_than_chance(ablate, gains, expected):
+    assert ablate.verdict(gains) == expected
+
+
+def test_scenes_in_which_a_hazard_becomes_ground_are_named(ablate):
+    row = {'drop called ground': {'hole': [-0.03, 0.0], 'kerb': [-0.01], 'stairs': [np.nan]}}
+    assert ablate.needed_for(row) == 'safety: hole'
+    assert ablate.needed_for({'drop found': {'hole': [1.0]}}) == ''
+
+
+def test_borders_match_within_two_pixels(frames):
+    def halves(column):
+        return np.tile(np.where(np.arange(20) < column, 1, 2), (10, 1))
+
+    valid = np.ones((10, 20), bool)
+    assert frames.border_f(halves(8), halves(10), valid) == 1.0
+    assert frames.border_f(halves(8), halves(11), valid) == 0.0
+    assert frames.border_f(halves(8), halves(20), valid) == 0.0
+
+
+def test_holes_and_enlargement_are_the_same_in_image_and_truth(frame):
+    holes, enlarged = frame.damaged('holes'), frame.damaged('enlarged')
+    lost = 1 - holes.image.valid.sum() / frame.image.valid.sum()
+    assert lost == pytest.approx(0.3, abs=0.01)
+    assert not holes.truth.labels[~holes.image.valid].any()
+    for array in (enlarged.image.inverse, enlarged.truth.labels):
+        np.testing.assert_array_equal(array[::2], array[1::2])
+        np.testing.assert_array_equal(array[:, ::2], array[:, 1::2])
+
+
+def test_the_page_has_a_row_for_each_mechanism(ablate, frame, monkeypatch, tmp_path):
+    monkeypatch.setattr(ablate, 'simulated_frames', lambda *_: iter([frame]))
+    page = tmp_path / 'ledger.md'
+    ablate.main(['--only', '^(curved regions told|weights by distance)$', '--output', str(page)])
+    rows = [line for line in page.read_text().splitlines() if line.startswith('| ')]
+    assert [row.split(' | ')[0] for row in rows] == [
+        '| mechanism',
+        '| ---',
+        '| with all',
+        '| weights by distance (an option)',
+        '| curved regions told',
+    ]
