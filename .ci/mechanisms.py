@@ -148,16 +148,12 @@ MECHANISMS = (
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
     Mechanism('labels expanded by cuts', 'by_planes/labelling.py graphcut/cut.py '
               'graphcut/sites.py graphcut/expansion.py',
-              {'by_planes.labelling._minimise': _returning(None)}),
+              {'by_planes.labelling.run_halves': _returning(None)}),
     Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/shifts.py '
               'graphcut/cut.py graphcut/sites.py graphcut/expansion.py',
-              {'by_planes.labelling._minimise': _returning(None),
+              {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
-    Mechanism('labels expanded until nothing changes', 'by_planes/labelling.py:_domains',
-              {'exact': True}, option=True),
-    Mechanism('planes refitted to labels', 'by_planes/labelling.py:refine', {'refits': 3},
-              option=True),
     Mechanism('every pixel, not every fourth', 'runtime/work.py', {'work_budget': 0.9}),
     Mechanism('thin regions are noise', 'regions.py:_thin,merge', {'noise_regions': 'leave'}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),

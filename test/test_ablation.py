@@ -62,16 +62,16 @@ def test_lines_and_constants_of_a_module_and_of_its_functions(ablate, monkeypatc
 def test_what_is_switched_off_is_on_again(ablate):
     module = importlib.import_module('rangeseg_ros.core.by_planes.method')
     before = module.unite_regions
-    with ablate.switched({'by_planes.method.unite_regions': lambda _: abs, 'refits': 2}) as given:
+    with ablate.switched({'by_planes.method.unite_regions': lambda _: abs, 'seed': 2}) as given:
         assert module.unite_regions is abs
-        assert given == {'refits': 2}
+        assert given == {'seed': 2}
     assert module.unite_regions is before
     with pytest.raises(AttributeError), ablate.switched({'by_planes.method.gone': 1}):
         pass
 
 
 def test_without_any_plane_all_of_the_accuracy_is_lost_and_without_a_change_none(ablate, frame):
-    nothing = ablate.Mechanism('nothing', '', {'refits': Config().refits})
+    nothing = ablate.Mechanism('nothing', '', {'seed': Config().seed})
     planes = ablate.Mechanism('planes', '', {'min_pixels': 10**8})
     option = ablate.Mechanism('no planes', '', {'min_pixels': 10**8}, option=True)
     gains = ablate.measure(iter([('kinect', frame.run)]), [nothing, planes, option])

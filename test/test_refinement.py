@@ -2,18 +2,18 @@
 
 from itertools import product
 
-import cv2
 import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs, energy, region_moments
+from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.graphcut.moves import Labelling
 from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, weights
@@ -178,7 +178,8 @@ def test_an_expansion_is_the_best_there_is(seed):
     problem, models, labels = random_case(seed, 3, 4)
     labels[0, 0], problem.inverse[0] = 1, models.theta[1] @ problem.rays[0]
     problem.weight[0] = problem.weight.max()
-    cost = cost_of(labels, problem, models)
+    # What is not known is worked out where it is asked for.
+    cost = np.where(labels == 2, np.float32(np.nan), cost_of(labels, problem, models))
     free = np.flatnonzero(linked(problem, 1, labels))
     chosen = np.array(list(product([False, True], repeat=len(free))))
     every = np.repeat(labels.reshape(1, -1), len(chosen), axis=0)
@@ -190,7 +191,9 @@ def test_an_expansion_is_the_best_there_is(seed):
     assert energies(labels[None], problem, models)[0] == pytest.approx(least, abs=1e-4)
     assert ((labels == before) | (labels == 1)).all()
     assert not labels.ravel()[problem.weight == 0].any()
-    np.testing.assert_allclose(cost, cost_of(labels, problem, models), atol=1e-4)
+    known = ~np.isnan(cost)
+    assert known[free // 4, free % 4].all()
+    np.testing.assert_allclose(cost[known], cost_of(labels, problem, models)[known], atol=1e-4)
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -198,15 +201,11 @@ def test_expansions_in_larger_images_never_raise_the_energy(seed):
     problem, models, labels = random_case(seed, 30, 40, 5)
     cost = cost_of(labels, problem, models)
     values = [energies(labels[None], problem, models)[0]]
-    for alpha, reach in ((3, 4), (1, 4), (5, 1), (2, 12), (4, 4), (3, 12)):
+    for alpha, reach in ((3, 4), (1, 4), (5, 2), (2, 12), (4, 4), (3, 12)):
         if (labels == alpha).any():
-            before = labels.copy()
             helped = expand(alpha, labels, cost, problem, models, reach)
             values.append(energies(labels[None], problem, models)[0])
             assert helped == (values[-1] < values[-2])
-            # A domain stays as it is; a band goes along with the boundary.
-            own = cv2.dilate((before == alpha).astype(np.uint8), np.ones((3, 3)))
-            assert reach > 1 or ((labels == before) | (own > 0)).all()
     assert (np.diff(values) <= 0).all()
     assert values[-1] < values[0] - 100
 
@@ -235,37 +234,20 @@ def test_expansions_lower_the_energy_of_the_labels_of_blocks():
     assert energy(labels, problem, models) == pytest.approx(values[1], rel=1e-5)
 
 
-def test_no_expansion_helps_after_the_exact_minimisation():
-    """Of no plane to anywhere, of the others to the pixels around their blocks."""
+def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
+    """Of every label, from anywhere, until none helps."""
     problem, (surface, blocks, moments), sensor = small_room()
-    labels, models = refine(problem, surface, blocks, moments, sensor, exact=True)
-    value = energy(labels, problem, models)
-    measured = problem.weight.reshape(-1, problem.width) > 0
-    for alpha in range(len(models.theta)):
-        own = np.pad(surface == alpha, 4)
-        around = np.lib.stride_tricks.sliding_window_view(own, (9, 9)).any(axis=(2, 3))
-        pixels = np.kron(around, np.ones((BLOCK, BLOCK), bool)) | (alpha == 0)
-        front = np.flatnonzero(pixels & measured).astype(np.int32)
-        changed, cost = labels.copy(), costs(labels, problem, models)
-        labelling = GridLabelling.of(changed, cost, problem.links, problem.width)
-        refinement._expand(
-            alpha, front, (0, len(labels) // problem.width), 1, labelling, problem, models
-        )
-        assert energy(changed, problem, models) > value - 1e-2
-
-
-@pytest.mark.parametrize('exact', [False, True])
-def test_refits_lower_the_energy_until_they_do_not(exact):
-    problem, (surface, blocks, moments), sensor = small_room()
-    values = []
-    for refits in (0, 1, 2, 5, 40):
-        labels, models = refine(problem, surface, blocks, moments, sensor, exact, refits)
-        values.append(energy(labels, problem, models))
-    assert values[1] < values[0]
-    assert (np.diff(values) <= 0).all()
-    # Some round before the last did not help.
-    again, _ = refine(problem, surface, blocks, moments, sensor, exact, 41)
-    np.testing.assert_array_equal(labels, again)
+    labels, models = refine(problem, surface, blocks, moments, sensor)
+    cost = unary(problem, models).reshape(len(models.theta), -1)
+    everywhere = Labelling(
+        labels.reshape(-1, problem.width),
+        lambda k, pixels: cost[k, pixels],
+        Grid(*prior(problem)),
+        1,
+    )
+    everywhere.minimise(len(models.theta))
+    least = energy(everywhere.labels, problem, models)
+    assert least <= energy(labels, problem, models) < 1.05 * least
 
 
 def test_moments_of_regions_are_sums_over_their_pixels():

@@ -124,16 +124,8 @@ class Config:
     )
     exact: bool = option(
         False,
-        'minimise the energy without shortcuts: every label is expanded at full resolution until '
-        'nothing changes, directions to all of the image (minutes), planes to the pixels around '
-        'their surfaces (a second)',
-    )
-    refits: int = option(
-        0,
-        'method planes: rounds of fitting the planes to the labels and the labels to the planes '
-        'again; fewer when that does not lower the energy',
-        low=0,
-        high=1000,
+        'method normals: minimise the energy without shortcuts, every label over all of the image '
+        'until nothing changes (minutes)',
     )
     work_budget: float = option(
         1.0,
@@ -395,8 +387,8 @@ class Config:
         check_directions(self.directions, self.direction_count)
         if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
             raise ConfigError('parameter moves: swap is for method normals with exact')
-        if self.work_budget < 1 and (self.method != 'planes' or self.exact):
-            raise ConfigError('parameter work_budget is for method planes, without exact')
+        if self.work_budget < 1 and self.method != 'planes':
+            raise ConfigError('parameter work_budget is for method planes')
         if self.odometry and not self.odometry_frame:
             raise ConfigError('parameter odometry_frame must have a name')
         if self.up_x == self.up_y == self.up_z == 0:
@@ -476,6 +468,7 @@ RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 # Former parameters that nothing reads any more, and why.
 DROPPED: dict[str, str] = {
     'flatness': 'plane_probability decides what is a plane',
+    'refits': 'planes are fitted to the final labels',
     'warm_start': 'no frame depends on those before',
 }
 

@@ -61,8 +61,8 @@ class NodeConfig(Config):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.target_rate > 0 and (self.method != 'planes' or self.exact):
-            raise ConfigError('parameter target_rate is for method planes, without exact')
+        if self.target_rate > 0 and self.method != 'planes':
+            raise ConfigError('parameter target_rate is for method planes')
 
 
 def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:

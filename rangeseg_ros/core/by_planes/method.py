@@ -49,7 +49,7 @@ def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None])
     ----------
     view : View
     config : Config
-        `plane_smoothness`, `exact` and `refits` are read.
+        `plane_smoothness` is read.
     cuts : float
         Share of the pixels near boundaries whose labels graph cuts decide.
     lap : callable
@@ -71,9 +71,7 @@ def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None])
     surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, view.least)
     problem = pending.result()
     lap('surfaces')
-    labels, models = refine(
-        problem, surface, nodes.moments, moments, sensor, config.exact, config.refits, cuts
-    )
+    labels, models = refine(problem, surface, nodes.moments, moments, sensor, cuts)
     lap('labels')
     return Labelling(labels.reshape(whole.shape), problem, models)
 
