@@ -63,10 +63,9 @@ def _basis(
     rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
 ) -> NDArray[np.float64]:
     """(N, M) Chebyshev polynomials of both coordinates."""
-    v, u = (
-        2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True)
-    )
-    return np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
+    basis: NDArray[np.float64] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis
 
 
 def _between(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
