@@ -34,23 +34,15 @@ class Config:
     )
     normals: str = option(
         'cross_product',
-        'observed normals by cross product of the tangents (cross_product), by the plane through '
-        'a window of least squares in inverse range (plane_fit) or of orthogonal least squares '
-        '(orthogonal_fit)',
+        'observed normals by cross product of tangents, or by the plane through a window of least '
+        'squares in inverse range (plane_fit) or of orthogonal least squares (orthogonal_fit)',
         choices=('cross_product', 'plane_fit', 'orthogonal_fit'),
     )
     normal_baseline: int = option(
-        3,
-        'pixels from a pixel to the neighbours of its cross product; the thesis uses 1, where '
-        'one step of the quantised depth of a Kinect turns the normal by tens of degrees',
-        low=1,
-        high=50,
+        3, 'pixels from a pixel to the neighbours of its cross product; the thesis uses 1', 1, 50
     )
     normal_radius: int = option(
-        2,
-        'the window of plane_fit and orthogonal_fit has 2 r + 1 rows and columns',
-        low=1,
-        high=50,
+        2, 'the window of plane_fit and orthogonal_fit has 2 r + 1 rows and columns', 1, 50
     )
     directions: str = option(
         'platonic',
@@ -62,8 +54,8 @@ class Config:
         305,
         'method normals: number of directions; platonic has 4, 17, 73, 305, 1249, regular the '
         'odd squares (25, 225, 1225), spiral and random any',
-        low=1,
-        high=5000,
+        1,
+        5000,
     )
     jump_edges: str = option(
         'plane',
@@ -75,8 +67,8 @@ class Config:
         0.0,
         'jump_edges plane: smallest jump of the inverse range, 1/m; 0 follows the noise of the '
         'sensor: about 0.0065 for a Kinect, 26 mm at 2 m',
-        low=0.0,
-        high=10.0,
+        0.0,
+        10.0,
     )
     weighting: str = option(
         'uniform',
@@ -85,30 +77,26 @@ class Config:
     )
     smoothness: float = option(
         130.0,
-        'method normals: lambda of eq. 5.3, weight of the Potts prior against degrees of angle; '
-        'trained on simulated Kinect rooms; the thesis uses 55, with normal_baseline 1',
-        low=0.0,
-        high=10000.0,
+        'method normals: lambda of eq. 5.3, against degrees; the thesis uses 55',
+        0.0,
+        10000.0,
     )
     plane_smoothness: float = option(
         1.2,
-        'method planes: lambda of eq. 5.3, weight of the Potts prior against half the squares of '
-        'residuals in standard deviations, for each pixel whose noise agrees',
-        low=0.0,
-        high=10000.0,
+        'method planes: lambda of eq. 5.3, against half the squares of residuals in standard '
+        'deviations, for each pixel whose noise agrees',
+        0.0,
+        10000.0,
     )
     plane_probability: float = option(
         0.3,
         'method planes: a region is a plane from this probability on, and otherwise a curved '
         'surface; 0 makes planes of all',
-        low=0.0,
-        high=1.0,
+        0.0,
+        1.0,
     )
     plane_prior: float = option(
-        0.5,
-        'share of planes among the regions that are found, before their bend is looked at',
-        low=0.001,
-        high=0.999,
+        0.5, 'share of planes among the regions, before their bend is looked at', 0.001, 0.999
     )
     moves: str = option(
         'expansion',
@@ -116,11 +104,7 @@ class Config:
         choices=('expansion', 'swap'),
     )
     cycles: int = option(
-        0,
-        'method normals with exact: rounds of moves at most; 0 goes on until no move helps; '
-        'nothing else reads it',
-        low=0,
-        high=1000,
+        0, 'method normals with exact: rounds of moves at most; 0 = until none helps', 0, 1000
     )
     exact: bool = option(
         False,
@@ -132,8 +116,8 @@ class Config:
         'method planes: share of the full work that a frame may take; below 1 fewer boundaries '
         'are refined, below 0.95 every second row and column is looked at, below 0.65 every '
         'fourth',
-        low=0.0,
-        high=1.0,
+        0.0,
+        1.0,
     )
     noise_regions: str = option(
         'identify',
@@ -142,57 +126,46 @@ class Config:
         choices=('leave', 'identify', 'merge'),
     )
     min_pixels: int = option(
-        0,
-        'smallest region that makes a plane, pixels; 0 follows the size of the image: 300 of VGA',
-        low=0,
-        high=100000000,
+        0, 'smallest plane, pixels; 0 follows the size of the image: 300 of VGA', 0, 100000000
     )
     noise: float = option(
         0.0013,
         'random error of the inverse range, 1/m; the default is 0.45 steps of the disparity of a '
         'Kinect, more is taken where the image shows more',
-        low=0.0,
-        high=10.0,
+        0.0,
+        10.0,
     )
     range_noise: float = option(
-        0.0, 'random error of the range, metres, for sensors like lasers', low=0.0, high=10.0
+        0.0, 'random error of the range, metres, for sensors like lasers', 0.0, 10.0
     )
     pixel_noise: float = option(
         0.6,
-        'random error of the direction of a pixel, pixels, by which surfaces seen at a grazing '
-        'angle are noisier',
-        low=0.0,
-        high=100.0,
+        'random error of the direction of a pixel, pixels: noise at grazing angles',
+        0.0,
+        100.0,
     )
     white_noise: float = option(
-        0.33,
-        'share of the random variance that is new in every pixel; the default is the '
-        'quantisation of a Kinect, the rest is correlated noise of 0.37 steps of the disparity',
-        low=0.0,
-        high=1.0,
+        0.33, 'share of the random variance that is new in every pixel', 0.0, 1.0
     )
     noise_correlation: float = option(
-        2.0,
-        'width of the Gaussian the noise looks smoothed with, pixels; 0 is white noise',
-        low=0.0,
-        high=100.0,
+        2.0, 'width of the Gaussian the noise looks smoothed with, pixels; 0 = white', 0.0, 100.0
     )
     distortion: float = option(
         0.00145,
         'smooth systematic error of the inverse range, 1/m; the default is half a step of the '
         'disparity of a Kinect',
-        low=0.0,
-        high=10.0,
+        0.0,
+        10.0,
     )
     range_distortion: float = option(
-        0.0, 'smooth systematic error of the range, metres', low=0.0, high=10.0
+        0.0, 'smooth systematic error of the range, metres', 0.0, 10.0
     )
     distortion_length: float = option(
         0.0,
         'width of the Gaussian the distortion looks smoothed with, pixels; 0 follows the size of '
         'the image: 35 of VGA',
-        low=0.0,
-        high=10000.0,
+        0.0,
+        10000.0,
     )
     sensor_model: str = option(
         'measured',
@@ -201,11 +174,7 @@ class Config:
         choices=('measured', 'fixed'),
     )
     dithering: float = option(
-        0.0,
-        'standard deviation of Gaussian noise added to the range, metres; breaks up the steps '
-        'of coarsely quantised depth',
-        low=0.0,
-        high=10.0,
+        0.0, 'noise added to the range, metres; breaks up the steps of coarse depth', 0.0, 10.0
     )
     # What is known of one sensor: its fixed distortion, and what always stands in its way.
     distortion_map: str = option(
@@ -219,50 +188,35 @@ class Config:
         'neither segmented nor terrain',
     )
     track_time: float = option(
-        3.0,
-        'seconds that a plane may be out of sight, or go unnoticed, and keep its id',
-        low=0.0,
-        high=100000.0,
+        3.0, 'seconds that a plane may be out of sight or unnoticed and keep its id', 0.0, 100000.0
     )
-    up_x: float = option(0.0, 'up in the frame of the image, x', low=-1000.0, high=1000.0)
+    up_x: float = option(0.0, 'up in the frame of the image, x', -1000.0, 1000.0)
     up_y: float = option(
         -1.0,
         'up in the frame of the image, y; the default, 0, -1, 0, is that of a level camera, '
         'which is z of clouds in frames that do not look along z',
-        low=-1000.0,
-        high=1000.0,
+        -1000.0,
+        1000.0,
     )
-    up_z: float = option(0.0, 'up in the frame of the image, z', low=-1000.0, high=1000.0)
+    up_z: float = option(0.0, 'up in the frame of the image, z', -1000.0, 1000.0)
     role_tolerance: float = option(
         10.0,
-        'largest angle of floor, table, ceiling and wall to the horizontal or vertical, degrees',
-        low=0.0,
-        high=45.0,
+        'largest angle of planes with roles to the horizontal or vertical, degrees',
+        0.0,
+        45.0,
     )
     role_height: float = option(
-        0.1,
-        'planes within this distance of the floor or ceiling belong to it, metres',
-        low=0.0,
-        high=10.0,
+        0.1, 'planes so near to the floor or ceiling belong to it, metres', 0.0, 10.0
     )
     role_area: float = option(
-        0.3,
-        'smallest area, square metres, from which a surface can be floor, ceiling or wall',
-        low=0.0,
-        high=1000.0,
+        0.3, 'smallest area that can be floor, ceiling or wall, square metres', 0.0, 1000.0
     )
     # How the camera moves where planes and tf leave it open: by default like a quick hand.
     camera_turn: float = option(
-        60.0,
-        'standard deviation of how fast the camera turns, degrees per second',
-        low=0.1,
-        high=3600.0,
+        60.0, 'standard deviation of the turning of the camera, degrees per second', 0.1, 3600.0
     )
     camera_speed: float = option(
-        0.9,
-        'standard deviation of how fast the camera moves, metres per second',
-        low=0.001,
-        high=100.0,
+        0.9, 'standard deviation of the speed of the camera, metres per second', 0.001, 100.0
     )
     # The world: frames, the map of planes.
     fixed_frame: str = option(
@@ -276,42 +230,23 @@ class Config:
         'and the height of the camera, before the accelerometer and up_x, up_y, up_z',
     )
     target_frame: str = option(
-        '',
-        'frame of ~/planes and ~/markers, like base_link; without a name, that of the images',
+        '', 'frame of ~/planes and ~/markers, like base_link; without a name, that of the images'
     )
-    tf_timeout: float = option(
-        0.1, 'seconds that an image waits for its transforms', low=0.0, high=60.0
-    )
+    tf_timeout: float = option(0.1, 'seconds that an image waits for its transforms', 0.0, 60.0)
     pose_noise: float = option(
-        0.005,
-        'standard deviation of the place of the camera in the fixed frame, metres, for each axis',
-        low=0.0,
-        high=10.0,
+        0.005, 'standard deviation of the place of the camera, metres, for each axis', 0.0, 10.0
     )
     pose_turn_noise: float = option(
-        0.3,
-        'standard deviation of the direction of the camera in the fixed frame, degrees, about '
-        'each axis',
-        low=0.0,
-        high=45.0,
+        0.3, 'standard deviation of the pose of the camera, degrees, about each axis', 0.0, 45.0
     )
     map_resolution: float = option(
-        0.03,
-        'smallest detail of outlines in the map of planes, metres',
-        low=0.001,
-        high=10.0,
+        0.03, 'smallest detail of outlines in the map of planes, metres', 0.001, 10.0
     )
     map_area: float = option(
-        0.05,
-        'smallest area of a plane that the map tells, square metres; 0 for clutter as well',
-        low=0.0,
-        high=1000.0,
+        0.05, 'smallest plane of the map, square metres; 0 for clutter as well', 0.0, 1000.0
     )
     map_planes: int = option(
-        1000,
-        'planes that the map keeps at most: those out of sight the longest are forgotten',
-        low=1,
-        high=100000,
+        1000, 'planes of the map at most: those out of sight the longest are forgotten', 1, 100000
     )
     odometry: bool = option(
         False,
@@ -319,61 +254,51 @@ class Config:
         'the map of planes',
     )
     odometry_frame: str = option(
-        'odom',
-        "frame of ~/odometry: x forward and z up, at the camera's first place",
+        'odom', "frame of ~/odometry: x forward and z up, at the camera's first place"
     )
     # The ground.
     sensor_height: float = option(
         0.0,
         'height of the sensor above the ground below it, along up, metres; 0 = unknown',
-        low=0.0,
-        high=100.0,
+        0.0,
+        100.0,
     )
     ground_slope: float = option(
-        12.0,
-        'steepest ground, against the ground under the robot, degrees',
-        low=0.0,
-        high=45.0,
+        12.0, 'steepest ground, against the ground under the robot, degrees', 0.0, 45.0
     )
     sensor_height_sd: float = option(
-        0.015, 'standard deviation of sensor_height, metres', low=0.001, high=10.0
+        0.015, 'standard deviation of sensor_height, metres', 0.001, 10.0
     )
     up_sd: float = option(
-        1.5,
-        'standard deviation of the direction that is up, however it is told, degrees',
-        low=0.01,
-        high=45.0,
+        1.5, 'standard deviation of the direction up, however it is told, degrees', 0.01, 45.0
     )
     obstacle_height: float = option(
-        0.05, 'what stands so high above the ground is an obstacle, metres', low=0.005, high=10.0
+        0.05, 'what stands so high above the ground is an obstacle, metres', 0.005, 10.0
     )
     drop_height: float = option(
-        0.05, 'what lies so deep below the ground is a drop, metres', low=0.005, high=10.0
+        0.05, 'what lies so deep below the ground is a drop, metres', 0.005, 10.0
     )
     grid_resolution: float = option(
-        0.05, 'side of a cell of ~/grid, the ground around the robot, metres', low=0.01, high=1.0
+        0.05, 'side of a cell of ~/grid, the ground around the robot, metres', 0.01, 1.0
     )
-    grid_size: float = option(8.0, 'side of ~/grid, metres', low=0.1, high=50.0)
+    grid_size: float = option(8.0, 'side of ~/grid, metres', 0.1, 50.0)
     grid_memory: float = option(
         30.0,
         'how long ~/grid remembers what is out of sight, with fixed_frame or odometry, seconds',
-        low=0.0,
-        high=86400.0,
+        0.0,
+        86400.0,
     )
     grid_clearance: float = option(
-        2.0,
-        'what hangs higher above the ground is no obstacle of ~/grid, metres',
-        low=0.0,
-        high=100.0,
+        2.0, 'what hangs higher above the ground is no obstacle of ~/grid, metres', 0.0, 100.0
     )
     cloud_resolution: float = option(
         0.0,
         'side of the cells of which ~/ground and ~/obstacles have a point, metres, more where '
         'there would be 20 000 points or more; ~/drops has all edges of drops; 0 = all pixels',
-        low=0.0,
-        high=1.0,
+        0.0,
+        1.0,
     )
-    seed: int = option(0, 'of dithering and random directions', low=0, high=2147483647)
+    seed: int = option(0, 'of dithering and random directions', 0, 2147483647)
 
     def __new__(cls, *values: Any, **named: Any) -> Config:
         # The TypeError of the generated __init__ would suggest nothing.
@@ -434,20 +359,15 @@ def check_directions(distribution: str, count: int) -> None:
     """Raise ConfigError if `distribution` cannot give `count` directions."""
     if distribution not in ('platonic', 'regular', 'spiral', 'random'):
         raise ConfigError(f'unknown distribution of directions {distribution!r}')
-    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
-        counts = ', '.join(map(str, PLATONIC_COUNTS))
-        raise ConfigError(
-            f'parameter direction_count: platonic subdivision gives {counts} directions, '
-            f'not {count}'
-        )
     if count < 1:
         raise ConfigError(f'parameter direction_count must be positive, not {count}')
-    root = math.isqrt(count)
+    root, given = math.isqrt(count), f'directions, not {count}'
+    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
+        counts = ', '.join(map(str, PLATONIC_COUNTS))
+        raise ConfigError(f'parameter direction_count: platonic gives {counts} {given}')
     if distribution == 'regular' and (root * root != count or root % 2 == 0):
-        raise ConfigError(
-            'parameter direction_count: regular angles give an odd square (1, 9, 25 ... 1225) of '
-            f'directions, not {count}'
-        )
+        squares = 'an odd square (1, 9, 25 ... 1225) of'
+        raise ConfigError(f'parameter direction_count: regular gives {squares} {given}')
 
 
 def _frames_in_seconds(frames: object) -> object:
@@ -455,15 +375,11 @@ def _frames_in_seconds(frames: object) -> object:
     return frames / 30 if isinstance(frames, int | float) else frames
 
 
-def _as_it_is(value: object) -> object:
-    return value
-
-
 # Former names of parameters, their names now, and what becomes of their values.
 RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     'track_memory': ('track_time', _frames_in_seconds),
-    'sensor_height_noise': ('sensor_height_sd', _as_it_is),
-    'up_noise': ('up_sd', _as_it_is),
+    'sensor_height_noise': ('sensor_height_sd', lambda value: value),
+    'up_noise': ('up_sd', lambda value: value),
 }
 # Former parameters that nothing reads any more, and why.
 DROPPED: dict[str, str] = {

@@ -19,7 +19,6 @@ class ConfigError(ValueError):
 def option(
     default: bool | int | float | str,
     description: str,
-    *,
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),

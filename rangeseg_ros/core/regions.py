@@ -79,91 +79,54 @@ def connected_components(
     (H, W) int32
         1...M, 0 where not valid.
     """
-    found = np.empty(labels.shape, np.int32)
-    parent = np.empty(labels.size + 1, np.int32)
-    counts = map_halves(_find_components, len(labels), labels, *grid, valid, found, parent)
-    number = _unite_halves(labels, grid.below, found, parent, *counts)
-    components = np.empty(labels.shape, np.int32)
-    run_rows(_relabel, len(labels), found, number, components)
-    return components
+    return _find_components(labels, *grid, valid)
 
 
 @njit(cache=True, nogil=True)
 def _find_components(
-    first: int,
-    after: int,
     labels: NDArray[np.integer],
     right: NDArray[np.float32],
     below: NDArray[np.float32],
     valid: NDArray[np.bool_],
-    found: NDArray[np.int32],
-    parent: NDArray[np.int32],
-) -> int:
-    """The first pass over some rows, with a table of equivalent labels (thesis 3.1.1).
-
-    Numbers in `found` begin after that of the rows' first pixel; a number's `parent` is an
-    equivalent, lower one, or itself. Returns how many there are.
-    """
-    width = labels.shape[1]
-    start = first * width
+) -> NDArray[np.int32]:
+    """Two passes, with a table of equivalent numbers between them (thesis 3.1.1)."""
+    height, width = labels.shape
+    found = np.zeros((height, width), np.int32)
+    # Of each number an equivalent, lower one, or itself.
+    parent = np.empty(labels.size + 1, np.int32)
     count = 0
-    for i in range(first, after):
+    for i in range(height):
         for j in range(width):
-            found[i, j] = 0
             if not valid[i, j]:
                 continue
             here = labels[i, j]
             if j > 0 and right[i, j - 1] > 0 and labels[i, j - 1] == here:
                 found[i, j] = found[i, j - 1]
-            if i > first and below[i - 1, j] > 0 and labels[i - 1, j] == here:
-                above = found[i - 1, j]
-                if found[i, j] == 0:
-                    found[i, j] = above
-                elif above > 0 and found[i, j] != above:
-                    _unite(int(found[i, j]), int(above), parent)
+            if i > 0 and below[i - 1, j] > 0 and labels[i - 1, j] == here:
+                a, b = found[i, j], found[i - 1, j]
+                if a == 0:
+                    found[i, j] = b
+                elif b > 0 and a != b:
+                    while parent[a] != a:
+                        a = parent[a]
+                    while parent[b] != b:
+                        b = parent[b]
+                    parent[max(a, b)] = min(a, b)
             if found[i, j] == 0:
                 count += 1
-                parent[start + count] = found[i, j] = start + count
-    return count
-
-
-@njit(cache=True)
-def _unite(a: int, b: int, parent: NDArray[np.int32]) -> None:
-    while parent[a] != a:
-        a = parent[a]
-    while parent[b] != b:
-        b = parent[b]
-    parent[max(a, b)] = min(a, b)
-
-
-@njit(cache=True, nogil=True)
-def _unite_halves(
-    labels: NDArray[np.integer],
-    below: NDArray[np.float32],
-    found: NDArray[np.int32],
-    parent: NDArray[np.int32],
-    upper: int,
-    lower: int,
-) -> NDArray[np.int32]:
-    """Component 1...M of each number in `found`, of which the halves have so many; of 0 none."""
-    height, width = labels.shape
-    middle = height // 2
-    for j in range(width if middle > 0 else 0):
-        a, b = int(found[middle - 1, j]), int(found[middle, j])
-        alike = a > 0 and b > 0 and labels[middle - 1, j] == labels[middle, j]
-        if alike and below[middle - 1, j] > 0:
-            _unite(a, b, parent)
-    # A parent has a lower number than its children, so that one pass resolves and renumbers.
-    number = np.empty(len(parent), np.int32)
-    number[0] = last = 0
-    for start, count in ((0, upper), (middle * width, lower)):
-        for k in range(start + 1, start + count + 1):
-            if parent[k] == k:
-                last += 1
-                number[k] = last
-            else:
-                number[k] = number[parent[k]]
-    return number
+                parent[count] = found[i, j] = count
+    number = np.zeros(count + 1, np.int32)
+    last = 0
+    for k in range(1, count + 1):
+        if parent[k] == k:
+            last += 1
+            number[k] = last
+        else:
+            number[k] = number[parent[k]]
+    for i in range(height):
+        for j in range(width):
+            found[i, j] = number[found[i, j]]
+    return found
 
 
 @njit(cache=True, nogil=True)

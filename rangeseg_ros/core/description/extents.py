@@ -7,15 +7,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.blocks import BLOCK
-from rangeseg_ros.core.sensing.marks import find_marked, no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.ray_rows import ray_of
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
 _FAR = 2.0
-# Variance of the places of a block's pixels, along its rows or columns, pixels squared.
-_SPREAD = (BLOCK**2 - 1) / 12
 
 
 def areas_and_axes(
@@ -45,8 +41,7 @@ def areas_and_axes(
         Unit vector in the plane of the largest second moment of the area, to the image's right.
     """
     pixels = image.inverse, image.rays, image.pinhole, _footprints(image)
-    rows = -(-len(labels) // BLOCK)
-    upper, lower = map_halves(_area_moments, rows, labels, *pixels, theta, tangents)
+    upper, lower = map_halves(_area_moments, len(labels), labels, *pixels, theta, tangents)
     sums = upper + lower
     # With rays r + t du + s dv the area on n . p + d = 0 is d^2 |du x dv . r| / |n . r|^3.
     area = sums[:, 0] * np.linalg.norm(theta, axis=1)
@@ -124,7 +119,7 @@ def _ray_footprints(
     return result
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model='numpy')
 def _area_moments(
     first: int,
     after: int,
@@ -136,89 +131,34 @@ def _area_moments(
     theta: NDArray[np.float64],
     tangents: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2 of rows of blocks.
-
-    a is area over |theta|. A block of one label counts as so many times its middle.
-    """
+    """Sums (M + 1, 6) of a, a u, a v, a u^2, a u v, a v^2 of some rows; a is area over |theta|."""
     sums = np.zeros((len(theta), 6))
-    height, width = labels.shape
-    for bi in range(first, after):
-        top, bottom = bi * BLOCK, min((bi + 1) * BLOCK, height)
-        for left in range(0, width, BLOCK):
-            right, label = min(left + BLOCK, width), labels[top, left]
-            if bottom - top == BLOCK and right - left == BLOCK and _is_filled(labels, top, left):
-                if label == 0:
-                    continue
-                i, j = top + BLOCK // 2, left + BLOCK // 2
-                # Of the four pixels in the middle, three tell all.
-                one = _ray(rays, pinhole, i - 1, j - 1)
-                next_one, other = _ray(rays, pinhole, i - 1, j), _ray(rays, pinhole, i, j)
-                ray = (one[0] + other[0]) / 2, (one[1] + other[1]) / 2, (one[2] + other[2]) / 2
-                level = _along(theta, label, ray)
-                right_step = _along(theta, label, next_one) - _along(theta, label, one)
-                down_step = _along(theta, label, other) - _along(theta, label, next_one)
-                # The mean of 1 / level^3 over them, to the second order.
-                bend = 6 * _SPREAD * (right_step**2 + down_step**2) / max(level**2, 1e-300)
-                size = BLOCK * BLOCK * (1 + bend) * footprints[i, j]
-                _add_area(sums, label, theta, tangents, ray, inverse[i, j], size)
+    for i in range(first, after):
+        for j in range(labels.shape[1]):
+            label = labels[i, j]
+            if label == 0 or inverse[i, j] == 0:
                 continue
-            for i in range(top, bottom):
-                for j in range(left, right):
-                    label = labels[i, j]
-                    if label > 0:
-                        ray, size = _ray(rays, pinhole, i, j), float(footprints[i, j])
-                        _add_area(sums, label, theta, tangents, ray, inverse[i, j], size)
+            ray = ray_of(rays, pinhole, i, j)
+            level = _product(theta[label], ray)
+            if level * _FAR < inverse[i, j]:
+                continue
+            depth = 1 / level
+            u = depth * _product(tangents[label, 0], ray)
+            v = depth * _product(tangents[label, 1], ray)
+            area = footprints[i, j] * depth * depth * depth
+            total = sums[label]
+            total[0] += area
+            total[1] += area * u
+            total[2] += area * v
+            total[3] += area * u * u
+            total[4] += area * u * v
+            total[5] += area * v * v
     return sums
 
 
 @njit(cache=True, inline='always')
-def _is_filled(labels: NDArray[np.uint16], top: int, left: int) -> bool:
-    """Whether a block has one label."""
-    label = labels[top, left]
-    # Without branches.
-    unlike = label ^ label
-    for i in range(BLOCK):
-        for j in range(BLOCK):
-            unlike |= labels[top + i, left + j] ^ label
-    return unlike == 0
-
-
-@njit(cache=True, inline='always')
-def _add_area(
-    sums: NDArray[np.float64],
-    label: int,
-    theta: NDArray[np.float64],
-    tangents: NDArray[np.float64],
-    ray: tuple[float, float, float],
-    inverse: float,
-    size: float,
-) -> None:
-    """Add the moments of what is seen along a ray; `size` is its footprint."""
-    level = _along(theta, label, ray)
-    if inverse > 0 and level * _FAR >= inverse:
-        depth = 1 / level
-        across = depth * _along(tangents[:, 0], label, ray)
-        along = depth * _along(tangents[:, 1], label, ray)
-        area = size * depth * depth * depth
-        sums[label, 0] += area
-        sums[label, 1] += area * across
-        sums[label, 2] += area * along
-        sums[label, 3] += area * across * across
-        sums[label, 4] += area * across * along
-        sums[label, 5] += area * along * along
-
-
-@njit(cache=True, inline='always')
-def _ray(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[float, float, float]:
-    """Ray of a pixel."""
-    x, y, z = ray_of(rays, pinhole, i, j)
-    return float(x), float(y), float(z)
-
-
-@njit(cache=True, inline='always')
-def _along(vectors: NDArray[np.float64], label: int, ray: tuple[float, float, float]) -> float:
-    """Product of a ray and the vector of a region."""
-    return vectors[label, 0] * ray[0] + vectors[label, 1] * ray[1] + vectors[label, 2] * ray[2]
+def _product(vector: NDArray[np.float64], ray: tuple[float, float, float]) -> float:
+    return vector[0] * ray[0] + vector[1] * ray[1] + vector[2] * ray[2]
 
 
 @njit(cache=True, nogil=True)
@@ -241,54 +181,31 @@ def _limits(
     limits[:, :, 0], limits[:, :, 1] = np.inf, -np.inf
     corners = 4 if half.any() else 1
     height, width = labels.shape
-    # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends. Others
-    # may bend, but lie inside where all neighbours are of the region, too.
-    outer = no_marks(width)
-    places = np.empty(len(outer), np.intp)
     for i in range(first, after):
-        if corners > 1:
-            _find_ends(labels[i], labels[i], labels[i], outer)
-        elif 0 < i < height - 1:
-            _find_ends(labels[i], labels[i - 1], labels[i + 1], outer)
-        else:
-            outer[:width] = 1
-        for place in places[: find_marked(outer, 0, places)]:
-            j = int(place)
+        for j in range(width):
             label = labels[i, j]
             if label == 0 or inverse[i, j] == 0:
                 continue
-            plane, ray = theta[label], ray_of(rays, pinhole, i, j)
+            # Rows of a pinhole camera are straight on the plane: the extremes lie at their ends.
+            # Others may bend, but lie inside where all neighbours are of the region, too.
+            if 0 < j < width - 1 and labels[i, j - 1] == label == labels[i, j + 1]:
+                if corners > 1:
+                    continue
+                if 0 < i < height - 1 and labels[i - 1, j] == label == labels[i + 1, j]:
+                    continue
+            x, y, z = ray_of(rays, pinhole, i, j)
             for corner in range(corners):
                 right, down = 1 - 2 * (corner & 1), 1 - (corner & 2)
-                x = ray[0] + half[0, 0] * right + half[0, 1] * down
-                y = ray[1] + half[1, 0] * right + half[1, 1] * down
-                z = ray[2] + half[2, 0] * right + half[2, 1] * down
-                level = plane[0] * x + plane[1] * y + plane[2] * z
+                ray = (
+                    x + half[0, 0] * right + half[0, 1] * down,
+                    y + half[1, 0] * right + half[1, 1] * down,
+                    z + half[2, 0] * right + half[2, 1] * down,
+                )
+                level = _product(theta[label], ray)
                 if level * _FAR < inverse[i, j]:
                     continue
                 for a in range(2):
-                    axis = axes[label, a]
-                    value = (axis[0] * x + axis[1] * y + axis[2] * z) / level
+                    value = _product(axes[label, a], ray) / level
                     limits[label, a, 0] = min(limits[label, a, 0], value)
                     limits[label, a, 1] = max(limits[label, a, 1], value)
     return limits
-
-
-@njit(cache=True, nogil=True)
-def _find_ends(
-    row: NDArray[np.uint16],
-    above: NDArray[np.uint16],
-    below: NDArray[np.uint16],
-    ends: NDArray[np.uint8],
-) -> None:
-    """Mark the pixels of a row that have a neighbour of another region, or none."""
-    # Views, of which the compiler takes many pixels at a time.
-    last = len(row) - 1
-    middle, left, right = row[1:], row, row[2:]
-    upper, lower, inside = above[1:], below[1:], ends[1:]
-    for j in range(last - 1):
-        label = middle[j]
-        inside[j] = (
-            (label != left[j]) | (label != right[j]) | (label != upper[j]) | (label != lower[j])
-        )
-    ends[0] = ends[last] = 1

@@ -10,7 +10,6 @@ from typing import Any
 import cv2
 import numpy as np
 from mapbox_earcut import triangulate_float64
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
@@ -138,23 +137,9 @@ def lies_ahead(
     """
     if camera is None or not camera.pinhole:
         return np.zeros(len(boxes), np.bool_)
-    lens = camera.fx, camera.fy, camera.cx, camera.cy
-    return _corners_lie_ahead(boxes, theta @ camera.axes, lens)
-
-
-@njit(cache=True)
-def _corners_lie_ahead(
-    boxes: NDArray[np.intp], theta: NDArray[np.float64], lens: tuple[float, float, float, float]
-) -> NDArray[np.bool_]:
-    """Whether the corners of each box meet its plane, optical frame: see `Outline._on_plane`."""
-    fx, fy, cx, cy = lens
-    ahead = np.ones(len(boxes), np.bool_)
-    for k in range(len(boxes)):
-        for row in boxes[k, 0::2]:
-            for column in boxes[k, 1::2]:
-                x, y = (column - 0.5 - cx) / fx, (row - 0.5 - cy) / fy
-                level = theta[k, 0] * x + theta[k, 1] * y + theta[k, 2]
-                ahead[k] &= level > _GRAZING * np.abs(theta[k]).max()
+    corners = np.stack([boxes[:, [1, 3, 1, 3]], boxes[:, [0, 0, 2, 2]]], axis=-1) - 0.5
+    level = np.einsum('nki,ni->nk', camera.rays_at(corners[..., 0], corners[..., 1]), theta)
+    ahead: NDArray[np.bool_] = level.min(axis=1) > _GRAZING * np.abs(theta).max(axis=1)
     return ahead
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,21 +73,8 @@ class RegionShape:
     def __init__(self, shapes: Shapes, label: int) -> None:
         self._shapes, self._label = shapes, label
 
-    @property
-    def area(self) -> float:
-        return self._shapes[self._label].area
-
-    @property
-    def extents(self) -> NDArray[np.float64]:
-        return self._shapes[self._label].extents
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        return self._shapes[self._label].centre
-
-    @property
-    def orientation(self) -> NDArray[np.float64]:
-        return self._shapes[self._label].orientation
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._shapes[self._label], name)
 
     def __reduce__(self) -> tuple[type[Shape], Shape]:
         return Shape, self._shapes[self._label]

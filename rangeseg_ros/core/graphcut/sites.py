@@ -11,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.marks import find_marked, no_marks
-
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 """Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
@@ -73,66 +71,19 @@ def fronts(
         The first of the rows, and the one after the last.
     """
     first, after = rows[0] * width, rows[1] * width
-    room = 4 * (after - first)
-    beside, sites = np.empty(room, np.int32), np.empty(room, np.int32)
+    beside, sites = np.empty((2, 4 * (after - first)), np.int32)
     found = 0
-    marks, unlike = room_for_unlike(width)
-    for row in range(max(rows[0] - 1, 0), rows[1]):
-        for s in range(unlike_sites(labels, row * width, width, marks, unlike)):
-            p = unlike[s]
-            here = labels[p]
-            for k in range(2):
-                q = p + (1 if k == 0 else width)
-                if q < len(labels) and labels[q] != here and links[k, p] > 0:
-                    if first <= q < after:
-                        beside[found], sites[found] = here, q
-                        found += 1
-                    if p >= first:
-                        beside[found], sites[found] = labels[q], p
-                        found += 1
+    for p in range(max(first - width, 0), after):
+        # The last pixel of a row has no link to the right.
+        for k, q in enumerate((p + 1, p + width)):
+            if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
+                if first <= q < after:
+                    beside[found], sites[found] = labels[p], q
+                    found += 1
+                if p >= first:
+                    beside[found], sites[found] = labels[q], p
+                    found += 1
     return group_sites(beside[:found], sites[:found], count)
-
-
-@njit(cache=True, nogil=True)
-def room_for_unlike(width: int) -> tuple[NDArray[np.uint8], NDArray[np.intp]]:
-    """`marks` and `sites` for `unlike_sites`, of rows so wide."""
-    marks = no_marks(width)
-    return marks, np.empty(len(marks), np.intp)
-
-
-@njit(cache=True, nogil=True)
-def unlike_sites(
-    labels: NDArray[np.int32],
-    first: int,
-    width: int,
-    marks: NDArray[np.uint8],
-    sites: NDArray[np.intp],
-) -> int:
-    """Sites of a row, which begins at `first`, whose right or lower neighbour has another label.
-
-    Parameters
-    ----------
-    labels : (n,) int32
-    first, width : int
-    marks : (m,) uint8
-        Scratch, see `no_marks`.
-    sites : (m,) int
-        Receives them.
-
-    Returns
-    -------
-    int
-        How many there are.
-    """
-    # As views of their own, whose places are known not to be negative, many are compared at once.
-    here, right = labels[first : first + width], labels[first + 1 : first + width]
-    below = labels[first + width : first + 2 * width]
-    marks[width - 1] = 0
-    for j in range(len(right)):
-        marks[j] = here[j] != right[j]
-    for j in range(len(below)):
-        marks[j] |= here[j] != below[j]
-    return find_marked(marks, first, sites)
 
 
 @njit(cache=True, nogil=True)

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
-from rangeseg_ros.core.sensing.plane_deviation import plane_deviation
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.significance import OUTLIER
 
-# Rows and columns of the windows of the Sobel operators and of the median before them.
+# Rows and columns of the windows of both methods, and of the median before the Sobel operators.
 _WINDOW = 3
+# The farthest window that a boundary looks at.
+_FRAME = 2 * _WINDOW - 1
 # Response of the Sobel operator of 3 x 3 to a step of one: 1 + 2 + 1.
 _SOBEL_GAIN = 4
 
@@ -29,6 +36,149 @@ def jump_edges(
     if method == 'sobel':
         return sobel(image)
     return None
+
+
+def plane_deviation(
+    image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0, between: ArrayLike = 0.0
+) -> GridEdges:
+    """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
+
+    In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
+    adjoining 3 x 3 windows is compared to the steps on either side of it: on a plane all three
+    are equal, over a crease the middle one lies between the others, and only a jump exceeds both.
+    The pixels beside such boundaries are candidates. The jump runs between candidates of which
+    one lies above the mean of the 7 x 7 pixels around it and one below: the zero crossing, which
+    closes contours by itself.
+
+    Where three surfaces meet, two may lie on the same side of the mean: every clear step between
+    two pixels is a jump, too, unless the next one continues it, as on a steep face. At corners,
+    where the windows hold little of one surface, contours would have gaps: beside candidates, the
+    pixels by themselves are compared as the windows are.
+
+    Parameters
+    ----------
+    image : RangeImage
+        (H, W).
+    step : float or (rows, columns) float
+        Deviation that makes a jump, 1/m, of all or of every block of 4 x 4 pixels.
+    slope : float or (rows, columns) float
+        Change of the inverse range from pixel to pixel on surfaces, 1/m.
+    between : float or (rows, columns) float
+        As `step`, between two pixels instead of windows; not less than `step`.
+
+    Returns
+    -------
+    horizontal, vertical : (H, W-1), (H-1, W) bool
+        Never true beside a pixel that was not measured.
+    """
+    height, width = image.shape
+    step, slope, between = (np.asarray(a, np.float32) for a in (step, slope, between))
+    # No noise, and twice as steep as the flat surface around.
+    clear = np.float32(OUTLIER) * step + 2 * slope
+    step, lone, clear = (
+        _along_rows(a, image.shape) for a in (step, np.maximum(step, between), clear)
+    )
+    total, count = _window_sums(image, _WINDOW)
+    means = _framed(total / np.maximum(count, 1))
+    jumps = np.empty((height, width - 1), np.bool_), np.empty((height - 1, width), np.bool_)
+    for down, result in enumerate(jumps):
+        run_rows(_find_deviations, len(result), means, step, down, result)
+    total, count = _window_sums(image, 2 * _WINDOW + 1)
+    nearer = image.inverse * count > total
+    # 1 for candidates below the mean, 2 for those above.
+    sides = pixels_beside(jumps).view(np.uint8) << nearer
+    pixels = _framed(image.inverse)
+    for down, result in enumerate(jumps):
+        run_rows(_find_crossings, len(result), pixels, sides, lone, clear, down, result)
+    return jumps
+
+
+def _along_rows(limit: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Values (rows of blocks, W) from one value or those of all blocks."""
+    blocks = np.broadcast_to(limit, (-(-shape[0] // BLOCK), -(-shape[1] // BLOCK)))
+    return np.ascontiguousarray(blocks.repeat(BLOCK, axis=1)[:, : shape[1]])
+
+
+def _window_sums(image: RangeImage, size: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Sums of the inverse range and numbers of measured pixels of square windows in the image."""
+    total, count = (
+        cv2.boxFilter(a, -1, (size, size), normalize=False, borderType=cv2.BORDER_CONSTANT)
+        for a in (image.inverse, image.valid.view(np.uint8))
+    )
+    return total, count
+
+
+def _framed(values: NDArray[Any]) -> NDArray[Any]:
+    """Values in a frame of zeros."""
+    return cv2.copyMakeBorder(values, _FRAME, _FRAME, _FRAME, _FRAME, cv2.BORDER_CONSTANT)
+
+
+@njit(cache=True, nogil=True)
+def _find_deviations(
+    first: int,
+    after: int,
+    means: NDArray[np.float32],
+    limits: NDArray[np.float32],
+    down: bool,
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the windows on either side of boundaries deviate from those beyond."""
+    for i in range(first, after):
+        a, b = _shifted(means, i, -4, down), _shifted(means, i, -1, down)
+        c, d = _shifted(means, i, 2, down), _shifted(means, i, 5, down)
+        row = limits[i // BLOCK]
+        for j in range(result.shape[1]):
+            result[i, j] = _exceeds(a[j], b[j], c[j], d[j], row[j])[0]
+
+
+@njit(cache=True, nogil=True)
+def _find_crossings(
+    first: int,
+    after: int,
+    pixels: NDArray[np.float32],
+    sides: NDArray[np.uint8],
+    limits: NDArray[np.float32],
+    clear: NDArray[np.float32],
+    down: bool,
+    result: NDArray[np.bool_],
+) -> None:
+    """Jumps between pixels, see `plane_deviation`."""
+    for i in range(first, after):
+        a, b = _shifted(pixels, i, -1, down), _shifted(pixels, i, 0, down)
+        c, d = _shifted(pixels, i, 1, down), _shifted(pixels, i, 2, down)
+        one, other = sides[i], sides[i + 1] if down else sides[i, 1:]
+        row, clear_row = limits[i // BLOCK], clear[i // BLOCK]
+        for j in range(result.shape[1]):
+            jumps, stands_out = _exceeds(a[j], b[j], c[j], d[j], row[j])
+            both = one[j] | other[j]
+            jumps = (jumps & (both > 0)) | (stands_out & (abs(c[j] - b[j]) > clear_row[j]))
+            result[i, j] = jumps | ((both == 3) & (b[j] > 0) & (c[j] > 0))
+
+
+@njit(cache=True, inline='always')
+def _shifted(values: NDArray[np.float32], i: int, offset: int, down: bool) -> NDArray[np.float32]:
+    """Row i of framed values, or what lies `offset` further down or to the right."""
+    if down:
+        return values[_FRAME + i + offset, _FRAME:]
+    return values[_FRAME + i, _FRAME + offset :]
+
+
+@njit(cache=True, inline='always')
+def _exceeds(a: float, b: float, c: float, d: float, limit: float) -> tuple[Any, Any]:
+    """Whether the step from b to c exceeds those from a to b and from c to d, in one direction.
+
+    And whether it differs from both in any direction. Of a and d, one that was not measured (0) is
+    left out; there is no step without b and c.
+    """
+    # Without branches, so that the compiler takes many at a time.
+    here = c - b
+    before, after = here - (b - a), here - (d - c)
+    first, last, known = a == 0, d == 0, (b > 0) & (c > 0)
+    higher, lower = before > limit, before < -limit
+    rises, falls = after > limit, after < -limit
+    above, below = (first | higher) & (last | rises), (first | lower) & (last | falls)
+    apart = (first | higher | lower) & (last | rises | falls)
+    return known & (above | below) & ~(first & last), known & apart
 
 
 def sobel(image: RangeImage) -> GridEdges:

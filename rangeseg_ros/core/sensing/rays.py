@@ -62,19 +62,13 @@ def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.b
 def _basis(
     rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
 ) -> NDArray[np.float64]:
-    """(N, M) Chebyshev polynomials of both coordinates, up to the degree together."""
-    vander = np.polynomial.chebyshev.chebvander
-    v, u = (
-        vander(2 * x / max(size - 1, 1) - 1, _DEGREE)
-        for x, size in zip((rows, columns), shape, strict=True)
-    )
-    terms = [v[:, i] * u[:, k] for i in range(_DEGREE + 1) for k in range(_DEGREE + 1 - i)]
-    return np.stack(terms, axis=1)
+    """(N, M) Chebyshev polynomials of both coordinates."""
+    v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
+    basis: NDArray[np.float64] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis
 
 
 def _between(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels with valid ones on either side in their row."""
-    left = np.logical_or.accumulate(valid, axis=1)
-    right = np.logical_or.accumulate(valid[:, ::-1], axis=1)[:, ::-1]
-    result: NDArray[np.bool_] = left & right
-    return result
+    after = np.logical_or.accumulate(valid[:, ::-1], axis=1)[:, ::-1]
+    return np.logical_or.accumulate(valid, axis=1) & after
