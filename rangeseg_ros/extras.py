@@ -15,7 +15,6 @@ EXTRAS = {
     'trimesh': 'notebook',
     'open3d': 'open3d',
     'OpenEXR': 'exr',
-    'rerun': 'view',
     'rclpy': 'jazzy',
 }
 """Package that is imported -> extra of setup.py."""

@@ -32,8 +32,9 @@ def segcomp_set(folder):
     calibration = abw_calibration(1)
     rays = calibration.camera.rays.astype(float)
     depth, truth = corner(rays)
-    values = np.rint(calibration.values(depth * 0.5)).clip(1, 255).astype(np.uint8)
+    values = (500 * depth - calibration.offset) * calibration.scale
+    values = np.rint(values).clip(1, 255).astype(np.uint8)
     segcomp.write_raster(folder / 'abw.test.1.range', values)
     segcomp.write_segmentation(folder / 'abw.test.1.gt-seg', segcomp.to_segcomp(truth))
-    segcomp.write_angles(folder / 'abw.test.1.gt-ang', [segcomp.RegionAngle(10, 11, 90.0)])
+    (folder / 'abw.test.1.gt-ang').write_text('1\n10 11 90.0\n')
     return folder

@@ -22,10 +22,8 @@ from rangeseg_ros.tasks import run_all
 @options.params
 @options.method
 @tolerance
-@click.option(
-    '--min-pixels',
-    type=click.IntRange(min=1),
-    help='Regions of the truth of depth images that are smaller do not count.  [default: 1000]',
+@options.count(
+    '--min-pixels', help='Smaller regions of true depth images do not count.  [default: 1000]'
 )
 @click.option(
     '--split', type=click.Choice(['train', 'test']), help='Only this part of a segcomp set.'
@@ -36,12 +34,11 @@ from rangeseg_ros.tasks import run_all
     help='Terrains: do not give the height of the sensor to the segmenter.',
 )
 @options.jobs
-@click.option(
-    '--output',
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for report.html, each image's labels and a picture of truth and segmentation at "
+@options.output_folder(
+    "Folder for report.html, each image's labels and a picture of truth and segmentation at "
     'tolerance 0.8: correct white, over-segmented green, under-segmented blue, missed orange, '
     'noise red.',
+    required=False,
 )
 @options.overwrite
 @options.json_file

@@ -14,37 +14,28 @@ from rangeseg_ros.evaluation.datasets import Case, find_cases
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.params import read_params
 
-NAMES = ('directions', 'lambda', 'postprocessing', 'weights', 'comparison', 'timing')
-PLOTS = {'lambda': plots.plot_lambdas, 'timing': plots.plot_timing}
+NAMES = ('directions', 'lambda', 'postprocessing', 'weights', 'comparison')
 
 
 @click.command()
 @click.argument('name', metavar='EXPERIMENT', type=click.Choice(NAMES))
 @click.argument('folder', metavar='DIR', type=options.FOLDER)
-@options.folder_output()
+@options.output_folder()
 @options.params
-@click.option('--images', type=click.IntRange(min=1), help='Only so many images of each split.')
+@options.count('--images', help='Only so many images of each split.')
 @click.option('--real', is_flag=True, help='DIR is a real set: say so in the results.')
 @click.option(
     '--limit',
     type=click.IntRange(min=17),
     default=1249,
     show_default=True,
-    help='directions, timing: leave out sets with more directions.',
+    help='directions: leave out sets with more directions.',
 )
-@click.option(
-    '--step',
-    type=click.IntRange(min=1),
-    default=10,
-    show_default=True,
-    help='Lambda runs from 20 to 150 in such steps; the thesis has 5.',
-)
-@click.option(
+@options.count('--step', default=10, help='Of lambda from 20 to 150; the thesis has 5.')
+@options.output_file(
     '--train',
-    'train_file',
-    type=click.Path(dir_okay=False, path_type=Path),
-    help='lambda: write the parameters, with the lambda that is best with identified noise '
-    'regions, to this YAML file.',
+    'lambda: write the parameters, with the lambda that is best with identified noise regions, to '
+    'this YAML file.',
 )
 @options.jobs
 def command(
@@ -56,7 +47,7 @@ def command(
     real: bool,
     limit: int,
     step: int,
-    train_file: Path | None,
+    train: Path | None,
     jobs: int | None,
 ) -> None:
     """Repeat an experiment of the thesis on a set of images with ground truth.
@@ -68,24 +59,19 @@ def command(
     weights         neighbourhood weights of section 5.5 (figure 5.5)
     comparison      ours on the test images, beside published results of a
                     Perceptron or ABW set (figure 6.5, table B.1)
-    timing          time against the number of labels at full resolution
-                    (table 6.1): takes long; with --jobs 1, on an idle machine
 
     DIR is a folder that `rangeseg evaluate` knows, such as a segcomp set. Writes a plot (PNG) and
-    a table (CSV), and keeps what it has measured in OUTPUT/cache: interrupted, it resumes there.
-    Parameters that the experiment does not vary come from --params; without it, they are those of
-    the thesis. `comparison` adds rows with the parameters of --params.
+    a table (CSV). Parameters that the experiment does not vary come from --params; without it,
+    they are those of the thesis. `comparison` adds rows with the parameters of --params.
     """
-    if train_file and name != 'lambda':
+    if train and name != 'lambda':
         raise click.UsageError('--train is for the experiment lambda')
     given = read_params(params_file) if params_file else None
     params = None if given is None else Config.from_mapping({'method': 'normals', **given})
     base = params or published.THESIS
     lambdas = [float(value) for value in range(20, 151, step)]
     source = f'{"real" if real else "simulated"} set {folder.resolve().name}'
-    bench = experiments.Bench(
-        output / 'cache', jobs, lambda items, total: options.progress(items, total, 'image')
-    )
+    bench = experiments.Bench(jobs, lambda items, total: options.progress(items, total, 'image'))
     cases = find_cases(folder)
     training, test = _split(cases, 'train', images), _split(cases, 'test', images)
     needed = {'comparison': test, 'weights': training or test}.get(name, training)
@@ -100,8 +86,6 @@ def command(
             {'series': row['series'], 'source': source, **row}
             for row in experiments.comparison(bench, separate, test, variants, lambdas)
         ] + published.published_rows(sensor)
-    elif name == 'timing':
-        rows = experiments.timing(bench, training, base, limit)
     elif name == 'directions':
         leaving = Config.from_mapping({**vars(base), 'noise_regions': 'leave'})
         sets = experiments.direction_sets(leaving, limit)
@@ -112,13 +96,14 @@ def command(
         table = experiments.by_lambda if name == 'lambda' else experiments.by_tolerance
         rows = table(found)
     plots.write_csv(output / f'{name}.csv', rows)
-    plot = PLOTS.get(name, plots.plot_tolerances)
-    plot(output / f'{name}.png', rows, f'{name}, measured on the {source}')
+    against = 'lambda' if name == 'lambda' else 'tolerance'
+    title = f'{name}, measured on the {source}'
+    plots.plot_correct(output / f'{name}.png', rows, title, against)
     click.echo(f'{output / name}.csv, .png')
-    if train_file:
+    if train:
         about = f'{source}, {images or "all"} training images'
         names_method = given is None or 'method' in given
-        _write_params(train_file, base, names_method, about, rows)
+        _write_params(train, base, names_method, about, rows)
 
 
 def _split(cases: list[Case], name: str, images: int | None) -> list[Case]:

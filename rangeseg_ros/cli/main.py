@@ -31,7 +31,6 @@ COMMANDS = {
     'bench': 'Measure the time and memory of each stage.',
     'compile': 'Compile ahead of the first frame.',
     'play': 'Publish the messages of a recording in ROS 2.',
-    'view': 'Show planes in 3D.',
 }
 
 

@@ -20,7 +20,7 @@ from rangeseg_ros.tasks import Failure
 
 @click.command()
 @recordings.argument
-@options.folder_output()
+@options.output_folder()
 @options.topics
 @options.raw
 @options.overwrite

@@ -22,22 +22,10 @@ _ROWS = {
 
 
 @click.command()
-@click.option('--rooms', type=click.IntRange(min=1), default=3, show_default=True)
-@click.option(
-    '--frames',
-    type=click.IntRange(min=1),
-    default=100,
-    show_default=True,
-    help='Of each room, at 30 Hz.',
-)
-@click.option('--seed', type=click.IntRange(min=0), default=0, show_default=True)
-@click.option(
-    '--speed',
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help='Times the speed of a camera in the hand, which is up to 0.3 m/s and 15 degrees/s.',
-)
+@options.count('--rooms', default=3)
+@options.count('--frames', default=100, help='Of each room, at 30 Hz.')
+@options.number('--seed', default=0)
+@options.count('--speed', default=1, help='Times that of a hand: up to 0.3 m/s and 15 degrees/s.')
 @options.params
 @options.json_file
 def command(

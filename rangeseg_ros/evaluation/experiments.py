@@ -9,20 +9,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.datasets import Case
 from rangeseg_ros.evaluation.figures import COUNTS, TOLERANCES
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.measure import Measurement, Task
-from rangeseg_ros.evaluation.published import AS_PUBLISHED, SECONDS, THESIS
+from rangeseg_ros.evaluation.published import AS_PUBLISHED, THESIS
 from rangeseg_ros.tasks import run_all
 
 K = TypeVar('K')
@@ -55,15 +51,12 @@ class Bench:
 
     Attributes
     ----------
-    cache : Path
-        Folder of finished measurements, from which an interrupted experiment resumes.
     jobs : int or None
         Processes; None for one on each core.
     progress : callable
         Wraps an iterable, given also the number of its items, to show progress.
     """
 
-    cache: Path
     jobs: int | None
     progress: Callable[[Iterable[Measurement], int], Iterable[Measurement]]
 
@@ -71,7 +64,7 @@ class Bench:
         self, configs: Mapping[K, Config], cases: Sequence[Case]
     ) -> dict[K, list[Measurement]]:
         """Measurements of every case with every config, by the config's key."""
-        tasks = [Task(case, config, self.cache) for config in configs.values() for case in cases]
+        tasks = [Task(case, config) for config in configs.values() for case in cases]
         done = iter(self.progress(run_all(tasks, self.jobs), len(tasks)))
         return {key: [next(done) for _ in cases] for key in configs}
 
@@ -192,51 +185,3 @@ def compared(sensor: str, params: Config | None = None) -> dict[str, Config]:
         rows['normals as published, dithered'] = AS_PUBLISHED['abw']
         rows['normals, our defaults, dithered'] = replace(ours, dithering=0.001)
     return rows
-
-
-def timing(
-    bench: Bench, cases: Sequence[Case], base: Config, limit: int, swap_limit: int = 73
-) -> list[Row]:
-    """Table 6.1: seconds for the labelling, with every label at full resolution.
-
-    Beside the direction sets up to `limit` by alpha-expansion, those up to `swap_limit` by
-    alpha-beta-swap, and all of them coarse to fine.
-    """
-    configs = {}
-    for name, config in direction_sets(base, limit).items():
-        configs[name, 'expansion'] = replace(config, exact=True)
-        if config.direction_count <= swap_limit:
-            configs[name, 'swap'] = replace(config, exact=True, moves='swap')
-        configs[name, 'coarse to fine'] = config
-    for config in configs.values():
-        _compile(config)
-    results = bench.run(configs, cases)
-    rows = []
-    for (name, moves), measurements in results.items():
-        seconds = np.array([item.timings['labels'] for item in measurements]) / 1000
-        reference = results[name, 'expansion']
-        energies = [m.energy / r.energy for m, r in zip(measurements, reference, strict=True)]
-        rows.append(
-            {
-                'series': name,
-                'labels': configs[name, moves].direction_count,
-                'moves': moves,
-                'mean_s': float(seconds.mean()),
-                'std_s': float(seconds.std()),
-                'min_s': float(seconds.min()),
-                'max_s': float(seconds.max()),
-                'energy_ratio': float(np.mean(energies)),
-                'correct': averages(measurements, 0.8)['correct'],
-                'thesis_mean_s': SECONDS[name][0] if moves == 'expansion' else '',
-            }
-        )
-    return rows
-
-
-def _compile(config: Config) -> None:
-    """Have all that `config` runs compiled, or loaded, so that no measurement contains it."""
-    camera = Camera(48, 48, 48.0, 48.0, 23.5, 23.5)
-    wall = np.full(camera.shape, 1000, np.uint16)
-    # Files of the sensor are for images of another size.
-    config = replace(config, cycles=1, distortion_map='', mask='')
-    Segmenter(config).segment(RangeImage.from_depth(wall, camera))

@@ -1,4 +1,4 @@
-"""What the thesis and others have published: parameters, regions found, seconds."""
+"""What the thesis and others have published: parameters, regions found."""
 
 from __future__ import annotations
 
@@ -59,17 +59,6 @@ CORRECT_ABW = {
     'WSU': 9.7,
 }
 """Regions correct at T = 0.8, of 15.2, on the 30 real ABW test images."""
-
-SECONDS = {
-    '17 platonic': (12, 6, 7, 44),
-    '73 platonic': (42, 7, 33, 63),
-    '305 platonic': (129, 30, 100, 204),
-    '1249 platonic': (476, 112, 384, 809),
-    '25 regular': (14, 3, 10, 24),
-    '225 regular': (114, 33, 76, 179),
-    '1225 regular': (657, 198, 414, 1309),
-}
-"""Table 6.1: mean, variance (more likely the standard deviation), minimum, maximum."""
 
 
 def published_rows(sensor: str) -> list[dict[str, Any]]:

@@ -7,13 +7,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.figures import COUNTS
 from rangeseg_ros.evaluation.measure import Measurement
-from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import Picture, common, spread, stage_table, write_page
+from rangeseg_ros.report.page import Picture, common, spread, write_page
 
 _KINDS = COUNTS[1:]
 
@@ -62,18 +59,6 @@ def write_evaluation(
                 )
                 for image, row in images.items()
             ]
-        ),
-        curves=charts.lines(
-            {
-                kind: [row[kind] / figures['images'] for row in tolerances.values()]
-                for kind in _KINDS
-            },
-            [float(tolerance) for tolerance in tolerances],
-            ('tolerance', 'regions per image'),
-        ),
-        cut=charts.CUT,
-        stage_times=charts.stage_times(
-            stage_table(timings), np.arange(len(found), dtype=float), 'image'
         ),
         **common(config, timings, Counter(item.reason for item in found if item.reason)),
     )

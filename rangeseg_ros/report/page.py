@@ -52,17 +52,13 @@ def spread(pictures: Sequence[Picture]) -> list[Picture]:
     return [pictures[index] for index in chosen]
 
 
-def stage_table(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds (N,) of each stage in N frames, 0 where a frame has not come to the stage."""
-    names = dict.fromkeys(name for laps in timings for name in laps)
-    return {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
-
-
 def common(
     config: Config, timings: Sequence[Mapping[str, float]], reasons: Mapping[str, int]
 ) -> dict[str, Any]:
     """What every page shows: stages with their statistics, reasons, parameters."""
-    stages = stage_table(timings)
+    names = dict.fromkeys(name for laps in timings for name in laps)
+    # 0 where a frame has not come to the stage.
+    stages = {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
     total = {'total': np.sum(list(stages.values()), axis=0)} if stages else {}
     return {
         'stages': [

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -178,27 +178,6 @@ def read_perceptron(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
     return (values & _RANGE_MASK).astype(np.uint16)
 
 
-def write_perceptron(path: str | os.PathLike[str], values: ArrayLike) -> None:
-    """Write 12-bit range values as a Perceptron image (512 x 512, integer, 0..4095).
-
-    Raises
-    ------
-    SegcompError
-        Another size or type, or values beyond 12 bits.
-    """
-    array = np.asarray(values)
-    if array.shape != (SIZE, SIZE) or array.dtype.kind not in 'iu':
-        raise SegcompError(
-            f'{path}: a Perceptron image is {SIZE}x{SIZE} integers, '
-            f'not {array.shape} {array.dtype}'
-        )
-    if array.min() < 0 or array.max() > _RANGE_MASK:
-        raise SegcompError(f'{path}: Perceptron range values must be in 0..{_RANGE_MASK}')
-    lines = (' '.join(['perceptron', *'x' * (words - 1)]) for words in _PERCEPTRON_WORDS)
-    header = ''.join(f'{line}\n' for line in lines).encode() + b'\x00\x00'
-    _write(path, header + array.astype('>i4').tobytes())
-
-
 class RegionAngle(NamedTuple):
     """Angle between the normals of two adjacent regions of a ground truth, degrees."""
 
@@ -216,12 +195,6 @@ def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
         A wrong count or a malformed line.
     """
     return [RegionAngle(int(a), int(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
-
-
-def write_angles(path: str | os.PathLike[str], angles: Sequence[RegionAngle]) -> None:
-    """Write a `.gt-ang` file."""
-    lines = [str(len(angles)), *(f'{a} {b} {degrees:.6f}' for a, b, degrees in angles)]
-    _write(path, ('\n'.join(lines) + '\n').encode())
 
 
 def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
