@@ -50,6 +50,7 @@ def plane(label, hull=SQUARE, holes=()):
         count=1000 * label,
         rms=0.003,
         confidence=0.9,
+        probability=0.75,
         area=4.0,
         extents=np.array([2.0, 1.5]),
         centre=np.array([0.0, 0.25, 2.0]),
@@ -102,6 +103,7 @@ def test_planes_read_back_as_they_were():
     assert [ROLES[number] for number in planes['role']] == ['floor', 'wall']
     np.testing.assert_array_equal(planes['confidence'], np.float32([0.9, 0.9]))
     for column, value in {
+        'probability': 0.75,
         'length': 2,
         'width': 1.5,
         'centre_y': 0.25,

@@ -151,25 +151,3 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     assert all((tmp_path / 'out' / unquote(link)).exists() for link in page.sources)
     whole, torn = (line for line in page.text.splitlines() if line.startswith(tuple(names)))
     assert whole == 'walls160.5220' and torn.startswith('torn #2') and 'damaged after' in torn
-
-
-def test_report_of_evaluate(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert not end.value.code
-
-    small = ('--width', '160', '--height', '120', '--noise', 'none')
-    run('simulate', 'kinect', '--scenes', '2', *small, '--output', 'set')
-    run('evaluate', 'set', '--jobs', '1', '--output', 'out', '--tolerance', '0.7', '0.8')
-    page = Page(tmp_path / 'out/report.html')
-    assert '2 images, method planes' in page.text
-    assert [title.split(':')[0] for title in page.titles if ' correct' in title] == [
-        '000000',
-        '000001',
-    ]
-    assert all(source.startswith('data:image/') for source in page.sources)
-    assert 'Images at tolerance 0.8' in page.text

@@ -12,8 +12,6 @@ from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
-from rangeseg_ros.report.evaluation import write_evaluation
-from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.tasks import run_all
 
 
@@ -35,9 +33,8 @@ from rangeseg_ros.tasks import run_all
 )
 @options.jobs
 @options.output_folder(
-    "Folder for report.html, each image's labels and a picture of truth and segmentation at "
-    'tolerance 0.8: correct white, over-segmented green, under-segmented blue, missed orange, '
-    'noise red.',
+    "Folder for each image's labels and a picture of truth and segmentation at tolerance 0.8: "
+    'correct white, over-segmented green, under-segmented blue, missed orange, noise red.',
     required=False,
 )
 @options.overwrite
@@ -86,15 +83,11 @@ def command(
         raise click.ClickException(f'{folder}: no {split} images')
     tasks = [Task(case, config, output=output) for case in cases]
     if output:
-        page = output / 'report.html'
-        ours = page.is_file() and page_kind(page) == 'evaluation'
-        outputs = [page, *(path for task in tasks for path in task.pictures(output).values())]
+        outputs = [path for task in tasks for path in task.pictures(output).values()]
         inputs = [path for case in cases for path in (case.image, case.truth)]
-        options.check_new(outputs, inputs, overwrite or ours)
+        options.check_new(outputs, inputs, overwrite)
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
     figures = evaluation_figures(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')
     click.echo(table(figures))
-    if output:
-        write_evaluation(output, folder.resolve().name, config, found, figures)
     options.write_json(json_file, figures)

@@ -27,7 +27,6 @@ COMMANDS = {
     'evaluate': 'Segment images and compare the results with their truth.',
     'compare': 'Compare label images with ground truth.',
     'tracks': 'Measure how well planes keep their ids.',
-    'experiment': 'Repeat the experiments of the thesis.',
     'bench': 'Measure the time and memory of each stage.',
     'compile': 'Compile ahead of the first frame.',
     'play': 'Publish the messages of a recording in ROS 2.',

@@ -40,8 +40,6 @@ class Measurement:
         Of the labelling.
     timings : dict
         Milliseconds per stage.
-    reason : str
-        Why there is no plane; empty when there is one.
     """
 
     name: str
@@ -51,7 +49,6 @@ class Measurement:
     found_planes: dict[int, list[float]]
     energy: float
     timings: dict[str, float]
-    reason: str = ''
 
 
 @dataclass(frozen=True)
@@ -88,7 +85,6 @@ class Task:
             {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
             float(result.energy),
             result.timings,
-            result.reason,
         )
 
     def pictures(self, folder: Path) -> dict[str, Path]:

@@ -86,11 +86,12 @@ def planes_from_message(cloud: Any) -> NDArray[np.void]:
         `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance` (metres:
         normal . p + distance = 0), `label`, `id`, `surface` (the same for parts of one plane seen
         apart), `role` (index in `roles.ROLES`, 1 is floor), `count` (pixels), `rms` (metres),
-        `confidence` (0...1), `probability` (0...1, to be a plane and no curved surface), `area` (square metres), `length`, `width`, `centre_x`, `centre_y`,
-        `centre_z` (of the rectangle around the region, metres), `orientation_x`, `orientation_y`,
-        `orientation_z`, `orientation_w` (quaternion of the frame with x along the length and z
-        along the normal), `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of
-        the 4x4 covariance of normal x, y, z and distance d).
+        `confidence` (0...1), `probability` (0...1, to be a plane and no curved surface), `area`
+        (square metres), `length`, `width`, `centre_x`, `centre_y`, `centre_z` (of the rectangle
+        around the region, metres), `orientation_x`, `orientation_y`, `orientation_z`,
+        `orientation_w` (quaternion of the frame with x along the length and z along the normal),
+        `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of the 4x4 covariance
+        of normal x, y, z and distance d).
 
     Raises
     ------
