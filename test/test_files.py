@@ -256,14 +256,6 @@ def test_plane_table(tmp_path):
     assert not any('[' in value for row in rows for value in row.values())
 
 
-@pytest.mark.parametrize('shape, kind', [((4, 5, 3), np.uint8), ((4, 5), np.float32)])
-def test_labels_of_another_kind_are_refused(tmp_path, shape, kind):
-    path = tmp_path / 'labels.tiff'
-    write_image(path, np.ones(shape, kind))
-    with pytest.raises(ImageFileError, match='one channel of 8 or 16 bits'):
-        read_labels(path)
-
-
 @pytest.mark.parametrize('order', ['<', '>'])
 def test_the_size_of_a_tiff_is_told_by_its_front(order):
     entries = [(256, 3, 1, 5), (257, 3, 1, 4)]
