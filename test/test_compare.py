@@ -5,9 +5,9 @@ import json
 import cv2
 import numpy as np
 import pytest
+from segcomp_files import raster
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.segcomp import files as segcomp
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def write(path, labels):
     if path.suffix == '.png':
         assert cv2.imwrite(str(path), image)
     else:
-        segcomp.write_segmentation(path, image.astype(np.uint8))
+        path.write_bytes(raster(image.astype(np.uint8)))
     return path
 
 

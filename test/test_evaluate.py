@@ -21,7 +21,6 @@ from rangeseg_ros.evaluation.pictures import (
     class_picture,
 )
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.segcomp import files as segcomp
 from rangeseg_ros.segcomp.geometry import abw_calibration
 
 
@@ -130,23 +129,6 @@ def test_segcomp_set(tmp_path, evaluate):
     row = figures['tolerances']['0.8']
     assert (row['regions'], row['correct']) == (2, 2)
     assert row['angle_mean'] < 1.0 and row['angle_std'] == 0.0
-
-
-def test_segcomp_output_is_what_the_reference_tool_takes(tmp_path, evaluate, monkeypatch):
-    folder, output = segcomp_set(tmp_path / 'abw'), tmp_path / 'out'
-    figures = evaluate(folder, '--output', output)[1]
-    image = segcomp.read_segmentation(output / 'abw.test.1.ms-seg')
-    assert set(np.unique(image)) <= {0, 10, 11}
-    normals = segcomp.read_normals(output / 'abw.test.1.ms-nor')
-    for label, plane in zip((image[256, 5], image[256, -5]), (LEFT, RIGHT), strict=True):
-        assert normals[label] == pytest.approx(plane[:3], abs=0.01)
-    words = ['compare', folder, output, '--json', tmp_path / 'again.json']
-    monkeypatch.setattr('sys.argv', ['rangeseg', *map(str, words)])
-    with pytest.raises(SystemExit):
-        main()
-    again = json.loads((tmp_path / 'again.json').read_text())
-    for tolerance, row in again['tolerances'].items():
-        assert figures['tolerances'][tolerance] == pytest.approx(row, abs=1e-6)
 
 
 def test_calibration_follows_split_and_number(tmp_path):

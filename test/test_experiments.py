@@ -41,7 +41,7 @@ def measurement(found):
     truth = np.ones((1, 10), np.uint16)
     labels = truth.copy()
     labels[0, found:] = 0
-    return Measurement('x', Overlap.between(truth, labels), [], {}, {}, 0.0, {})
+    return Measurement('x', Overlap.between(truth, labels), [], {}, {}, {})
 
 
 def test_lambda_with_most_correct_regions_wins_the_lowest_of_equals(experiments):

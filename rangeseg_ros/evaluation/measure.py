@@ -6,20 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
+from rangeseg_ros.evaluation.datasets import Case
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.segcomp.files import (
-    MAX_REGIONS,
-    to_segcomp,
-    write_normals,
-    write_segmentation,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +29,6 @@ class Measurement:
         (label, label, degrees) of the truth, where known.
     true_planes, found_planes : dict
         Plane (nx, ny, nz, d) of each label, where known.
-    energy : float
-        Of the labelling.
     timings : dict
         Milliseconds per stage.
     """
@@ -47,7 +38,6 @@ class Measurement:
     angles: list[tuple[int, int, float]]
     true_planes: dict[int, list[float]]
     found_planes: dict[int, list[float]]
-    energy: float
     timings: dict[str, float]
 
 
@@ -62,8 +52,7 @@ class Task:
     config : Config
         Parameters of the segmenter.
     output : Path or None
-        Folder for <name>_labels.png, <name>_classes.png, and of images of segcomp sets
-        <name>.ms-seg and <name>.ms-nor, unless there are too many regions for these.
+        Folder for <name>_labels.png and <name>_classes.png.
     """
 
     case: Case
@@ -76,14 +65,16 @@ class Task:
         result = Segmenter(self.config).segment(corrected(sample.image, self.config))
         overlap = sample.truth.compare(result.labels)
         if self.output:
-            self._save(self.output, sample, result, overlap)
+            paths = self.pictures(self.output)
+            picture = class_picture(sample, result.labels, overlap, classify(overlap, 0.8))
+            write_image(paths['labels'], result.labels)
+            write_image(paths['classes'], picture)
         return Measurement(
             self.case.name,
             overlap,
             [(a, b, degrees) for a, b, degrees in sample.angles],
             {label: [float(x) for x in plane] for label, plane in sample.planes.items()},
             {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
-            float(result.energy),
             result.timings,
         )
 
@@ -91,15 +82,3 @@ class Task:
         """Where pictures of the image are left."""
         kinds = 'labels', 'classes'
         return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}
-
-    def _save(self, folder: Path, sample: Sample, result: Segmentation, overlap: Overlap) -> None:
-        name, labels = self.case.name, result.labels
-        picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
-        paths = self.pictures(folder)
-        write_image(paths['labels'], labels)
-        write_image(paths['classes'], picture)
-        if isinstance(self.case, SegcompCase) and len(result.planes) <= MAX_REGIONS:
-            image = to_segcomp(labels, ~sample.image.valid)
-            normals = {int(image[labels == p.label][0]): p.normal for p in result.planes}
-            write_segmentation(folder / f'{name}.ms-seg', image)
-            write_normals(folder / f'{name}.ms-nor', normals)
