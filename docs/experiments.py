@@ -83,7 +83,7 @@ def main():
     given = parser.parse_args()
     cases = find_cases(given.folder)
     training, test = (
-        [case for case in cases if getattr(case, 'split', name) == name][: given.images]
+        [case for case in cases if case.split in (name, '')][: given.images]
         for name in ('train', 'test')
     )
     base = read_config(given.params, method='normals')
@@ -108,8 +108,7 @@ def main():
 def rows_of(name, base, training, test, run):
     """Table of an experiment, one row for each series and tolerance or lambda."""
     if name == 'comparison':
-        sensor = getattr(test[0], 'sensor', '')
-        return comparison(base, training, test, run) + published(sensor)
+        return comparison(base, training, test, run) + published(test[0].sensor)
     if name == 'directions':
         sets = variations(replace(base, noise_regions='leave'), DIRECTIONS)
         return by_tolerance(train(run, sets, HIGH_LAMBDAS, training or test))

@@ -10,7 +10,7 @@ from corner_set import CAMERA, LEFT, RIGHT, corner, depth_and_truth, segcomp_set
 from pcd_files import literal_lzf
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.evaluation.datasets import ScanCase, SegcompCase, find_cases
+from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.pictures import (
     CORRECT,
@@ -134,9 +134,9 @@ def test_segcomp_set(tmp_path, evaluate):
 def test_calibration_follows_split_and_number(tmp_path):
     folder = segcomp_set(tmp_path / 'abw')
     sample = find_cases(folder)[0].load()
-    other = SegcompCase('x', folder / 'abw.test.1.range', folder / 'abw.test.1.gt-seg', number=0)
+    files = folder / 'abw.test.1.range', folder / 'abw.test.1.gt-seg'
     assert sample.image.camera == abw_calibration(1).camera
-    assert other.load().image.camera == abw_calibration(0).camera
+    assert read_segcomp(*files, 'abw', 'test', 0).image.camera == abw_calibration(0).camera
 
 
 def test_labelled_scan(tmp_path):
@@ -166,7 +166,6 @@ def test_labelled_scan(tmp_path):
     sizes = np.array([len(packed), len(raw)], '<u4')
     path.write_bytes(header.encode() + sizes.tobytes() + packed)
     (case,) = find_cases(tmp_path)
-    assert isinstance(case, ScanCase)
     sample = case.load()
     # Column 0 is on the left, x right, y down: the left wall is region 10.
     assert sample.image.points[0, 0, 0] < 0 and sample.image.points[0, 0, 1] < 0

@@ -74,11 +74,8 @@ def command(
         click.echo(terrain_table(figures))
         options.write_json(json_file, figures)
         return
-    cases = [
-        case
-        for case in find_cases(folder, min_pixels)
-        if split is None or getattr(case, 'split', split) == split
-    ]
+    known = find_cases(folder, min_pixels)
+    cases = [case for case in known if split is None or case.split in (split, '')]
     if not cases:
         raise click.ClickException(f'{folder}: no {split} images')
     tasks = [Task(case, config, output=output) for case in cases]
