@@ -190,13 +190,14 @@ def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
             lines[mutant.first - 1 : mutant.last] = [mutant.text]
             target.write_text(''.join(lines))
         command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
-        of_ros = mutant and 'rclpy' in mutant.path.read_text()
-        marks = 'not slow' if of_ros else 'not slow and not ros'
+        if mutant:
+            of_ros = 'rclpy' in mutant.path.read_text()
+            command += ['-m', 'not slow' if of_ros else 'not slow and not ros']
         environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
         environment.pop('NUMBA_CACHE_DIR', None)
         with tempfile.TemporaryFile('w+') as output:
             process = subprocess.Popen(
-                [*command, '-m', marks],
+                command,
                 cwd=folder,
                 env=environment,
                 stdout=output,
