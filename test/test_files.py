@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rosbags.typesys import Stores
 
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
-from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera, write_camera
 from rangeseg_ros.io.files import natural_order, replacing
@@ -95,7 +95,7 @@ def test_where_there_is_no_room_the_file_is_named(tmp_path):
             write_image(path, noise)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert in_words(caught.value) == f'{path}: File too large'
+    assert one_line(caught.value) == f'{path}: File too large'
     assert not list(tmp_path.iterdir())
 
 

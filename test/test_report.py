@@ -14,7 +14,7 @@ from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import MAX_PICTURES, Picture, spread
+from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
 from rangeseg_ros.report.replay import ReplayReport
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -96,11 +96,11 @@ def test_a_page_of_nothing(tmp_path):
 
 def test_long_sequences_are_shown_from_first_to_last(tmp_path):
     pictures = [Picture(tmp_path, str(n)) for n in range(1000)]
-    chosen = [int(picture.title) for picture in spread(pictures)]
+    chosen = [int(picture.title) for picture in evenly_spaced(pictures)]
     assert len(chosen) == MAX_PICTURES
     assert (chosen[0], chosen[-1]) == (0, 999)
     assert set(np.diff(chosen)) <= {21, 22}
-    assert spread(pictures[:3]) == pictures[:3]
+    assert evenly_spaced(pictures[:3]) == pictures[:3]
 
 
 def sightings(*rows):

@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 import click
 
 from rangeseg_ros import interrupts
-from rangeseg_ros.cli.errors import in_words
-from rangeseg_ros.extras import MissingExtraError, missing
+from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.extras import MissingExtraError, install_command
 
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
@@ -63,7 +63,7 @@ def rangeseg() -> None:
 
 
 def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
-    text = in_words(message) if isinstance(message, Warning) else message
+    text = one_line(message) if isinstance(message, Warning) else message
     print(f'rangeseg: warning: {text}', file=sys.stderr)
 
 
@@ -89,9 +89,9 @@ def main() -> None:
     except MissingExtraError as error:
         _fail(str(error))
     except ModuleNotFoundError as error:
-        _fail(missing(error) or f'{error}: is the installation complete?')
+        _fail(install_command(error) or f'{error}: is the installation complete?')
     except (ValueError, OSError, MemoryError, RecursionError) as error:
-        _fail(in_words(error))
+        _fail(one_line(error))
     except SystemExit as end:
         if end.code and end.code == interrupts.exit_code():
             interrupts.end()

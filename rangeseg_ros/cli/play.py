@@ -13,7 +13,7 @@ from rosbags.rosbag2 import Reader
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli import options
-from rangeseg_ros.extras import load
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.recordings import why_unreadable
 
 CLOCK = '/clock'
@@ -39,8 +39,8 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
     Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort. The
     first message comes after a second, for subscribers to find the topics.
     """
-    rclpy = load('rclpy')
-    no_handlers = load('rclpy.signals').SignalHandlerOptions.NO
+    rclpy = import_extra('rclpy')
+    no_handlers = import_extra('rclpy.signals').SignalHandlerOptions.NO
     try:
         reader = Reader(bag)
         reader.open()
@@ -67,7 +67,7 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
             if not loop:
                 break
         for publisher in publishers.values():
-            publisher.wait_for_all_acked(load('rclpy.duration').Duration(seconds=2))
+            publisher.wait_for_all_acked(import_extra('rclpy.duration').Duration(seconds=2))
     finally:
         reader.close()
         node.destroy_node()
@@ -108,7 +108,7 @@ def _offered(connection: Connection) -> Any:
 
 
 def _clock_publisher(node: Any) -> Any:
-    return node.create_publisher(load('rosgraph_msgs.msg').Clock, CLOCK, 1)
+    return node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
 
 
 def _timed(

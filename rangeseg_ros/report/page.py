@@ -45,14 +45,14 @@ def page_kind(path: Path) -> str:
     return found[1].decode() if found else ''
 
 
-def spread(pictures: Sequence[Picture]) -> list[Picture]:
+def evenly_spaced(pictures: Sequence[Picture]) -> list[Picture]:
     """At most `MAX_PICTURES`, evenly spaced, the first and the last among them."""
     count = min(len(pictures), MAX_PICTURES)
     chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
     return [pictures[index] for index in chosen]
 
 
-def common(
+def shared_values(
     config: Config, timings: Sequence[Mapping[str, float]], reasons: Mapping[str, int]
 ) -> dict[str, Any]:
     """What every page shows: stages with their statistics, reasons, parameters."""

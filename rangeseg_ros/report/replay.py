@@ -14,7 +14,7 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.drawing import normals_picture
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import Picture, as_jpeg, common, spread, write_page
+from rangeseg_ros.report.page import Picture, as_jpeg, evenly_spaced, shared_values, write_page
 
 # Frames whose normals are shown: up to twice as many, evenly spaced.
 _NORMALS = 6
@@ -103,12 +103,12 @@ class ReplayReport:
             if self._sensors
             else '',
             **self.figures(),
-            pictures=spread(self._pictures),
+            pictures=evenly_spaced(self._pictures),
             normals=self._normals,
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
             drifts=charts.drifts(sightings, times) if len(sightings) else '',
-            **common(self.config, self._timings, self.reasons),
+            **shared_values(self.config, self._timings, self.reasons),
         )
 
 
