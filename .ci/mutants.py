@@ -31,8 +31,6 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'rangeseg_ros'
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
-# What a test kills in less time than this lets nobody wait for it.
-_TIMEOUT = 600
 _SWAPS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -179,8 +177,8 @@ class Selection:
         return chosen or sorted((ROOT / 'test').glob('test_node_[fs]*.py'))
 
 
-def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
-    """What tests say of a copy of the package, perhaps changed, and which failed first."""
+def run(tests: list[str], limit: float, mutant: Mutant | None = None) -> tuple[str, str]:
+    """What tests say within `limit` seconds of a copy, perhaps changed, and which failed first."""
     with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
         left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
         shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
@@ -205,7 +203,7 @@ def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
                 start_new_session=True,
             )
             try:
-                code = process.wait(_TIMEOUT)
+                code = process.wait(limit)
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, 9)
                 process.wait()
@@ -226,6 +224,7 @@ def main() -> int:
     parser.add_argument('--files', type=int, default=8, help='files of tests for each, at most')
     parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
     parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
+    parser.add_argument('--limit', type=float, default=600, help='seconds for one')
     parser.add_argument('--jobs', type=int, default=1, help='mutants at the same time')
     parser.add_argument('--minutes', type=float, default=math.inf, help='begin none after that')
     chosen = parser.parse_args()
@@ -245,14 +244,14 @@ def main() -> int:
     @cache
     def passes(test: str) -> bool:
         """Whether a test passes where nothing is changed."""
-        return run([test])[0] == 'survived'
+        return run([test], chosen.limit)[0] == 'survived'
 
     def judged(mutant: Mutant) -> str:
         if time.monotonic() > end:
             return 'no time'
         tests = selection.tests(mutant.path, mutant.function)
         names = [str(test.relative_to(ROOT)) for test in tests]
-        outcome, failed = run(names, mutant) if names else ('untested', '')
+        outcome, failed = run(names, chosen.limit, mutant) if names else ('untested', '')
         if outcome == 'killed' and failed and not passes(failed):
             outcome = 'unsound'
         print(f'{outcome:9}{mutant.name}  (line {mutant.first}) {failed}', flush=True)
