@@ -26,7 +26,6 @@ COMMANDS = {
     'calibrate': "Learn a sensor's distortion from the planes it sees.",
     'evaluate': 'Segment images and compare the results with their truth.',
     'compare': 'Compare label images with ground truth.',
-    'tracks': 'Measure how well planes keep their ids.',
     'bench': 'Measure the time and memory of each stage.',
     'compile': 'Compile ahead of the first frame.',
     'play': 'Publish the messages of a recording in ROS 2.',
