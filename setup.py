@@ -169,7 +169,6 @@ setup(
         'open3d': ['open3d>=0.18'],
         'exr': ['OpenEXR>=3.3'],
         'dask': ['distributed>=2023.1'],
-        'view': [*bags, 'rerun-sdk>=0.23'],
         'plan': [*bags, *report, 'ezdxf>=1.1', 'trimesh>=4.0'],
         'docs': ['mkdocs-material>=9.5', 'mkdocstrings[python]>=0.26'],
         'lint': ['import-linter>=2.1', 'mypy>=1.8', 'ruff>=0.4', 'types-PyYAML'],

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import ast
 import copy
+import math
 import os
 import random
 import re
@@ -19,16 +20,17 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'rangeseg_ros'
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
-# What a test kills in less time than this lets nobody wait for it.
-_TIMEOUT = 600
 _SWAPS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -175,8 +177,8 @@ class Selection:
         return chosen or sorted((ROOT / 'test').glob('test_node_[fs]*.py'))
 
 
-def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
-    """What tests say of a copy of the package, perhaps changed, and which failed first."""
+def run(tests: list[str], limit: float, mutant: Mutant | None = None) -> tuple[str, str]:
+    """What tests say within `limit` seconds of a copy, perhaps changed, and which failed first."""
     with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
         left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
         shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
@@ -186,13 +188,14 @@ def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
             lines[mutant.first - 1 : mutant.last] = [mutant.text]
             target.write_text(''.join(lines))
         command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
-        of_ros = mutant and 'rclpy' in mutant.path.read_text()
-        marks = 'not slow' if of_ros else 'not slow and not ros'
+        if mutant:
+            of_ros = 'rclpy' in mutant.path.read_text()
+            command += ['-m', 'not slow' if of_ros else 'not slow and not ros']
         environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
         environment.pop('NUMBA_CACHE_DIR', None)
         with tempfile.TemporaryFile('w+') as output:
             process = subprocess.Popen(
-                [*command, '-m', marks],
+                command,
                 cwd=folder,
                 env=environment,
                 stdout=output,
@@ -200,7 +203,7 @@ def run(tests: list[str], mutant: Mutant | None = None) -> tuple[str, str]:
                 start_new_session=True,
             )
             try:
-                code = process.wait(_TIMEOUT)
+                code = process.wait(limit)
             except subprocess.TimeoutExpired:
                 os.killpg(process.pid, 9)
                 process.wait()
@@ -221,6 +224,9 @@ def main() -> int:
     parser.add_argument('--files', type=int, default=8, help='files of tests for each, at most')
     parser.add_argument('--name', default='', help='of names (path: before -> after): a pattern')
     parser.add_argument('--least', type=float, default=0.85, help='share that is to die')
+    parser.add_argument('--limit', type=float, default=600, help='seconds for one')
+    parser.add_argument('--jobs', type=int, default=1, help='mutants at the same time')
+    parser.add_argument('--minutes', type=float, default=math.inf, help='begin none after that')
     chosen = parser.parse_args()
     known = {
         line.partition(' # ')[0] for line in EQUIVALENT.read_text().splitlines() if line[:1] != '#'
@@ -233,28 +239,41 @@ def main() -> int:
     ]
     drawn = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
     selection = Selection(chosen.files)
-    table: dict[str, Counter[str]] = defaultdict(Counter)
-    sound: dict[str, bool] = {}
-    for mutant in drawn:
-        tests = [
-            str(test.relative_to(ROOT)) for test in selection.tests(mutant.path, mutant.function)
-        ]
-        outcome, failed = run(tests, mutant) if tests else ('untested', '')
-        if outcome == 'killed' and failed:
-            if failed not in sound:
-                sound[failed] = run([failed])[0] == 'survived'
-            outcome = outcome if sound[failed] else 'unsound'
-        table[mutant.path.relative_to(PACKAGE).parts[0]][outcome] += 1
+    end = time.monotonic() + 60 * chosen.minutes
+
+    @cache
+    def passes(test: str) -> bool:
+        """Whether a test passes where nothing is changed."""
+        return run([test], chosen.limit)[0] == 'survived'
+
+    def judged(mutant: Mutant) -> str:
+        if time.monotonic() > end:
+            return 'no time'
+        tests = selection.tests(mutant.path, mutant.function)
+        names = [str(test.relative_to(ROOT)) for test in tests]
+        outcome, failed = run(names, chosen.limit, mutant) if names else ('untested', '')
+        if outcome == 'killed' and failed and not passes(failed):
+            outcome = 'unsound'
         print(f'{outcome:9}{mutant.name}  (line {mutant.first}) {failed}', flush=True)
+        return outcome
+
+    with ThreadPoolExecutor(chosen.jobs) as pool:
+        outcomes = list(pool.map(judged, drawn))
+    table: dict[str, Counter[str]] = defaultdict(Counter)
+    for mutant, outcome in zip(drawn, outcomes, strict=True):
+        if outcome != 'no time':
+            table[mutant.path.relative_to(PACKAGE).parts[0]][outcome] += 1
     total: Counter[str] = Counter()
-    outcomes = ('killed', 'crashed', 'timeout', 'survived', 'untested', 'unsound')
-    print(f'\n{"":20}' + ''.join(f'{outcome:>10}' for outcome in outcomes))
+    kinds = ('killed', 'crashed', 'timeout', 'survived', 'untested', 'unsound')
+    print(f'\n{"":20}' + ''.join(f'{kind:>10}' for kind in kinds))
     for part, counts in sorted(table.items()):
-        print(f'{part:20}' + ''.join(f'{counts[outcome]:10}' for outcome in outcomes))
+        print(f'{part:20}' + ''.join(f'{counts[kind]:10}' for kind in kinds))
         total += counts
-    share = sum(total[outcome] for outcome in ('killed', 'crashed', 'timeout')) / len(drawn)
-    print(f'{share:.0%} of {len(drawn)} mutants die (seed {chosen.seed}, of {len(every)})')
-    return share < chosen.least
+    dead, count = sum(total[kind] for kind in kinds[:3]), total.total()
+    print(
+        f'{dead} of {count} mutants die (seed {chosen.seed}, {len(drawn)} drawn of {len(every)})'
+    )
+    return dead < chosen.least * count
 
 
 if __name__ == '__main__':

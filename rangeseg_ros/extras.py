@@ -15,7 +15,6 @@ EXTRAS = {
     'trimesh': 'notebook',
     'open3d': 'open3d',
     'OpenEXR': 'exr',
-    'rerun': 'view',
     'rclpy': 'jazzy',
 }
 """Package that is imported -> extra of setup.py."""
@@ -25,7 +24,7 @@ class MissingExtraError(ImportError):
     """A library of an extra that is not installed."""
 
 
-def load(name: str) -> ModuleType:
+def import_extra(name: str) -> ModuleType:
     """Import a library of `EXTRAS`.
 
     Raises
@@ -36,10 +35,10 @@ def load(name: str) -> ModuleType:
     try:
         return import_module(name)
     except ModuleNotFoundError as error:
-        raise MissingExtraError(missing(error) or str(error)) from None
+        raise MissingExtraError(install_command(error) or str(error)) from None
 
 
-def missing(error: ModuleNotFoundError) -> str:
+def install_command(error: ModuleNotFoundError) -> str:
     """The command that installs what is missing; empty where no extra brings it."""
     package = (error.name or '').partition('.')[0]
     if package not in EXTRAS:

@@ -20,7 +20,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.drawing import colours, overlay
-from rangeseg_ros.extras import load
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.planes import columns, values
 
@@ -72,8 +72,8 @@ def picture(result: Segmentation) -> NDArray[np.uint8]:
 def plot(result: Segmentation, axes: Any = None) -> Any:
     """Show `picture` in `axes` of matplotlib, the current ones when not given; returns them."""
     if axes is None:
-        load('matplotlib')
-        axes = load('matplotlib.pyplot').gca()
+        import_extra('matplotlib')
+        axes = import_extra('matplotlib.pyplot').gca()
     axes.imshow(picture(result))
     axes.set_title(f'{len(result.planes)} planes')
     axes.set_axis_off()
@@ -108,12 +108,12 @@ def to_html(result: Segmentation) -> str:
 def to_pandas(result: Segmentation) -> Any:
     """pandas.DataFrame with a row for each plane and the columns of planes.csv."""
     rows = [values(plane) for plane in result.planes]
-    return load('pandas').DataFrame(rows, columns=columns())
+    return import_extra('pandas').DataFrame(rows, columns=columns())
 
 
 def to_trimesh(result: Segmentation) -> Any:
     """trimesh.Scene with a coloured mesh for each plane, in the frame of the image."""
-    trimesh = load('trimesh')
+    trimesh = import_extra('trimesh')
     scene = trimesh.Scene()
     for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
         mesh = trimesh.Trimesh(*plane.mesh(), face_colors=[*colour, 255], process=False)
@@ -123,7 +123,7 @@ def to_trimesh(result: Segmentation) -> Any:
 
 def to_open3d(result: Segmentation) -> list[Any]:
     """Coloured open3d.geometry.TriangleMesh of each plane, in the frame of the image."""
-    open3d = load('open3d')
+    open3d = import_extra('open3d')
     meshes = []
     for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
         vertices, triangles = plane.mesh()

@@ -7,6 +7,12 @@ import os
 import signal
 import sys
 
+for number, name in enumerate(('stdin', 'stdout', 'stderr')):
+    # Before a file that is written gets the number of a closed stream, and what is printed there.
+    if getattr(sys, name) is None:
+        stream = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
+        setattr(sys, name, open(stream, 'w' if number else 'r'))  # noqa: SIM115
+
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda number, stack: os._exit(130))
 

@@ -1,9 +1,9 @@
 """A corner of two walls as the sets that `rangeseg evaluate` reads; its regions are exact."""
 
 import numpy as np
+from segcomp_files import raster
 
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.segcomp import files as segcomp
 from rangeseg_ros.segcomp.geometry import abw_calibration
 
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
@@ -32,8 +32,9 @@ def segcomp_set(folder):
     calibration = abw_calibration(1)
     rays = calibration.camera.rays.astype(float)
     depth, truth = corner(rays)
-    values = np.rint(calibration.values(depth * 0.5)).clip(1, 255).astype(np.uint8)
-    segcomp.write_raster(folder / 'abw.test.1.range', values)
-    segcomp.write_segmentation(folder / 'abw.test.1.gt-seg', segcomp.to_segcomp(truth))
-    segcomp.write_angles(folder / 'abw.test.1.gt-ang', [segcomp.RegionAngle(10, 11, 90.0)])
+    values = (500 * depth - calibration.offset) * calibration.scale
+    values = np.rint(values).clip(1, 255).astype(np.uint8)
+    (folder / 'abw.test.1.range').write_bytes(raster(values))
+    (folder / 'abw.test.1.gt-seg').write_bytes(raster((truth + 9).astype(np.uint8)))
+    (folder / 'abw.test.1.gt-ang').write_text('1\n10 11 90.0\n')
     return folder

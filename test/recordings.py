@@ -106,11 +106,16 @@ class Recording:
         message = types[kind](transforms=[stamped])
         self.messages.append((stamp, '/tf_static' if static else '/tf', kind, message))
 
-    def write(self, path, storage='mcap'):
-        """Write all messages; the file that holds them."""
+    def write(self, path, storage='mcap', compression=None):
+        """Write all messages; the file that holds them.
+
+        Compressed by BZ2 or LZ4 (ROS 1), or with zstd by FILE, MESSAGE or STORAGE (ROS 2).
+        """
         if self.ros1:
             writer = rosbag1.Writer(path)
             serialize = self.store.serialize_ros1
+            if compression:
+                writer.set_compression(writer.CompressionFormat[compression])
         else:
             plugin = {
                 'mcap': rosbag2.StoragePlugin.MCAP,
@@ -118,6 +123,9 @@ class Recording:
             }[storage]
             writer = rosbag2.Writer(path, version=9, storage_plugin=plugin)
             serialize = self.store.serialize_cdr
+            if compression:
+                mode = rosbag2.CompressionMode[compression]
+                writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
         with writer:
             connections = {}
             for stamp, topic, kind, message in self.messages:
@@ -126,7 +134,7 @@ class Recording:
                 writer.write(connections[topic], stamp, serialize(message, kind))
         if self.ros1:
             return path
-        (file,) = [*path.glob('*.mcap'), *path.glob('*.db3')]
+        (file,) = (part for part in path.iterdir() if part.suffix != '.yaml')
         return file
 
 

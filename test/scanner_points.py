@@ -3,11 +3,6 @@
 import numpy as np
 
 
-def abw_points(values, calibration):
-    """Points (512, 512, 3) of ABW range values, metres in the optical frame; NaN in shadow."""
-    return calibration.camera.rays.astype(float) * calibration.depth(values)[..., None]
-
-
 def scanned(camera):
     """Rays (H, W, 3) at even angles, as of a scanner that turns."""
     azimuth = (np.arange(camera.width) - camera.cx) / camera.fx

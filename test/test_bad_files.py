@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, ConfigError
-from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import ImageFileError, read_depth, write_image
 from rangeseg_ros.io.params import read_config
@@ -203,9 +203,9 @@ def test_options_take_no_nan(tmp_path, monkeypatch, run):
 
 
 def test_errors_are_one_line_of_printable_characters():
-    assert in_words(ValueError('a\nb\x00\x1b[31m')) == 'a\\nb\\x00\\x1b[31m'
-    assert in_words(MemoryError()) == 'not enough memory'
-    assert in_words(FileNotFoundError(2, 'No such file', 'x')) == 'x: No such file'
+    assert one_line(ValueError('a\nb\x00\x1b[31m')) == 'a\\nb\\x00\\x1b[31m'
+    assert one_line(MemoryError()) == 'not enough memory'
+    assert one_line(FileNotFoundError(2, 'No such file', 'x')) == 'x: No such file'
 
 
 def test_links_in_a_circle_are_told(tmp_path, monkeypatch, run):

@@ -52,7 +52,7 @@ def test_impossible_loss_reports_count_nothing(count):
     losses = Losses()
     losses.arrived(None)
     losses.report(count)
-    assert (losses.nonsense, losses.lost.total) == (1, 0)
+    assert (losses.implausible, losses.lost.total) == (1, 0)
 
 
 def test_losses_that_a_camera_can_have_had_are_believed(clock):
@@ -60,7 +60,7 @@ def test_losses_that_a_camera_can_have_had_are_believed(clock):
     losses.arrived(None)
     clock.now += 1.0
     losses.report(30)
-    assert (losses.nonsense, losses.lost.total) == (0, 30)
+    assert (losses.implausible, losses.lost.total) == (0, 30)
 
 
 def test_gaps_in_the_numbers_tell_of_unseen_messages():

@@ -1,18 +1,15 @@
 """Replays on a Dask cluster."""
 
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 
 import pytest
 from replays import record_walls, replay, results
 
 from rangeseg_ros.cli.main import main
-from rangeseg_ros.tasks import attempt_on_cluster
 
 pytestmark = pytest.mark.slow
 
@@ -88,79 +85,3 @@ def test_without_distributed_replay_says_what_is_missing(tmp_path, monkeypatch, 
         'rangeseg: --scheduler needs distributed: install the extra dask\n'
     )
     assert not (tmp_path / 'out').exists()
-
-
-def test_a_recording_that_kills_every_worker_ends_the_command(tmp_path):
-    distributed = pytest.importorskip('distributed')
-    with (
-        distributed.LocalCluster(
-            n_workers=1,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=None,
-            local_directory=tmp_path,
-        ) as cluster,
-    ):
-        (result,) = attempt_on_cluster([Deadly()], cluster.scheduler_address)
-    assert isinstance(result.error, OSError) and 'Attempted to run task' in str(result.error)
-
-
-@pytest.fixture
-def cluster(tmp_path):
-    """Process of a scheduler that has a worker, and its address."""
-    pytest.importorskip('distributed')
-    told = tmp_path / 'scheduler.json'
-    python = [sys.executable, '-m']
-    # The scheduler reads what it hands out, in the versions of today.
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(filter(None, sys.path))}
-    scheduler = subprocess.Popen(
-        [
-            *(*python, 'distributed.cli.dask_scheduler', '--scheduler-file', told),
-            *('--host', '127.0.0.1', '--port', '0', '--no-dashboard'),
-        ],
-        stderr=subprocess.DEVNULL,
-        env=environment,
-    )
-    worker = subprocess.Popen(
-        [
-            *(*python, 'distributed.cli.dask_worker', '--scheduler-file', told),
-            *('--nworkers', '1', '--nthreads', '1', '--no-dashboard', '--no-nanny'),
-            *('--local-directory', tmp_path, '--death-timeout', '300'),
-        ],
-        stderr=subprocess.DEVNULL,
-        env=environment,
-    )
-    try:
-        deadline = time.monotonic() + 120
-        while not told.exists():
-            assert scheduler.poll() is None and time.monotonic() < deadline
-            time.sleep(0.05)
-        yield scheduler, json.loads(told.read_text())['address']
-    finally:
-        for process in (worker, scheduler):
-            process.kill()
-            process.wait()
-
-
-def test_a_scheduler_that_is_lost_during_a_run_ends_the_command_in_one_line(cluster):
-    scheduler, address = cluster
-    with pytest.raises(OSError, match='the scheduler is gone'):
-        list(attempt_on_cluster([KillsScheduler(scheduler.pid), KillsScheduler(0)], address))
-
-
-@dataclass
-class KillsScheduler:
-    """A task that ends the scheduler, and never itself."""
-
-    scheduler: int
-
-    def run(self):
-        os.kill(self.scheduler, signal.SIGKILL)
-        time.sleep(600)
-
-
-class Deadly:
-    """A task that no worker survives."""
-
-    def run(self):
-        os.kill(os.getpid(), signal.SIGKILL)

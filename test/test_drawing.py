@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.description.lookup import look_up
-from rangeseg_ros.drawing import colours, grey, overlay, plan
+from rangeseg_ros.drawing import colours, grey, overlay
 
 
 def test_colours_can_be_told_apart():
@@ -18,26 +18,6 @@ def test_colours_can_be_told_apart():
     assert distance.min() > 5 * 2.3
     assert np.hypot(lab[:, 1], lab[:, 2]).min() > 5 * 2.3  # nor taken for grey
     np.testing.assert_array_equal(colours([5, 9, 49]), palette[[4, 8, 0]])
-
-
-def test_a_plan_shows_what_faces_it_and_hides_the_rest():
-    def level(number, height, side, facing=1):
-        square = np.array([[0, 0], [side, 0], [side, side], [0, side]])
-        ring = np.column_stack([square, np.full(4, height)])
-        outline = SimpleNamespace(parts=[[ring]])
-        normal = np.array([0, 0, facing])
-        return SimpleNamespace(id=number, normal=normal, centroid=ring.mean(0), outline=outline)
-
-    up, ahead = np.array([0, 0, 1.0]), np.array([1.0, 0, 0])
-    planes = [level(1, 0, 2.0), level(2, 1, 1.0), level(3, 2.5, 2.0, facing=-1)]
-    picture = plan(planes, up, ahead, size=260)
-    # Ten pixels are a tenth of a metre, and 0.3 m are left around: x upwards, y to the left.
-    assert picture.shape == (260, 260, 3)
-    table, floor, outside = picture[180, 180], picture[80, 80], picture[20, 10]
-    np.testing.assert_array_equal(table, colours([2])[0])
-    np.testing.assert_array_equal(floor, colours([1])[0])
-    assert (outside > 200).all()
-    assert plan([], up, ahead).ndim == 3
 
 
 def test_unlabelled_pixels_stay_grey_and_labelled_ones_have_their_colour():

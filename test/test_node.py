@@ -80,29 +80,6 @@ def test_reliability_follows_the_publishers(node, expected):
             np.testing.assert_array_equal(node.segment(), expected)
 
 
-@pytest.mark.parametrize(
-    ('encoding', 'padding', 'order'), [('16UC1', 6, '<'), ('mono16', 0, '>'), ('32FC1', 6, '>')]
-)
-def test_encodings_byte_orders_and_padding(bench, expected, encoding, padding, order):
-    depth = corner_depth(bench.camera)
-    if encoding == '32FC1':
-        depth = (depth * np.float64(0.001)).astype(np.float32)
-    stored = depth.astype(depth.dtype.newbyteorder(order))
-    rows = np.pad(stored.view(np.uint8), ((0, 0), (0, padding)), constant_values=255)
-    labels = bench.segment(
-        bench.image(
-            depth,
-            encoding,
-            data=array('B', rows.tobytes()),
-            step=rows.shape[1],
-            is_bigendian=int(order == '>'),
-        )
-    )
-    # Metres as floats differ from millimetres in the last bit.
-    different = 0 if depth.dtype == np.uint16 else 10
-    assert np.count_nonzero(labels != expected) <= different
-
-
 BODY = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """x forward, y left, z up, from the optical frame (REP 103)."""
 

@@ -103,27 +103,6 @@ def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench
     assert len(planes) == 2 and min(planes['id']) > max(plane['id'] for plane in after.values())
 
 
-def test_the_rows_of_a_plane_are_one_frame_and_one_covariance(bench):
-    """The quaternion turns z to the normal; normal and distance vary as they can."""
-    planes, _ = planes_of(bench, room(bench.camera))
-    for plane in planes.values():
-        x, y, z, w = (plane[f'orientation_{axis}'] for axis in 'xyzw')
-        turned = 2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)
-        normal = [plane[f'normal_{axis}'] for axis in 'xyz']
-        np.testing.assert_allclose(turned, normal, atol=1e-5)
-        centre = [plane[f'centre_{axis}'] for axis in 'xyz']
-        assert np.dot(normal, centre) + plane['distance'] == pytest.approx(0, abs=1e-4)
-        assert plane['length'] >= plane['width'] > 0.5
-        covariance = np.zeros((4, 4))
-        for i, row in enumerate('xyzd'):
-            for j, column in enumerate('xyzd'[i:], i):
-                covariance[i, j] = covariance[j, i] = plane[f'covariance_{row}{column}']
-        variances = np.linalg.eigvalsh(covariance)
-        # The normal stays a unit vector: of four directions, one does not vary.
-        assert variances[1] > 0 and abs(variances[0]) < 1e-3 * variances[1]
-        assert covariance[:3] @ [*normal, 0] == pytest.approx(0, abs=1e-6 * variances[3] + 1e-9)
-
-
 def test_ground_and_obstacles_share_out_the_points(bench):
     depth = room(bench.camera)
     depth[:, :3] = 0
@@ -149,18 +128,6 @@ def test_ground_and_obstacles_share_out_the_points(bench):
     on_floor = (depth > 0) & (down > 0) & (HEIGHT / np.where(down > 0, down, 1) < WALL)
     assert (terrain == GROUND)[on_floor].mean() > 0.98
     assert (terrain == OBSTACLE)[(depth > 0) & ~on_floor].mean() > 0.98
-
-
-def test_without_a_floor_all_are_obstacles(bench):
-    with bench.listening('ground', 'obstacles'):
-        image = bench.image()
-        bench.segment(image)
-        ground, obstacles = (
-            bench.until(lambda name=name: bench.find(name, image))
-            for name in ('ground', 'obstacles')
-        )
-    assert ground.width == 0 and len(ground.fields) == 4
-    assert obstacles.width == bench.camera.width * bench.camera.height
 
 
 def test_node_and_replay_say_the_same_of_a_recording(tmp_path):

@@ -44,7 +44,7 @@ def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
         bench.listening('labels'),
         bench.camera_on(*topics),
     ):
-        told = r'no output for .* s: compiling kernels, \d+ of'
+        told = r'no output for .* s: compiling kernels'
         status = bench.reported(lambda s: re.match(told, s.message), bench.send)
         assert status.level == DiagnosticStatus.ERROR
         assert 'compiling kernels' in bench.log()

@@ -10,7 +10,7 @@ import pytest
 import rangeseg_ros
 from rangeseg_ros import Camera, CameraError, Config, ConfigError, RangeImage, Segmenter
 from rangeseg_ros.drawing import colours
-from rangeseg_ros.extras import MissingExtraError, load
+from rangeseg_ros.extras import MissingExtraError, import_extra
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
@@ -132,7 +132,7 @@ def test_field_of_view():
 def test_a_missing_library_is_told_with_its_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, 'pandas', None)
     with pytest.raises(MissingExtraError, match=r"pip install 'rangeseg_ros\[notebook\]'"):
-        load('pandas')
+        import_extra('pandas')
 
 
 def test_the_core_is_imported_without_drawing():

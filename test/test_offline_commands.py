@@ -75,32 +75,6 @@ def test_segment_compiles_before_the_first_image_and_for_its_parameters(folder, 
     assert prepared == [('normals', ('image',), before)]
 
 
-def test_segment_reads_floats_and_scales(folder, run):
-    cv2.imwrite('metres.tiff', np.full((48, 64), 1.5, np.float32))
-    write_image(folder / 'fifths.png', np.full((48, 64), 7500, np.uint16))
-    assert run('segment', 'metres.tiff', '--camera', 'camera.yaml', '--output', 'a')[0] == 0
-    scaled = ('--camera', 'camera.yaml', '--output', 'a', '--depth-scale', '0.0002')
-    assert run('segment', 'fifths.png', *scaled)[0] == 0
-    assert run('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'a')[0] == 0
-    wall = (folder / 'a/2_planes.csv').read_text()
-    assert (folder / 'a/metres_planes.csv').read_text() == wall
-    assert (folder / 'a/fifths_planes.csv').read_text() == wall
-
-
-@pytest.mark.parametrize(
-    ('shape', 'value'), [((1, 1), 2), ((1, 9), np.nan), ((9, 1), 1e-30), ((3, 3), 1e30)]
-)
-def test_degenerate_images_give_no_exception(folder, run, shape, value):
-    cv2.imwrite('x.tiff', np.full(shape, value, np.float32))
-    height, width = shape
-    write_camera(folder / 'small.yaml', Camera(width, height, 50.0, 50.0, 0.0, 0.0))
-    code, output, error = run('segment', 'x.tiff', '--camera', 'small.yaml', '--output', 'out')
-    assert (code, error) == (0, '')
-    assert read_labels(folder / 'out/x_labels.png').shape == shape
-    if not 0 < value < np.inf:
-        assert output == 'x.tiff: no plane: no valid depth\n'
-
-
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -224,24 +198,6 @@ def test_several_bags_have_a_folder_each(folder, run):
     assert not (folder / 'new').exists()
 
 
-def test_a_truncated_bag_is_reported_and_its_first_frames_are_kept(folder, run):
-    path = folder / 'bag'
-    file = record(path, 'mcap', np.zeros((16, 240, 320), np.uint16))
-    with file.open('r+b') as stream:
-        stream.truncate(file.stat().st_size // 2)
-    record(folder / 'whole', 'mcap', depth_images(1) * 0)
-    with DepthBag(path) as bag:
-        count = len(bag)
-    assert count > 5
-    code, output, error = run('replay', path, 'whole', '--output', 'out', '--jobs', 1)
-    assert code == 1
-    assert error.startswith(f'rangeseg: {path}: damaged after {count} frames: ')
-    assert error.count('\n') == 1
-    assert f'out/bag: {count} frames' in output
-    assert 'out/whole: 1 frames' in output
-    assert sum(name.endswith('_labels.png') for name in files(folder / 'out')) == count + 1
-
-
 def test_bad_input_of_replay_leaves_nothing(folder, run):
     record(folder / 'good', 'mcap', depth_images(1))
     bad = Recording()
@@ -290,3 +246,14 @@ def test_an_interrupted_replay_leaves_whole_files(folder):
     frames = {int(row['frame']) for row in rows}
     assert frames <= set(range(len(labels)))
     assert not [path for path in (folder / 'out').iterdir() if path.name.startswith('.')]
+
+
+@pytest.mark.parametrize('closed', ['2>&-', '0<&- 1>&- 2>&-'])
+def test_closed_streams_are_not_written_to(folder, closed):
+    arguments = ('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output', 'out')
+    code = 'from rangeseg_ros.start import rangeseg; rangeseg()'
+    shell = ['/bin/sh', '-c', f'exec "$@" {closed}', 'sh']
+    assert subprocess.run([*shell, sys.executable, '-c', code, *arguments]).returncode == 0
+    assert (read_labels(folder / 'out/2_labels.png') == 1).all()
+    with (folder / 'out/2_planes.csv').open() as file:
+        assert len(list(csv.DictReader(file))) == 1

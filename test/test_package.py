@@ -50,7 +50,7 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
 
 def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
     extras = setup_arguments['extras_require']
-    packages = {'rerun': 'rerun-sdk', 'rclpy': 'ros-jazzy-rclpy'}
+    packages = {'rclpy': 'ros-jazzy-rclpy'}
     for name, extra in EXTRAS.items():
         wanted = packages.get(name, name)
         assert any(re.match(rf'{wanted}\b', requirement) for requirement in extras[extra]), name

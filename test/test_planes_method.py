@@ -136,10 +136,6 @@ def in_another_process(**environment):
     return json.loads(text)
 
 
-def test_two_runs_agree_bit_for_bit(fingerprint):
-    assert small_fingerprint() == [*fingerprint]
-
-
 def test_two_processes_agree_bit_for_bit(fingerprint):
     assert in_another_process(PYTHONHASHSEED='7') == [*fingerprint]
 

@@ -14,7 +14,7 @@ from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import MAX_PICTURES, Picture, spread
+from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
 from rangeseg_ros.report.replay import ReplayReport
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -57,7 +57,7 @@ def report(tmp_path):
 
 def test_a_page_is_self_contained(report):
     page = Page(report)
-    assert len(page.sources) == 4 + 4 + 3  # overlays, normals, charts
+    assert len(page.sources) == 4 + 4 + 2  # overlays, normals, charts
     assert all(source.startswith('data:image/') for source in page.sources)
     assert not re.search(r'url\(|@import|<link', report.read_text())
 
@@ -96,11 +96,11 @@ def test_a_page_of_nothing(tmp_path):
 
 def test_long_sequences_are_shown_from_first_to_last(tmp_path):
     pictures = [Picture(tmp_path, str(n)) for n in range(1000)]
-    chosen = [int(picture.title) for picture in spread(pictures)]
+    chosen = [int(picture.title) for picture in evenly_spaced(pictures)]
     assert len(chosen) == MAX_PICTURES
     assert (chosen[0], chosen[-1]) == (0, 999)
     assert set(np.diff(chosen)) <= {21, 22}
-    assert spread(pictures[:3]) == pictures[:3]
+    assert evenly_spaced(pictures[:3]) == pictures[:3]
 
 
 def sightings(*rows):
@@ -151,25 +151,3 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     assert all((tmp_path / 'out' / unquote(link)).exists() for link in page.sources)
     whole, torn = (line for line in page.text.splitlines() if line.startswith(tuple(names)))
     assert whole == 'walls160.5220' and torn.startswith('torn #2') and 'damaged after' in torn
-
-
-def test_report_of_evaluate(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert not end.value.code
-
-    small = ('--width', '160', '--height', '120', '--noise', 'none')
-    run('simulate', 'kinect', '--scenes', '2', *small, '--output', 'set')
-    run('evaluate', 'set', '--jobs', '1', '--output', 'out', '--tolerance', '0.7', '0.8')
-    page = Page(tmp_path / 'out/report.html')
-    assert '2 images, method planes' in page.text
-    assert [title.split(':')[0] for title in page.titles if ' correct' in title] == [
-        '000000',
-        '000001',
-    ]
-    assert all(source.startswith('data:image/') for source in page.sources)
-    assert 'Images at tolerance 0.8' in page.text

@@ -1,13 +1,8 @@
-"""`rangeseg tracks`, and the figures it prints: sequences of ids written by hand."""
-
-import json
+"""Figures of tracks: sequences of ids written by hand."""
 
 import numpy as np
-from click.testing import CliRunner
 
-from rangeseg_ros.cli.tracks import command
-from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures, track_rooms
+from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 
 
 def test_figures_of_perfect_tracks():
@@ -63,25 +58,3 @@ def test_ids_of_faces():
     found = ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)
     assert found == {5: [12, 11], 6: []}
     assert ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=21) == {5: [12, 11]}
-
-
-def test_rooms_are_tracked_one_by_one():
-    frames = list(track_rooms([3, 4], 2, 5, Config()))
-    assert [{room for room, _ in frame.surfaces} for frame in frames] == [{3}, {3}, {4}, {4}]
-    first, _, other, _ = ({i for ids in frame.planes.values() for i in ids} for frame in frames)
-    assert first and other and not first & other
-    for frame in frames:
-        assert frame.planes.keys() == frame.surfaces.keys()
-
-
-def test_command(tmp_path):
-    output = tmp_path / 'figures.json'
-    words = ['--rooms', '1', '--frames', '2', '--seed', '3', '--json', str(output)]
-    result = CliRunner().invoke(command, words)
-    assert result.exit_code == 0, result.output
-    figures = json.loads(output.read_text())
-    frames = list(track_rooms([3], 2, 1, Config()))
-    assert figures['planes'] == track_figures([frame.planes for frame in frames])
-    assert figures['surfaces'] == track_figures([frame.surfaces for frame in frames])
-    assert figures['planes']['coverage'] > 0.7
-    assert result.output.startswith('1 rooms, 2 frames, ')

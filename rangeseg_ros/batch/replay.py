@@ -213,7 +213,7 @@ class Replay:
                 doubts=dict(doubts),
                 contradicted=sequence.map.doubts if self.config.map_frame else [],
             )
-            report.write(self.folder / 'report.html', outcome.damage, planes, outcome.contradicted)
+            report.write(self.folder / 'report.html', outcome.damage, outcome.contradicted)
             kept = {
                 name: value for name, value in asdict(outcome).items() if name != 'already_done'
             }

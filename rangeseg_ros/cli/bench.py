@@ -19,22 +19,11 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 @click.command()
 @click.argument('depth', nargs=-1, type=options.FILE)
-@click.option(
-    '--camera',
-    'camera_file',
-    type=options.FILE,
-    help='Intrinsics of the DEPTH images: a ROS camera-calibration YAML file.',
-)
+@options.camera
 @options.depth_scale
 @options.params
 @options.method
-@click.option(
-    '--scenes',
-    type=click.IntRange(min=1),
-    default=5,
-    show_default=True,
-    help='How many simulated rooms, where no DEPTH is given.',
-)
+@options.count('--scenes', default=5, help='How many simulated rooms, where no DEPTH is given.')
 @click.option(
     '--size',
     type=(click.IntRange(16, 4096), click.IntRange(16, 4096)),
@@ -43,18 +32,8 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
     metavar='WIDTH HEIGHT',
     help='Of the images of simulated rooms.',
 )
-@click.option(
-    '--rounds',
-    type=click.IntRange(min=1),
-    default=3,
-    show_default=True,
-    help='How many times each frame is segmented.',
-)
-@click.option(
-    '--threads',
-    type=click.IntRange(min=1),
-    help='At most so many, of the four that a frame can use.  [default: one for each core]',
-)
+@options.count('--rounds', default=3, help='How many times each frame is segmented.')
+@options.count('--threads', help='At most so many.  [default: one for each core, up to four]')
 @options.json_file
 def command(
     depth: tuple[Path, ...],

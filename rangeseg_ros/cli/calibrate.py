@@ -37,29 +37,13 @@ _HEADER = '# Written by rangeseg calibrate.\n'
     required=True,
     type=click.Path(exists=True, path_type=Path),
 )
-@click.option(
-    '--output',
-    type=click.Path(dir_okay=False, path_type=Path),
-    required=True,
-    help='Distortion map to write: TIFF.',
-)
-@click.option(
-    '--params',
-    'params_output',
-    type=click.Path(dir_okay=False, path_type=Path),
-    help='Parameter file to write: the map, and noise and distortion that remain.',
-)
-@click.option(
-    '--camera',
-    'camera_file',
-    type=options.FILE,
-    help='Intrinsics of the images in folders: a ROS camera-calibration YAML file.',
-)
+@options.output_file('--output', 'Distortion map to write: TIFF.', required=True)
+@options.output_file('--params', 'Parameter file to write: the map, and what noise remains.')
+@options.camera
 @options.depth_scale
 @options.topics
 @click.option(
     '--segment-with',
-    'segment_with',
     type=options.FILE,
     help='Parameters of the segmenter, which --params repeats.  [default: those of the package]',
 )
@@ -67,7 +51,7 @@ _HEADER = '# Written by rangeseg calibrate.\n'
 def command(
     recordings: tuple[Path, ...],
     output: Path,
-    params_output: Path | None,
+    params: Path | None,
     camera_file: Path | None,
     depth_scale: float | None,
     depth_topic: str | None,
@@ -84,7 +68,7 @@ def command(
     An interrupted run goes on where it was when it is started again.
     """
     report = output.with_name(f'{output.stem}_report.html')
-    _check_free(output, params_output)
+    _check_free(output, params)
     camera = read_camera(camera_file) if camera_file else None
     sources = [Source(path, camera, depth_scale, depth_topic, camera_topic) for path in recordings]
     for source in sources:
@@ -119,8 +103,8 @@ def command(
         )
     Config.from_mapping(parameters)
     write_distortion(output, result.distortion)
-    if params_output:
-        with replacing(params_output) as partial:
+    if params:
+        with replacing(params) as partial:
             partial.write_text(_HEADER + yaml.safe_dump(parameters, sort_keys=False))
     spread = np.linspace(0, len(left) - 1, min(_SHOWN, len(left))).round().astype(int)
     shown = [Shown(int(chosen[n]), left[n].images, left[n].planes) for n in spread]
@@ -129,17 +113,17 @@ def command(
     click.echo(f'{output}, {report}')
 
 
-def _check_free(output: Path, params_output: Path | None) -> None:
+def _check_free(output: Path, params: Path | None) -> None:
     """Refuse to overwrite what is none of this command's own."""
     if output.exists():
         try:
             read_distortion(output)
         except DistortionError:
             raise click.UsageError(f'{output}: exists already, and is no distortion map') from None
-    if params_output and params_output.exists():
-        with params_output.open('rb') as file:
+    if params and params.exists():
+        with params.open('rb') as file:
             if file.readline() != _HEADER.encode():
-                raise click.UsageError(f'{params_output}: exists already, not overwritten')
+                raise click.UsageError(f'{params}: exists already, not overwritten')
 
 
 def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:

@@ -65,13 +65,7 @@ tolerance: Callable[..., Any] = click.option(
 @click.argument('truth', metavar='GT', type=click.Path(exists=True, path_type=Path))
 @click.argument('labels', metavar='MS', type=click.Path(exists=True, path_type=Path))
 @tolerance
-@click.option(
-    '--min-pixels',
-    type=click.IntRange(min=1),
-    default=1,
-    show_default=True,
-    help='Regions of the ground truth that are smaller do not count as regions.',
-)
+@options.count('--min-pixels', default=1, help='Smaller regions of the truth do not count.')
 @options.json_file
 def command(
     truth: Path,

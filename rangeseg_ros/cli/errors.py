@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-def in_words(error: BaseException) -> str:
+def one_line(error: BaseException) -> str:
     """What an error says, in one line of printable characters."""
     text = str(error)
     if isinstance(error, MemoryError):

@@ -12,8 +12,6 @@ from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
-from rangeseg_ros.report.evaluation import write_evaluation
-from rangeseg_ros.report.page import page_kind
 from rangeseg_ros.tasks import run_all
 
 
@@ -22,10 +20,8 @@ from rangeseg_ros.tasks import run_all
 @options.params
 @options.method
 @tolerance
-@click.option(
-    '--min-pixels',
-    type=click.IntRange(min=1),
-    help='Regions of the truth of depth images that are smaller do not count.  [default: 1000]',
+@options.count(
+    '--min-pixels', help='Smaller regions of true depth images do not count.  [default: 1000]'
 )
 @click.option(
     '--split', type=click.Choice(['train', 'test']), help='Only this part of a segcomp set.'
@@ -36,12 +32,10 @@ from rangeseg_ros.tasks import run_all
     help='Terrains: do not give the height of the sensor to the segmenter.',
 )
 @options.jobs
-@click.option(
-    '--output',
-    type=click.Path(file_okay=False, path_type=Path),
-    help="Folder for report.html, each image's labels and a picture of truth and segmentation at "
-    'tolerance 0.8: correct white, over-segmented green, under-segmented blue, missed orange, '
-    'noise red.',
+@options.output_folder(
+    "Folder for each image's labels and a picture of truth and segmentation at tolerance 0.8: "
+    'correct white, over-segmented green, under-segmented blue, missed orange, noise red.',
+    required=False,
 )
 @options.overwrite
 @options.json_file
@@ -80,24 +74,17 @@ def command(
         click.echo(terrain_table(figures))
         options.write_json(json_file, figures)
         return
-    cases = [
-        case
-        for case in find_cases(folder, min_pixels)
-        if split is None or getattr(case, 'split', split) == split
-    ]
+    known = find_cases(folder, min_pixels)
+    cases = [case for case in known if split is None or case.split in (split, '')]
     if not cases:
         raise click.ClickException(f'{folder}: no {split} images')
     tasks = [Task(case, config, output=output) for case in cases]
     if output:
-        page = output / 'report.html'
-        ours = page.is_file() and page_kind(page) == 'evaluation'
-        outputs = [page, *(path for task in tasks for path in task.pictures(output).values())]
+        outputs = [path for task in tasks for path in task.pictures(output).values()]
         inputs = [path for case in cases for path in (case.image, case.truth)]
-        options.check_new(outputs, inputs, overwrite or ours)
+        options.check_new(outputs, inputs, overwrite)
     found = list(options.progress(run_all(tasks, jobs), len(tasks), 'image'))
     figures = evaluation_figures(found, tolerances)
     click.echo(f'{folder}: {len(cases)} images, method {config.method}')
     click.echo(table(figures))
-    if output:
-        write_evaluation(output, folder.resolve().name, config, found, figures)
     options.write_json(json_file, figures)

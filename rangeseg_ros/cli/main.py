@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 import click
 
 from rangeseg_ros import interrupts
-from rangeseg_ros.cli.errors import in_words
-from rangeseg_ros.extras import MissingExtraError, missing
+from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.extras import MissingExtraError, install_command
 
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
@@ -26,12 +26,9 @@ COMMANDS = {
     'calibrate': "Learn a sensor's distortion from the planes it sees.",
     'evaluate': 'Segment images and compare the results with their truth.',
     'compare': 'Compare label images with ground truth.',
-    'tracks': 'Measure how well planes keep their ids.',
-    'experiment': 'Repeat the experiments of the thesis.',
     'bench': 'Measure the time and memory of each stage.',
     'compile': 'Compile ahead of the first frame.',
     'play': 'Publish the messages of a recording in ROS 2.',
-    'view': 'Show planes in 3D.',
 }
 
 
@@ -65,7 +62,7 @@ def rangeseg() -> None:
 
 
 def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
-    text = in_words(message) if isinstance(message, Warning) else message
+    text = one_line(message) if isinstance(message, Warning) else message
     print(f'rangeseg: warning: {text}', file=sys.stderr)
 
 
@@ -91,9 +88,9 @@ def main() -> None:
     except MissingExtraError as error:
         _fail(str(error))
     except ModuleNotFoundError as error:
-        _fail(missing(error) or f'{error}: is the installation complete?')
+        _fail(install_command(error) or f'{error}: is the installation complete?')
     except (ValueError, OSError, MemoryError, RecursionError) as error:
-        _fail(in_words(error))
+        _fail(one_line(error))
     except SystemExit as end:
         if end.code and end.code == interrupts.exit_code():
             interrupts.end()

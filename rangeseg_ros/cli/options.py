@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -51,34 +52,50 @@ class Finite(click.FloatRange):
 FILE = _RegularFile(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
-camera: Callable[..., Any] = click.option(
+Decorator = Callable[..., Any]
+
+
+def together(*options: Decorator) -> Decorator:
+    """Several options as one decorator, in their order in the help."""
+
+    def decorate(command: Callable[..., Any]) -> Any:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+def choice(name: str, choices: Sequence[str], text: str) -> Decorator:
+    """One of `choices`, by default the first."""
+    kind = click.Choice(list(choices))
+    return click.option(name, type=kind, default=choices[0], show_default=True, help=text)
+
+
+count = partial(click.option, type=click.IntRange(min=1), show_default=True)
+"""An integer from 1 on."""
+number = partial(click.option, type=click.IntRange(min=0), show_default=True)
+"""An integer from 0 on."""
+
+camera: Decorator = click.option(
     '--camera',
     'camera_file',
     type=FILE,
-    required=True,
-    help='Intrinsics: a ROS camera-calibration YAML file.',
+    help='Intrinsics: a ROS camera-calibration YAML file, or the JSON of Open3D.',
 )
-_NUMBERS = (
-    ('--fx', 'Focal length in x, pixels, in place of a file.'),
-    ('--fy', 'Focal length in y.  [default: as in x]'),
-    ('--cx', 'Column of the principal point.  [default: the middle]'),
-    ('--cy', 'Row of the principal point.  [default: the middle]'),
-    ('--fov', 'Horizontal field of view, degrees, in place of focal lengths.'),
+intrinsics = together(
+    camera,
+    *(
+        click.option(name, type=Finite(), help=text)
+        for name, text in (
+            ('--fx', 'Focal length in x, pixels, in place of a file.'),
+            ('--fy', 'Focal length in y.  [default: as in x]'),
+            ('--cx', 'Column of the principal point.  [default: the middle]'),
+            ('--cy', 'Row of the principal point.  [default: the middle]'),
+            ('--fov', 'Horizontal field of view, degrees, in place of focal lengths.'),
+        )
+    ),
 )
-
-
-def intrinsics(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options for `--camera` or for numbers in its place: `camera_file`, `fx` ... `fov`."""
-    for name, text in reversed(_NUMBERS):
-        command = click.option(name, type=Finite(), help=text)(command)
-    file = click.option(
-        '--camera',
-        'camera_file',
-        type=FILE,
-        help='Intrinsics: a ROS camera-calibration YAML file, or the JSON of Open3D.',
-    )
-    decorated: Callable[..., Any] = file(command)
-    return decorated
 
 
 def read_intrinsics(
@@ -94,39 +111,37 @@ def read_intrinsics(
     return Intrinsics(camera, numbers if given else (), fov)
 
 
-raw: Callable[..., Any] = click.option(
+raw: Decorator = click.option(
     '--raw',
     is_flag=True,
     help='The images are raw: lens distortion D and K count, not P of rectified images.',
 )
-params: Callable[..., Any] = click.option(
+params: Decorator = click.option(
     '--params',
     'params_file',
     type=FILE,
     help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
 )
-method: Callable[..., Any] = click.option(
+method: Decorator = click.option(
     '--method',
     type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
     help='Method, in place of that of the parameters.',
 )
-exact: Callable[..., Any] = click.option(
+exact: Decorator = click.option(
     '--exact',
     is_flag=True,
     help='Minimise with every label at full resolution instead of coarse to fine: slow.',
 )
-depth_scale: Callable[..., Any] = click.option(
+depth_scale: Decorator = click.option(
     '--depth-scale',
     type=Finite(min=1e-9, max=1e3),
     help='Metres per unit of the images.  [default: 0.001 for integers, 1 for floats]',
 )
-overwrite: Callable[..., Any] = click.option(
+overwrite: Decorator = click.option(
     '--overwrite', is_flag=True, help='Replace files that are there already.'
 )
-jobs: Callable[..., Any] = click.option(
-    '--jobs', type=click.IntRange(min=1), help='Processes.  [default: one for each core]'
-)
-fixed_frame: Callable[..., Any] = click.option(
+jobs = count('--jobs', help='Processes.  [default: one for each core]')
+fixed_frame: Decorator = click.option(
     '--fixed-frame',
     metavar='FRAME',
     help='Frame in which planes stay put, such as odom: the map of planes is in it, where the '
@@ -134,19 +149,22 @@ fixed_frame: Callable[..., Any] = click.option(
 )
 
 
-def topics(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options `--depth-topic` and `--camera-topic` of commands that read recordings."""
-    depth = click.option('--depth-topic', help='Depth.  [default: found by type and name]')
-    camera = click.option('--camera-topic', help='Intrinsics.  [default: those beside depth]')
-    decorated: Callable[..., Any] = depth(camera(command))
-    return decorated
+topics = together(
+    click.option('--depth-topic', help='Depth.  [default: found by type and name]'),
+    click.option('--camera-topic', help='Intrinsics.  [default: those beside depth]'),
+)
 
 
-def folder_output(text: str = 'Folder for the results; made when missing.') -> Callable[..., Any]:
-    """Option `--output` of commands that write a folder."""
+def output_file(name: str, text: str, required: bool = False) -> Decorator:
+    """A file to write."""
+    kind = click.Path(dir_okay=False, path_type=Path)
+    return click.option(name, type=kind, required=required, help=text)
+
+
+def output_folder(text: str = 'Folder for the results.', required: bool = True) -> Decorator:
+    """A folder to write, made when missing."""
     kind = click.Path(file_okay=False, path_type=Path)
-    option: Callable[..., Any] = click.option('--output', type=kind, required=True, help=text)
-    return option
+    return click.option('--output', type=kind, required=required, help=text)
 
 
 def _checked_json(
@@ -158,7 +176,7 @@ def _checked_json(
     return path
 
 
-json_file: Callable[..., Any] = click.option(
+json_file: Decorator = click.option(
     '--json',
     'json_file',
     type=click.Path(path_type=Path),

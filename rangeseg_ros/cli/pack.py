@@ -21,7 +21,13 @@ SUFFIXES = ('.png', '.tif', '.tiff')
 
 @click.command()
 @click.argument('frames_dir', type=options.FOLDER)
-@options.camera
+@click.option(
+    '--camera',
+    'camera_file',
+    type=options.FILE,
+    required=True,
+    help='Intrinsics: a ROS camera-calibration YAML file.',
+)
 @options.raw
 @click.option(
     '--output',

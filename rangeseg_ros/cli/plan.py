@@ -14,7 +14,7 @@ from rangeseg_ros.tasks import Failure
 
 @click.command()
 @recordings.argument
-@options.folder_output()
+@options.output_folder()
 @click.option(
     '--fixed-frame',
     metavar='FRAME',

@@ -1,9 +1,9 @@
-"""`rangeseg play`: recordings to live topics."""
+"""`rangeseg play`: recordings to live topics, where no `ros2 bag play` is installed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from rosbags.rosbag2 import Reader
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli import options
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.recordings import why_unreadable
 
 CLOCK = '/clock'
@@ -31,31 +32,15 @@ CLOCK_PERIOD = 0.025
 )
 @click.option('--loop', is_flag=True, help='Start again at the end, until interrupted.')
 @click.option('--wait', is_flag=True, help='Start only when every topic has a subscriber.')
-@click.option(
-    '--delay',
-    type=options.Finite(min=0),
-    default=1.0,
-    show_default=True,
-    help='Seconds before the first message, for subscribers to find the topics.',
-)
-@click.option(
-    '--clock',
-    is_flag=True,
-    help='Publish the time of the recording on /clock, for nodes with use_sim_time.',
-)
-def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock: bool) -> None:
+@click.option('--clock', is_flag=True, help='Publish the time of the recording on /clock.')
+def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None:
     """Publish the messages of a rosbag2 on their topics, timed as they were recorded.
 
-    Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort.
+    Stamps stay as recorded. Topics are reliable, unless they were recorded as best effort. The
+    first message comes after a second, for subscribers to find the topics.
     """
-    try:
-        import rclpy
-        from rclpy.duration import Duration
-        from rclpy.signals import SignalHandlerOptions
-    except ImportError:
-        raise click.ClickException(
-            'play needs rclpy: source a ROS 2 installation, or install the extra jazzy'
-        ) from None
+    rclpy = import_extra('rclpy')
+    no_handlers = import_extra('rclpy.signals').SignalHandlerOptions.NO
     try:
         reader = Reader(bag)
         reader.open()
@@ -63,27 +48,26 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, delay: float, clock:
     except Exception as error:
         reason = why_unreadable(bag, error)
         raise click.ClickException(f'{bag}: not a readable rosbag2: {reason}') from None
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=[], signal_handler_options=no_handlers)
     node = rclpy.create_node('rangeseg_play')
     try:
         publishers = _publishers(node, reader.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
-        publish_time = _clock(node) if clock and CLOCK not in publishers else _silent
+        times = _clock_publisher(node) if clock and CLOCK not in publishers else None
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
             interrupts.check()
             time.sleep(0.05)
-        time.sleep(delay)
+        time.sleep(1.0)
         while True:
             interrupts.check()  # there may be no message
-            for topic, data in options.progress(
-                _timed(reader, publishers, rate, publish_time), reader.message_count, 'message'
-            ):
+            messages = _timed(reader, set(publishers), rate, times)
+            for topic, data in options.progress(messages, reader.message_count, 'message'):
                 publishers[topic].publish(data)
             if not loop:
                 break
         for publisher in publishers.values():
-            publisher.wait_for_all_acked(Duration(seconds=2))
+            publisher.wait_for_all_acked(import_extra('rclpy.duration').Duration(seconds=2))
     finally:
         reader.close()
         node.destroy_node()
@@ -96,59 +80,48 @@ def _publishers(node: Any, connections: list[Connection]) -> dict[str, Any]:
 
     from rangeseg_ros.messages.make import message_class
 
-    publishers = {}
+    publishers: dict[str, Any] = {}
     for connection in connections:
+        topic, kind = connection.topic, connection.msgtype
         try:
-            kind = message_class(connection.msgtype)
+            publishers[topic] = publishers.get(topic) or node.create_publisher(
+                message_class(kind), topic, _offered(connection)
+            )
         except (ImportError, AttributeError):
-            click.echo(f'{connection.topic}: {connection.msgtype} is not installed, left out')
-            continue
-        if connection.topic not in publishers:
-            try:
-                publishers[connection.topic] = node.create_publisher(
-                    kind, connection.topic, _qos(connection)
-                )
-            except (InvalidTopicNameException, InvalidNamespaceException):
-                click.echo(f'{connection.topic!r} is no topic of ROS 2, left out')
+            click.echo(f'{topic}: {kind} is not installed, left out')
+        except (InvalidTopicNameException, InvalidNamespaceException):
+            click.echo(f'{topic!r} is no topic of ROS 2, left out')
     return publishers
 
 
-def _qos(connection: Connection) -> Any:
+def _offered(connection: Connection) -> Any:
     """Quality of service that the recorded publishers offered."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     offers: Any = getattr(connection.ext, 'offered_qos_profiles', [])
-    best_effort = any(offer.reliability.name == 'BEST_EFFORT' for offer in offers)
-    latched = any(offer.durability.name == 'TRANSIENT_LOCAL' for offer in offers)
-    return QoSProfile(
-        depth=10,
-        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
+    quality = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+    if any(offer.reliability.name == 'BEST_EFFORT' for offer in offers):
+        quality.reliability = ReliabilityPolicy.BEST_EFFORT
+    if any(offer.durability.name == 'TRANSIENT_LOCAL' for offer in offers):
+        quality.durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return quality
 
 
-def _clock(node: Any) -> Callable[[int], None]:
-    """Publishes a time in nanoseconds."""
-    from rosgraph_msgs.msg import Clock
-
-    publisher = node.create_publisher(Clock, CLOCK, 1)
-    message = Clock()
-
-    def publish_time(now: int) -> None:
-        message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
-        publisher.publish(message)
-
-    return publish_time
-
-
-def _silent(now: int) -> None:
-    pass
+def _clock_publisher(node: Any) -> Any:
+    return node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
 
 
 def _timed(
-    reader: Reader, topics: Collection[str], rate: float, publish_time: Callable[[int], None]
+    reader: Reader, topics: set[str], rate: float, times: Any
 ) -> Iterator[tuple[str, bytes]]:
-    """Topics and contents of messages when they are due; the time is published meanwhile."""
+    """Topics and contents of messages when they are due; `times` publishes the time meanwhile."""
+
+    def publish_time(now: int) -> None:
+        if times is not None:
+            message = times.msg_type()
+            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
+            times.publish(message)
+
     start = time.monotonic()
     wanted = [connection for connection in reader.connections if connection.topic in topics]
     for connection, stamp, data in reader.messages(wanted):

@@ -11,7 +11,7 @@ from typing import Any, Protocol, TypeVar
 import click
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
 
 R_co = TypeVar('R_co', covariant=True)
@@ -72,5 +72,5 @@ def outcomes(
 
 def report_failure(task: RecordingTask[Any], failure: Failure) -> int:
     """Say why a recording failed; the exit code."""
-    click.echo(f'rangeseg: {task.recording}: {in_words(failure.error)}', err=True)
+    click.echo(f'rangeseg: {task.recording}: {one_line(failure.error)}', err=True)
     return 2

@@ -10,7 +10,7 @@ import click
 
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options, recordings
-from rangeseg_ros.cli.errors import in_words
+from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.page import page_kind
@@ -20,7 +20,7 @@ from rangeseg_ros.tasks import Failure
 
 @click.command()
 @recordings.argument
-@options.folder_output()
+@options.output_folder()
 @options.topics
 @options.raw
 @options.overwrite
@@ -110,7 +110,7 @@ def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
     name = task.folder.name
     if isinstance(outcome, Failure):
         nothing = dict.fromkeys(('frames', 'empty', 'duration', 'planes_per_frame', 'ids'), 0)
-        return {'name': name, 'failed': True, 'damage': in_words(outcome.error), **nothing}
+        return {'name': name, 'failed': True, 'damage': one_line(outcome.error), **nothing}
     empty = sum(outcome.reasons.values())
     row = {'name': name, 'failed': False, 'empty': empty}
     return {**row, **asdict(outcome), **outcome.figures}

@@ -27,7 +27,7 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 @click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @options.intrinsics
 @options.raw
-@options.folder_output()
+@options.output_folder()
 @options.depth_scale
 @options.params
 @options.overwrite

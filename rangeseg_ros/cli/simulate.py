@@ -1,45 +1,59 @@
-"""`rangeseg simulate`: scenes with known truth, as depth sensors and range scanners see them."""
+"""`rangeseg simulate`: scenes with known truth, as depth sensors see them."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
-from rangeseg_ros.cli import options, simulate_terrain
+from rangeseg_ros.cli import options
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.evaluation.terrain import TerrainTable
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.segcomp.files import (
-    write_angles,
-    write_perceptron,
-    write_raster,
-    write_segmentation,
-)
-from rangeseg_ros.segcomp.geometry import abw_calibration
 from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
 from rangeseg_ros.simulation.render import Frame, simulate
-from rangeseg_ros.simulation.scanners import (
-    Scan,
-    abw_scene,
-    perceptron_scene,
-    simulate_abw,
-    simulate_perceptron,
-)
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
-from rangeseg_ros.simulation.segcomp_truth import ground_truth, region_angles
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.sensor import resize
+from rangeseg_ros.simulation.terrain.frame import simulate_terrain
+from rangeseg_ros.simulation.terrain.hard import HARD
+from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
-_count = click.IntRange(min=1)
-_number = partial(click.option, show_default=True)
+_size = click.IntRange(16, 4096)
+
+_sensor = options.choice(
+    '--sensor',
+    list(SENSORS),
+    'Structured light, active stereo, time of flight of a phone, lidar of a tablet, or a sensor '
+    'without error.',
+)
+_of_all_sets = options.together(
+    options.number('--seed', default=0, help='Of the first scene; the others have the next ones.'),
+    click.option('--width', type=_size, help="Columns; the sensor's own."),
+    click.option('--height', type=_size, help="Rows; the sensor's own."),
+    click.option(
+        '--output',
+        type=click.Path(path_type=Path),
+        required=True,
+        help='Folder to make; it must not exist, or be empty.',
+    ),
+)
+_of_rooms = options.together(
+    options.choice('--scene', list(SCENES), 'Boxes alone, or with a ball and a cylinder.'),
+    options.number('--sensor-seed', default=0, help='Which one of its kind the sensor is.'),
+    options.count('--scenes', default=12, help='How many.'),
+    options.count('--frames', default=1, help='Of each scene, at 30 Hz from a hand that moves.'),
+    _of_all_sets,
+)
 
 
 @click.group()
@@ -47,69 +61,9 @@ def command() -> None:
     """Simulate range images with ground truth."""
 
 
-def set_options(scenes: int, text: str) -> Callable[..., Any]:
-    """Options of all sets."""
-
-    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
-        for option in (
-            click.option(
-                '--output',
-                type=click.Path(path_type=Path),
-                required=True,
-                help='Folder to make; it must not exist, or be empty.',
-            ),
-            _number(
-                '--seed',
-                type=click.IntRange(min=0),
-                default=0,
-                help='Seed of the first scene; the next ones have the next numbers.',
-            ),
-            _number('--scenes', type=_count, default=scenes, help=text),
-        ):
-            command = option(command)
-        return command
-
-    return decorate
-
-
-def room_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Options of sets of rooms."""
-    for option in (
-        click.option('--height', type=click.IntRange(16, 4096), help="Rows; the sensor's own."),
-        click.option('--width', type=click.IntRange(16, 4096), help="Columns; the sensor's own."),
-        _number(
-            '--scene',
-            type=click.Choice(list(SCENES)),
-            default='room',
-            help='Rooms with boxes, or with a ball and a cylinder as well.',
-        ),
-        _number(
-            '--sensor-seed',
-            type=click.IntRange(min=0),
-            default=0,
-            help='Which one of its kind the sensor is: its fixed distortion.',
-        ),
-        _number(
-            '--frames',
-            type=_count,
-            default=1,
-            help='Frames of each scene, at 30 Hz from a camera that moves as if held by hand.',
-        ),
-        set_options(12, 'How many.'),
-    ):
-        command = option(command)
-    return command
-
-
 @command.command()
-@_number(
-    '--sensor',
-    type=click.Choice(list(SENSORS)),
-    default='kinect',
-    help='Structured light, active stereo, time of flight of a phone, lidar of a tablet, or a '
-    'sensor without error.',
-)
-@room_options
+@_sensor
+@_of_rooms
 def rooms(sensor: str, **given: Any) -> None:
     """Rooms as depth sensors of several kinds see them.
 
@@ -119,14 +73,13 @@ def rooms(sensor: str, **given: Any) -> None:
 
 
 @command.command()
-@_number(
+@options.choice(
     '--noise',
-    type=click.Choice(NOISES),
-    default='measured',
-    help='As measured on real sensors; the textbook formula, correlated over 1.5 pixels or '
+    NOISES,
+    'As measured on real sensors; the textbook formula, correlated over 1.5 pixels or '
     'independent; or none.',
 )
-@room_options
+@_of_rooms
 def kinect(noise: str, **given: Any) -> None:
     """Rooms as a Kinect sees them, with a choice of its noise.
 
@@ -160,21 +113,19 @@ def _write_rooms(
     output: Path,
 ) -> None:
     """Write what a sensor sees in rooms. More than seven parameters: the options of a command."""
-    camera = SENSORS[sensor](sensor_seed).camera
-    camera = resize(camera, width or camera.width, height or camera.height)
-
-    def see(room: Scene, frame: int, room_seed: int) -> Frame:
-        given = {'frame': frame, 'seed': room_seed}
-        if sensor == 'kinect':
-            return simulate_kinect(room, camera, noise=noise, sensor_seed=sensor_seed, **given)
-        return simulate(room, SENSORS[sensor](sensor_seed), camera, **given)
+    camera = _camera(sensor, sensor_seed, width, height)
 
     def seen() -> Iterator[tuple[str, Frame]]:
-        for room_seed in range(seed, seed + scenes):
-            room = SCENES[scene](room_seed, frames)
+        for number in range(seed, seed + scenes):
+            room = SCENES[scene](number, frames)
             for frame in range(frames):
-                name = f'{room_seed:06d}' if frames == 1 else f'{room_seed:06d}_{frame:06d}'
-                yield name, see(room, frame, room_seed)
+                name = f'{number:06d}' if frames == 1 else f'{number:06d}_{frame:06d}'
+                given = {'frame': frame, 'seed': number}
+                if sensor == 'kinect':
+                    given['sensor_seed'] = sensor_seed
+                    yield name, simulate_kinect(room, camera, noise=noise, **given)
+                else:
+                    yield name, simulate(room, SENSORS[sensor](sensor_seed), camera, **given)
 
     truth: list[tuple[str, TruePlane]] = []
     count = scenes * frames
@@ -182,99 +133,84 @@ def _write_rooms(
         write_camera(folder / 'camera.yaml', camera)
         with DepthBagWriter(folder / 'bag', camera) as bag:
             for index, (name, image) in enumerate(options.progress(seen(), count, 'image')):
-                depth = image.depth
-                if depth.dtype != np.uint16:
-                    depth = np.rint(1000 * depth).astype(np.uint16)
-                write_image(folder / 'depth' / f'{name}.png', depth)
-                write_image(folder / 'truth' / f'{name}.png', image.labels)
+                _write_depth(folder, name, image.depth, image.labels)
                 truth += [(name, plane) for plane in image.planes]
                 bag.write(image.depth, 10**9 + round(index * 1e9 / 30))
-        _write_truth(folder, truth)
+        _write_planes(folder / 'planes.csv', truth)
     click.echo(f'{output}: {count} images')
 
 
-_segcomp_options = set_options(40, 'How many; 40 as in the real sets, 10 of them for training.')
-
-
 @command.command()
-@_segcomp_options
-def abw(scenes: int, seed: int, output: Path) -> None:
-    """Polyhedra as the ABW structured-light scanner sees them, in segcomp's files.
-
-    \b
-    OUTPUT/abw.SPLIT.N.range    512x512, 8 bits, 0 = shadow
-    OUTPUT/abw.SPLIT.N.gt-seg   true regions, from 10; 2 = shadow
-    OUTPUT/abw.SPLIT.N.gt-ang   angles between regions that touch
-    OUTPUT/planes.csv           plane of each region, metres, optical frame
-
-    SPLIT is train for the first quarter of the scenes (at most 10), and test for the others.
-    """
-
-    def write(name: Path, split: str, number: int, scene_seed: int) -> Scan:
-        calibration = abw_calibration(number, split)
-        scan = simulate_abw(abw_scene(scene_seed), calibration, scene_seed)
-        write_raster(f'{name}.range', scan.values)
-        return scan
-
-    _write_segcomp_set(output, 'abw', scenes, seed, write)
-
-
-@command.command()
-@_segcomp_options
-def perceptron(scenes: int, seed: int, output: Path) -> None:
-    """Polyhedra as the Perceptron laser scanner sees them, in segcomp's files.
-
-    \b
-    OUTPUT/perc.SPLIT.N          512x512, 12 bits
-    OUTPUT/perc.SPLIT.N.gt-seg   true regions, from 10
-    OUTPUT/perc.SPLIT.N.gt-ang   angles between regions that touch
-    OUTPUT/planes.csv            plane of each region, metres, optical frame
-
-    SPLIT is train for the first quarter of the scenes (at most 10), and test for the others.
-    """
-
-    def write(name: Path, split: str, number: int, scene_seed: int) -> Scan:
-        scan = simulate_perceptron(perceptron_scene(scene_seed), scene_seed)
-        write_perceptron(name, scan.values)
-        return scan
-
-    _write_segcomp_set(output, 'perc', scenes, seed, write)
-
-
-def _write_segcomp_set(
-    output: Path,
+@_sensor
+@click.option('--kind', type=click.Choice([*KINDS, *HARD]), help='Only scenes of this kind.')
+@click.option('--hard', is_flag=True, help='Scenes that are easily confused, of all such kinds.')
+@options.count('--scenes', default=len(KINDS), help='How many; the kinds take turns.')
+@_of_all_sets
+def terrain(
     sensor: str,
+    kind: str | None,
+    hard: bool,
     scenes: int,
     seed: int,
-    write: Callable[[Path, str, int, int], Scan],
+    width: int | None,
+    height: int | None,
+    output: Path,
 ) -> None:
-    """Write images by `write(path, split, number, scene's seed)`, and their ground truth."""
-    training = min(scenes // 4, 10)
-    truth: list[tuple[str, TruePlane]] = []
-    with options.new_folder(output) as folder:
-        for index in options.progress(range(scenes), scenes, 'image'):
-            split, number = ('train', index) if index < training else ('test', index - training)
-            path = folder / f'{sensor}.{split}.{number}'
-            image, planes = ground_truth(write(path, split, number, seed + index))
-            write_segmentation(f'{path}.gt-seg', image)
-            write_angles(f'{path}.gt-ang', region_angles(image, planes))
-            truth += [(path.name, plane) for plane in planes]
-        _write_truth(folder, truth)
-    click.echo(
-        f'{output}: {training} training and {scenes - training} test images, '
-        f'{len(truth) / scenes:.1f} regions each'
-    )
+    """Ground, drops, stairs, ramps, curbs, mirrors and obstacles, from a robot.
+
+    \b
+    OUTPUT/depth/NAME.png      depth, 16 bits, millimetres, 0 = no measurement
+    OUTPUT/truth/NAME.png      0 not judged, 1 ground, 2 obstacle, 3 drop
+    OUTPUT/height/NAME.tiff    metres above the ground below the point
+    OUTPUT/size/NAME.tiff      height of the whole object, depth of the drop, m
+    OUTPUT/crossing/NAME.tiff  depth at which the ray crosses the ground, m
+    OUTPUT/terrain.csv         of each image: kind, up and sensor_height as the
+                               robot knows them (off by 1 degree per axis and
+                               1 cm), stairs
+    OUTPUT/camera.yaml         intrinsics
+
+    The camera is 0.3 to 1.6 m high, and looks down by 0 to 60 degrees.
+    Another width keeps the horizontal field of view. `rangeseg evaluate OUTPUT` compares classes
+    of pixels with the truth.
+    """
+    names = [kind] if kind else list(HARD if hard else KINDS)
+    camera = _camera(sensor, seed, width, height)
+    with (
+        options.new_folder(output) as folder,
+        TerrainTable(folder / 'terrain.csv') as table,
+    ):
+        write_camera(folder / 'camera.yaml', camera)
+        for number in options.progress(range(seed, seed + scenes), scenes, 'image'):
+            scene = terrain_scene(names[number % len(names)], number)
+            frame = simulate_terrain(scene, SENSORS[sensor](number), camera, seed=number)
+            name = f'{number:06d}'
+            _write_depth(folder, name, frame.depth, frame.terrain)
+            for part in ('height', 'size', 'crossing'):
+                write_image(folder / part / f'{name}.tiff', getattr(frame, part))
+            table.write(name, scene.kind, sensor, *stated(scene, number), scene.stairs)
+    click.echo(f'{output}: {scenes} images')
 
 
-def _write_truth(folder: Path, truth: list[tuple[str, TruePlane]]) -> None:
+def _camera(sensor: str, seed: int, width: int | None, height: int | None) -> Camera:
+    """Camera of a sensor of the catalogue, for images of another size where one is given."""
+    camera = SENSORS[sensor](seed).camera
+    return resize(camera, width or camera.width, height or camera.height)
+
+
+def _write_depth(folder: Path, name: str, depth: NDArray, truth: NDArray) -> None:
+    """Write a depth image, of metres as millimetres, and its truth."""
+    if depth.dtype != np.uint16:
+        depth = np.rint(1000 * depth).astype(np.uint16)
+    write_image(folder / 'depth' / f'{name}.png', depth)
+    write_image(folder / 'truth' / f'{name}.png', truth)
+
+
+def _write_planes(path: Path, truth: list[tuple[str, TruePlane]]) -> None:
     """Table of the planes of all images."""
-    with (folder / 'planes.csv').open('w', newline='') as file:
+    with path.open('w', newline='') as file:
         rows = csv.writer(file, lineterminator='\n')
         normal = ('normal_x', 'normal_y', 'normal_z')
         rows.writerow(['image', 'label', 'face', *normal, 'distance', 'count'])
         for image, plane in truth:
             equation = (f'{value:.9g}' for value in (*plane.normal, plane.distance))
             rows.writerow([image, plane.label, plane.face, *equation, plane.count])
-
-
-command.add_command(simulate_terrain.command)

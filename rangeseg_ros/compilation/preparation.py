@@ -19,8 +19,9 @@ from rangeseg_ros.messages.outputs import OUTPUTS
 Report = Callable[[str], None]
 _BEGIN = 'compiling kernels'
 _WIDTH = 30
-# Of frames that have all that is compiled run, see `rehearse`.
-_SIZE = 10
+# Of frames that have all that is compiled run, see `rehearse`. Exact ones take minutes if large:
+# the least that takes the path of large frames.
+_SIZE, _EXACT_SIZE = 10, 5
 
 
 def needs(config: Config) -> tuple[Any, ...]:
@@ -53,16 +54,17 @@ def prepare(
     outputs : collection of str
         Of `OUTPUTS`: what is made of the frames.
     """
+    size = _EXACT_SIZE if config.exact else _SIZE
     with not_ahead():
         try:
             with nothing_compiled():
-                rehearse(config, kinds, outputs, _SIZE)
+                rehearse(config, kinds, outputs, size)
             return
         except NotCompiledError:
             pass
         report(_BEGIN)
         _compile(report, config, kinds, outputs)
-        rehearse(config, kinds, outputs, _SIZE)
+        rehearse(config, kinds, outputs, size)
 
 
 def show(progress: str) -> None:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import csv
 import re
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -63,7 +64,7 @@ class Sample(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Case(ABC):
+class Case:
     """One image of a data set, not yet read.
 
     Attributes
@@ -72,11 +73,18 @@ class Case(ABC):
         Unique in its data set.
     image, truth : Path
         Files of the range image and of the ground truth.
+    read : callable
+        (image, truth) -> Sample.
+    sensor, split : str
+        Of sets that tell them: 'abw' or 'perc', 'train' or 'test'.
     """
 
     name: str
     image: Path
     truth: Path
+    read: Callable[[Path, Path], Sample]
+    sensor: str = ''
+    split: str = ''
 
     def load(self) -> Sample:
         """Read the files.
@@ -87,87 +95,55 @@ class Case(ABC):
             A missing or malformed file, or a truth of another size than the image; the message
             names the file.
         """
-        sample = self._read()
+        sample = self.read(self.image, self.truth)
         sizes = ['x'.join(map(str, a.shape[::-1])) for a in (sample.truth.labels, sample.image)]
         if sizes[0] != sizes[1]:
             raise EvaluationError(f'{self.truth}: truth is {sizes[0]}, its image {sizes[1]}')
         return sample
 
-    @abstractmethod
-    def _read(self) -> Sample:
-        """What the files hold."""
+
+def read_segcomp(image: Path, truth: Path, sensor: str, split: str, number: int) -> Sample:
+    """Image of the ABW or Perceptron set; the ABW calibration depends on split and number."""
+    if sensor == 'abw':
+        values = read_raster(image)
+        with _naming(image):
+            seen = abw_range_image(values, abw_calibration(number, split))
+    else:
+        seen = perceptron_range_image(read_perceptron(image))
+    labels = Truth(read_label_image(truth), None)
+    return Sample(seen, labels, read_angles_beside(truth), {})
 
 
-@dataclass(frozen=True)
-class SegcompCase(Case):
-    """Image of the ABW or Perceptron set, real or simulated.
+def read_depth_case(
+    image: Path,
+    truth: Path,
+    camera: Path,
+    min_pixels: int,
+    planes: Mapping[int, tuple[float, ...]] = MappingProxyType({}),
+) -> Sample:
+    """Depth image with intrinsics, a ROS camera calibration or a text file of fx fy cx cy.
 
-    Attributes
-    ----------
-    sensor : {'abw', 'perc'}
-    split : {'train', 'test'}
-    number : int
-        In its split; the ABW calibration depends on it.
+    Regions of the truth below `min_pixels` do not count; `planes` are those that are known.
     """
-
-    sensor: str = 'abw'
-    split: str = 'test'
-    number: int = 0
-
-    def _read(self) -> Sample:
-        if self.sensor == 'abw':
-            values = read_raster(self.image)
-            with _naming(self.image):
-                image = abw_range_image(values, abw_calibration(self.number, self.split))
-        else:
-            image = perceptron_range_image(read_perceptron(self.image))
-        truth = Truth(read_label_image(self.truth), None)
-        return Sample(image, truth, read_angles_beside(self.truth), {})
+    depth = read_depth(image)
+    with _naming(image):
+        seen = RangeImage.from_depth(depth, _camera(camera, depth.shape))
+    labels = as_truth(read_label_image(truth), min_pixels)
+    return Sample(seen, labels, [], {label: np.array(plane) for label, plane in planes.items()})
 
 
-@dataclass(frozen=True)
-class DepthCase(Case):
-    """Depth image with intrinsics and true regions.
-
-    Attributes
-    ----------
-    camera : Path
-        ROS camera calibration, or a text file of fx fy cx cy.
-    planes : dict
-        Plane of each region, where known.
-    min_pixels : int
-        Smaller regions of the truth do not count.
-    """
-
-    camera: Path = Path()
-    planes: Mapping[int, tuple[float, ...]] = field(default_factory=dict)
-    min_pixels: int = 1
-
-    def _read(self) -> Sample:
-        depth = read_depth(self.image)
-        camera = _camera(self.camera, depth.shape)
-        with _naming(self.image):
-            image = RangeImage.from_depth(depth, camera)
-        truth = as_truth(read_label_image(self.truth), self.min_pixels)
-        planes = {label: np.array(plane) for label, plane in self.planes.items()}
-        return Sample(image, truth, [], planes)
-
-
-@dataclass(frozen=True)
-class ScanCase(Case):
+def read_scan(image: Path, truth: Path) -> Sample:
     """Organised laser scan of the SynPEB kind: x forward, z up, `intensity` >= 10 the plane."""
-
-    def _read(self) -> Sample:
-        fields = read_pcd(self.image)
-        missing = {'x', 'y', 'z', 'intensity'} - fields.keys()
-        if missing:
-            raise PcdError(f'{self.image}: no field {", ".join(sorted(missing))}')
-        # Such scans count their columns from right to left.
-        x, y, z, label = (fields[name][:, ::-1] for name in ('x', 'y', 'z', 'intensity'))
-        image = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))
-        planar = np.isfinite(label) & (label >= FIRST_REGION)
-        labels = np.where(planar, label, 0).astype(np.uint16)
-        return Sample(image, Truth(labels, None), [], {})
+    fields = read_pcd(image)
+    missing = {'x', 'y', 'z', 'intensity'} - fields.keys()
+    if missing:
+        raise PcdError(f'{image}: no field {", ".join(sorted(missing))}')
+    # Such scans count their columns from right to left.
+    x, y, z, label = (fields[name][:, ::-1] for name in ('x', 'y', 'z', 'intensity'))
+    seen = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))
+    planar = np.isfinite(label) & (label >= FIRST_REGION)
+    labels = np.where(planar, label, 0).astype(np.uint16)
+    return Sample(seen, Truth(labels, None), [], {})
 
 
 _SEGCOMP = re.compile(r'(abw|perc)\.(train|test)\.(\d+)')
@@ -199,7 +175,7 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
         _segcomp_cases(folder),
         _depth_cases(folder, least),
         _nested_cases(folder, least),
-        (ScanCase(path.stem, path, path) for path in _sorted(folder, '*.pcd')),
+        (Case(path.stem, path, path, read_scan) for path in _sorted(folder, '*.pcd')),
     ):
         cases = list(layout)
         if cases:
@@ -231,7 +207,9 @@ def _segcomp_cases(folder: Path) -> Iterator[Case]:
             continue
         truth = folder / f'{match[0]}.gt-seg'
         _require(path, truth)
-        yield SegcompCase(match[0], path, truth, match[1], match[2], int(match[3]))
+        sensor, split, number = match.groups()
+        read = partial(read_segcomp, sensor=sensor, split=split, number=int(number))
+        yield Case(match[0], path, truth, read, sensor, split)
 
 
 def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
@@ -239,8 +217,13 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     for path in _sorted(folder, 'depth/*.png'):
         truth = folder / 'truth' / path.name
         _require(path, truth)
-        camera = folder / 'camera.yaml'
-        yield DepthCase(path.stem, path, truth, camera, planes.get(path.stem, {}), min_pixels)
+        read = partial(
+            read_depth_case,
+            camera=folder / 'camera.yaml',
+            min_pixels=min_pixels,
+            planes=planes.get(path.stem, {}),
+        )
+        yield Case(path.stem, path, truth, read)
 
 
 def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
@@ -251,9 +234,8 @@ def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
         if not camera.exists():
             camera = path.with_name('camera.yaml')
         name = path.parent.relative_to(folder).as_posix().replace('/', '_')
-        yield DepthCase(
-            folder.name if name == '.' else name, path, truth, camera, min_pixels=min_pixels
-        )
+        read = partial(read_depth_case, camera=camera, min_pixels=min_pixels)
+        yield Case(folder.name if name == '.' else name, path, truth, read)
 
 
 def _sorted(folder: Path, pattern: str) -> list[Path]:

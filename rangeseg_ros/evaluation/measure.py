@@ -2,31 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from contextlib import suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.digest import code_digest
-from rangeseg_ros.evaluation.datasets import Case, Sample, SegcompCase
+from rangeseg_ros.evaluation.datasets import Case
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.pictures import class_picture
-from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.files import replacing
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.segcomp.files import (
-    MAX_REGIONS,
-    to_segcomp,
-    write_normals,
-    write_segmentation,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +29,8 @@ class Measurement:
         (label, label, degrees) of the truth, where known.
     true_planes, found_planes : dict
         Plane (nx, ny, nz, d) of each label, where known.
-    energy : float
-        Of the labelling.
     timings : dict
         Milliseconds per stage.
-    reason : str
-        Why there is no plane; empty when there is one.
     """
 
     name: str
@@ -56,28 +38,7 @@ class Measurement:
     angles: list[tuple[int, int, float]]
     true_planes: dict[int, list[float]]
     found_planes: dict[int, list[float]]
-    energy: float
     timings: dict[str, float]
-    reason: str = ''
-
-    def to_json(self) -> str:
-        """All fields as JSON."""
-        record = {item.name: getattr(self, item.name) for item in fields(self)}
-        record['overlap'] = {
-            item.name: getattr(self.overlap, item.name).tolist() for item in fields(Overlap)
-        }
-        return json.dumps(record)
-
-    @classmethod
-    def from_json(cls, text: str) -> Measurement:
-        """The inverse of `to_json`."""
-        record = json.loads(text)
-        arrays = {name: np.array(values, np.int64) for name, values in record['overlap'].items()}
-        arrays['pairs'] = arrays['pairs'].reshape(-1, 2)
-        record['overlap'] = Overlap(**arrays)
-        for name in ('true_planes', 'found_planes'):
-            record[name] = {int(label): plane for label, plane in record[name].items()}
-        return cls(**record)
 
 
 @dataclass(frozen=True)
@@ -90,69 +51,34 @@ class Task:
         The image.
     config : Config
         Parameters of the segmenter.
-    cache : Path or None
-        Folder of finished measurements, which are not computed again.
     output : Path or None
-        Folder for <name>_labels.png, <name>_classes.png, and of images of segcomp sets
-        <name>.ms-seg and <name>.ms-nor, unless there are too many regions for these.
+        Folder for <name>_labels.png and <name>_classes.png.
     """
 
     case: Case
     config: Config
-    cache: Path | None = None
     output: Path | None = None
 
     def run(self) -> Measurement:
-        """Segment the image and measure it, or take the measurement from the cache."""
-        if self.cache is None:
-            return self._measure()
-        path = self.cache / f'{self.case.name}-{self._key()}.json'
-        with suppress(OSError, ValueError, KeyError, TypeError):  # none, or a damaged one
-            return Measurement.from_json(path.read_text())
-        measurement = self._measure()
-        with replacing(path) as partial:
-            partial.write_text(measurement.to_json())
-        return measurement
-
-    def pictures(self, folder: Path) -> dict[str, Path]:
-        """Where pictures of the image are left."""
-        kinds = 'labels', 'classes'
-        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}
-
-    def _measure(self) -> Measurement:
+        """Segment the image and measure it."""
         sample = self.case.load()
         result = Segmenter(self.config).segment(corrected(sample.image, self.config))
         overlap = sample.truth.compare(result.labels)
         if self.output:
-            self._save(self.output, sample, result, overlap)
+            paths = self.pictures(self.output)
+            picture = class_picture(sample, result.labels, overlap, classify(overlap, 0.8))
+            write_image(paths['labels'], result.labels)
+            write_image(paths['classes'], picture)
         return Measurement(
             self.case.name,
             overlap,
             [(a, b, degrees) for a, b, degrees in sample.angles],
             {label: [float(x) for x in plane] for label, plane in sample.planes.items()},
             {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
-            float(result.energy),
             result.timings,
-            result.reason,
         )
 
-    def _save(self, folder: Path, sample: Sample, result: Segmentation, overlap: Overlap) -> None:
-        name, labels = self.case.name, result.labels
-        picture = class_picture(sample, labels, overlap, classify(overlap, 0.8))
-        paths = self.pictures(folder)
-        write_image(paths['labels'], labels)
-        write_image(paths['classes'], picture)
-        if isinstance(self.case, SegcompCase) and len(result.planes) <= MAX_REGIONS:
-            image = to_segcomp(labels, ~sample.image.valid)
-            normals = {int(image[labels == p.label][0]): p.normal for p in result.planes}
-            write_segmentation(folder / f'{name}.ms-seg', image)
-            write_normals(folder / f'{name}.ms-nor', normals)
-
-    def _key(self) -> str:
-        """Digest of everything the measurement depends on: code, parameters, files."""
-        digest = hashlib.sha256(code_digest())
-        digest.update(repr((asdict(self.config), self.case)).encode())
-        files = [self.case.image, self.case.truth, *correction_files(self.config)]
-        for path in files:
-            digest.update(path.read_bytes())
-        return digest.hexdigest()[:16]
+    def pictures(self, folder: Path) -> dict[str, Path]:
+        """Where pictures of the image are left."""
+        kinds = 'labels', 'classes'
+        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}

@@ -9,22 +9,13 @@ to associate: HybridBoosted multi-target tracker for crowded scene", CVPR 2009 (
 
 from __future__ import annotations
 
-import time
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Hashable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.overlap import Overlap
-from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.scenes import kinect_room
 
 
 def ids_of_faces(
@@ -131,59 +122,3 @@ def track_figures(frames: Sequence[Mapping[Hashable, Sequence[int]]]) -> dict[st
         'coverage': found / max(visible, 1),
         'track_length': found / max(len(tracks), 1),
     }
-
-
-@dataclass(frozen=True, eq=False)
-class RoomFrame:
-    """Ids on the faces of a simulated room in one frame.
-
-    Attributes
-    ----------
-    planes, surfaces : dict
-        As `ids_of_faces`, by the ids of the planes and of their surfaces; the faces are
-        (room, face).
-    milliseconds : float
-        The tracker took.
-    """
-
-    planes: dict[Hashable, list[int]]
-    surfaces: dict[Hashable, list[int]]
-    milliseconds: float
-
-
-def track_rooms(
-    rooms: Iterable[int], frames: int, speed: int, config: Config
-) -> Iterator[RoomFrame]:
-    """Segment and track what a moving Kinect sees of simulated rooms.
-
-    Parameters
-    ----------
-    rooms : iterable of int
-        Seeds of `kinect_room`.
-    frames : int
-        Number of frames of each room, at 30 Hz.
-    speed : int
-        Times the speed of `camera_motion`: every `speed`-th of its frames is taken.
-    config : Config
-    """
-    segmenter, tracker = Segmenter(config), Tracker(config)
-    for room in rooms:
-        scene = kinect_room(room, frames * speed)
-        tracker.reset()
-        for k in range(frames):
-            view = simulate_kinect(scene, frame=k * speed, seed=room)
-            image = RangeImage.from_depth(view.depth, view.camera)
-            result = segmenter.segment(corrected(image, config))
-            begin = time.perf_counter()
-            stamp = 10**9 + round(k * speed * 1e9 / 30)
-            planes = tracker.track(result.labels, result.planes, stamp)
-            milliseconds = 1000 * (time.perf_counter() - begin)
-            faces = {plane.label: (room, plane.face) for plane in view.planes}
-            by_plane, by_surface = (
-                ids_of_faces(result.labels, ids, view.labels, faces)
-                for ids in (
-                    {plane.label: plane.id for plane in planes},
-                    {plane.label: plane.surface for plane in planes},
-                )
-            )
-            yield RoomFrame(by_plane, by_surface, milliseconds)

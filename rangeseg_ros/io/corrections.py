@@ -9,11 +9,11 @@ from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.io.distortion import read_distortion
-from rangeseg_ros.io.files import kept_while_unchanged
+from rangeseg_ros.io.files import cached_while_unchanged
 from rangeseg_ros.io.images import ImageFileError, read_mask
 
-load_mask = kept_while_unchanged(read_mask)
-load_distortion = kept_while_unchanged(read_distortion)
+load_mask = cached_while_unchanged(read_mask)
+load_distortion = cached_while_unchanged(read_distortion)
 
 
 def corrected(image: RangeImage, config: Config) -> RangeImage:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.extras import load
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.images import ImageFileError, read_depth
 from rangeseg_ros.io.pcd import read_pcd
 from rangeseg_ros.io.ply import read_ply
@@ -148,7 +148,7 @@ def _read_numpy(path: Path) -> NDArray:
 
 def _read_exr(path: Path) -> NDArray[np.float32]:
     try:
-        channels = load('OpenEXR').File(str(path)).channels()
+        channels = import_extra('OpenEXR').File(str(path)).channels()
         # Grey images have Y, renderers write Z or V; others repeat it in R, G and B.
         (name, *_) = [
             name for name in ('Z', 'Y', 'V', 'depth', 'R', *channels) if name in channels

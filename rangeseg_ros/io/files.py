@@ -147,7 +147,7 @@ def clear_abandoned(path: Path) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def kept_while_unchanged(read: Callable[[Path], T]) -> Callable[[Path], T]:
+def cached_while_unchanged(read: Callable[[Path], T]) -> Callable[[Path], T]:
     """Make a function that reads a file keep its results as long as the file does not change."""
 
     @lru_cache(maxsize=4)

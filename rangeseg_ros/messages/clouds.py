@@ -18,30 +18,12 @@ from rangeseg_ros.messages.make import Make
 # One row of `~/planes`: the fields of a Plane.
 PLANE_TYPE = np.dtype(
     [
-        ('x', '<f4'),
-        ('y', '<f4'),
-        ('z', '<f4'),
-        ('normal_x', '<f4'),
-        ('normal_y', '<f4'),
-        ('normal_z', '<f4'),
+        *((name, '<f4') for name in ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z')),
         ('distance', '<f4'),
-        ('label', '<u4'),
-        ('id', '<u4'),
-        ('surface', '<u4'),
-        ('role', '<u4'),
-        ('count', '<u4'),
-        ('rms', '<f4'),
-        ('confidence', '<f4'),
-        ('area', '<f4'),
-        ('length', '<f4'),
-        ('width', '<f4'),
-        ('centre_x', '<f4'),
-        ('centre_y', '<f4'),
-        ('centre_z', '<f4'),
-        ('orientation_x', '<f4'),
-        ('orientation_y', '<f4'),
-        ('orientation_z', '<f4'),
-        ('orientation_w', '<f4'),
+        *((name, '<u4') for name in ('label', 'id', 'surface', 'role', 'count')),
+        *((name, '<f4') for name in ('rms', 'confidence', 'probability', 'area')),
+        *((name, '<f4') for name in ('length', 'width', 'centre_x', 'centre_y', 'centre_z')),
+        *((f'orientation_{axis}', '<f4') for axis in 'xyzw'),
         *((f'covariance_{i}{j}', '<f4') for i, j in combinations_with_replacement('xyzd', 2)),
     ]
 )
@@ -104,11 +86,12 @@ def planes_from_message(cloud: Any) -> NDArray[np.void]:
         `normal_x`, `normal_y`, `normal_z` (unit, towards the sensor), `distance` (metres:
         normal . p + distance = 0), `label`, `id`, `surface` (the same for parts of one plane seen
         apart), `role` (index in `roles.ROLES`, 1 is floor), `count` (pixels), `rms` (metres),
-        `confidence` (0...1), `area` (square metres), `length`, `width`, `centre_x`, `centre_y`,
-        `centre_z` (of the rectangle around the region, metres), `orientation_x`, `orientation_y`,
-        `orientation_z`, `orientation_w` (quaternion of the frame with x along the length and z
-        along the normal), `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of
-        the 4x4 covariance of normal x, y, z and distance d).
+        `confidence` (0...1), `probability` (0...1, to be a plane and no curved surface), `area`
+        (square metres), `length`, `width`, `centre_x`, `centre_y`, `centre_z` (of the rectangle
+        around the region, metres), `orientation_x`, `orientation_y`, `orientation_z`,
+        `orientation_w` (quaternion of the frame with x along the length and z along the normal),
+        `covariance_xx`, `covariance_xy` ... `covariance_dd` (upper triangle of the 4x4 covariance
+        of normal x, y, z and distance d).
 
     Raises
     ------
@@ -168,6 +151,7 @@ def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
                 plane.count,
                 plane.rms,
                 plane.confidence,
+                plane.probability,
                 plane.area,
                 *plane.extents.tolist(),
                 *plane.centre.tolist(),

@@ -3,23 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib import colormaps, rc_context
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from rangeseg_ros.drawing import colours
 
 MAX_BARS, MAX_LINES = 40, 8
 """Planes in the chart of ids, and in those of drift, at most."""
-
-CUT = 5
-"""Times of more than so many medians reach out of their chart."""
 
 # One row per plane and frame.
 SIGHTING = np.dtype(
@@ -81,40 +76,6 @@ def drifts(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
     if len(ids):
         figure.legend(*upper.get_legend_handles_labels(), title='id', loc='outside right upper')
     return _finished(figure, lower, 'seconds')
-
-
-def stage_times(
-    stages: Mapping[str, NDArray[np.float64]], x: NDArray[np.float64], label: str
-) -> str:
-    """Milliseconds of each stage, one on top of the other, over `x` (N,) called `label`."""
-    figure = Figure(figsize=(10, 3.5), layout='constrained')
-    axes = figure.subplots()
-    shades = colormaps['Set2'](range(len(stages)))
-    axes.stackplot(x, *stages.values(), labels=list(stages), colors=shades)
-    axes.set_ylabel('milliseconds')
-    total = np.sum(list(stages.values()), axis=0)
-    # A frame that waited for the compiler or a busy machine would dwarf the others.
-    axes.set_ylim(0, 1.05 * min(total.max(), CUT * np.median(total)))
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    if len(x) > 1:
-        axes.set_xlim(x[0], x[-1])
-    handles, labels = axes.get_legend_handles_labels()
-    figure.legend(handles[::-1], labels[::-1], loc='outside right upper')
-    return _finished(figure, axes, label)
-
-
-def lines(
-    series: Mapping[str, Sequence[float]], x: Sequence[float], labels: tuple[str, str]
-) -> str:
-    """Several series over `x`; `labels` of both axes."""
-    figure = Figure(figsize=(10, 3.5), layout='constrained')
-    axes = figure.subplots()
-    for name, values in series.items():
-        axes.plot(x, values, marker='o', label=name)
-    axes.set_ylim(bottom=0)
-    axes.set_ylabel(labels[1])
-    figure.legend(loc='outside right upper')
-    return _finished(figure, axes, labels[0])
 
 
 def _finished(figure: Figure, axes: Axes, label: str) -> str:

@@ -45,24 +45,20 @@ def page_kind(path: Path) -> str:
     return found[1].decode() if found else ''
 
 
-def spread(pictures: Sequence[Picture]) -> list[Picture]:
+def evenly_spaced(pictures: Sequence[Picture]) -> list[Picture]:
     """At most `MAX_PICTURES`, evenly spaced, the first and the last among them."""
     count = min(len(pictures), MAX_PICTURES)
     chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
     return [pictures[index] for index in chosen]
 
 
-def stage_table(timings: Sequence[Mapping[str, float]]) -> dict[str, NDArray[np.float64]]:
-    """Milliseconds (N,) of each stage in N frames, 0 where a frame has not come to the stage."""
-    names = dict.fromkeys(name for laps in timings for name in laps)
-    return {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
-
-
-def common(
+def shared_values(
     config: Config, timings: Sequence[Mapping[str, float]], reasons: Mapping[str, int]
 ) -> dict[str, Any]:
     """What every page shows: stages with their statistics, reasons, parameters."""
-    stages = stage_table(timings)
+    names = dict.fromkeys(name for laps in timings for name in laps)
+    # 0 where a frame has not come to the stage.
+    stages = {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
     total = {'total': np.sum(list(stages.values()), axis=0)} if stages else {}
     return {
         'stages': [

@@ -8,19 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.tracking.plane_errors import tangents
-from rangeseg_ros.drawing import normals_picture, plan
+from rangeseg_ros.drawing import normals_picture
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import Picture, as_jpeg, common, spread, stage_table, write_page
+from rangeseg_ros.report.page import Picture, as_jpeg, evenly_spaced, shared_values, write_page
 
-# Largest sine of the angle to upright of the planes that define the side view of a map.
-_UPRIGHT = 0.5
 # Frames whose normals are shown: up to twice as many, evenly spaced.
 _NORMALS = 6
 
@@ -84,13 +79,7 @@ class ReplayReport:
             'ids': len(np.unique(sightings['id'])),
         }
 
-    def write(
-        self,
-        path: Path,
-        damage: str = '',
-        planes: Sequence[MapPlane] = (),
-        doubts: Sequence[str] = (),
-    ) -> None:
+    def write(self, path: Path, damage: str = '', doubts: Sequence[str] = ()) -> None:
         """Write the page.
 
         Parameters
@@ -98,14 +87,11 @@ class ReplayReport:
         path : Path
         damage : str
             What of the recording could not be read.
-        planes : sequence of MapPlane
-            The map.
         doubts : sequence of str
             What the planes say against the poses.
         """
         sightings = np.concatenate(self._sightings)
         times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
-        frames = np.arange(self.frames, dtype=float)
         write_page(
             path,
             'replay.html',
@@ -117,40 +103,13 @@ class ReplayReport:
             if self._sensors
             else '',
             **self.figures(),
-            pictures=spread(self._pictures),
+            pictures=evenly_spaced(self._pictures),
             normals=self._normals,
-            map_frame=self.config.map_frame,
-            mapped=len(planes),
-            plans=[(as_jpeg(picture), name) for name, picture in plans(planes)],
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
             drifts=charts.drifts(sightings, times) if len(sightings) else '',
-            cut=charts.CUT,
-            stage_times=charts.stage_times(stage_table(self._timings), frames, 'frame')
-            if self._timings
-            else '',
-            **common(self.config, self._timings, self.reasons),
+            **shared_values(self.config, self._timings, self.reasons),
         )
-
-
-def plans(planes: Sequence[MapPlane]) -> list[tuple[str, NDArray[np.uint8]]]:
-    """Names and pictures of a map: from above, and from a side.
-
-    Without a floor up is unknown, and the first view faces the largest plane.
-    """
-    if not planes:
-        return []
-    by_area = sorted(planes, key=lambda plane: -plane.area)
-    floors = [plane.normal for plane in by_area if plane.role == 'floor']
-    up = floors[0] if floors else by_area[0].normal
-    # Walls are seen edge on, or full face.
-    upright = [plane.normal for plane in by_area if abs(plane.normal @ up) < _UPRIGHT]
-    side = upright[0] if upright else tangents(up[None])[0, 0]
-    side = side - (side @ up) * up
-    side /= np.linalg.norm(side)
-    ahead = np.cross(up, side)
-    name = 'from above' if floors else 'facing the largest plane'
-    return [(name, plan(planes, up, ahead)), ('from a side', plan(planes, side, up))]
 
 
 def write_overview(path: Path, name: str, recordings: Sequence[Mapping[str, Any]]) -> None:

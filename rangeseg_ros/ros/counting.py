@@ -55,7 +55,7 @@ class Losses:
     ----------
     lost : Window
         Lost, as the middleware reports.
-    nonsense : int
+    implausible : int
         Reports with an impossible count, which are ignored: Fast DDS reports 2147483647
         when best-effort messages become smaller after others were lost, besides the true losses.
     unseen : int or None
@@ -66,7 +66,7 @@ class Losses:
 
     def __init__(self) -> None:
         self.lost = Window()
-        self.nonsense = 0
+        self.implausible = 0
         self.unseen: int | None = None
         self._last = time.monotonic()
         self._number: int | None = None
@@ -78,7 +78,7 @@ class Losses:
         if 0 < count <= 1 + FASTEST_CAMERA * (now - self._last):
             self.lost.add(count)
         else:
-            self.nonsense += 1
+            self.implausible += 1
         self._last = now
 
     def arrived(self, number: int | None) -> None:

@@ -162,7 +162,7 @@ class FrameStatistics:
             'frames dropped for newer ones': str(self.dropped.total),
             'frames refused': str(self.refused.total),
             'messages lost by the middleware': str(self.losses.lost.total),
-            'loss reports of impossible size': str(self.losses.nonsense),
+            'loss reports of impossible size': str(self.losses.implausible),
             'messages lost or overwritten, by their numbers': (
                 'unknown' if unseen is None else str(unseen)
             ),

@@ -54,7 +54,7 @@ class LatestReady(Generic[Item]):
                 self._changed.wait(min(left, default=None))
             return None
 
-    def look_again(self) -> None:
+    def recheck(self) -> None:
         """Check again whether items are ready."""
         with self._changed:
             self._changed.notify_all()

@@ -81,7 +81,7 @@ class Pipeline:
         self._settings = settings
         self._statistics = statistics
         self._frames: LatestReady[DepthFrame] = LatestReady(self._delay)
-        self.locator = Locator(node, self._frames.look_again)
+        self.locator = Locator(node, self._frames.recheck)
         self._turns = TicketLock()
         self._beginning = Lock()
         # Of the frame that was begun last.

@@ -10,18 +10,14 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.io.files import replacing
-
 FIRST_REGION = 10
-MAX_REGIONS = 246
-NOISE, SHADOW, EDGE = 1, 2, 3
+EDGE = 3
 SIZE = 512
 
 _MAGIC = 0x59A66A95
@@ -30,7 +26,7 @@ _RANGE_MASK = 4095
 
 
 class SegcompError(ValueError):
-    """A file, or an array to be written, that breaks the segcomp conventions."""
+    """A file that breaks the segcomp conventions."""
 
 
 def read_raster(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
@@ -66,22 +62,6 @@ def read_raster(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     return np.frombuffer(pixels, np.uint8).reshape(height, width).copy()
 
 
-def write_raster(path: str | os.PathLike[str], image: ArrayLike) -> None:
-    """Write an (H, W) uint8 image as an 8-bit Sun raster.
-
-    Raises
-    ------
-    SegcompError
-        An array of another shape or type.
-    """
-    pixels = np.asarray(image)
-    if pixels.ndim != 2 or pixels.dtype != np.uint8:
-        raise SegcompError(f'{path}: a raster is (H, W) uint8, not {pixels.shape} {pixels.dtype}')
-    height, width = pixels.shape
-    header = struct.pack('>I7i', _MAGIC, width, height, 8, width * height, 1, 0, 0)
-    _write(path, header + pixels.tobytes())
-
-
 def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
     """Read a `.gt-seg` or `.ms-seg` raster: 0 none, 1 noise, 2 shadow, 3 edge, regions from 10.
 
@@ -91,51 +71,9 @@ def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
         As `read_raster`, and labels 4..9.
     """
     image = read_raster(path)
-    _check_labels(path, image)
-    return image
-
-
-def write_segmentation(path: str | os.PathLike[str], image: ArrayLike) -> None:
-    """Write a `.gt-seg` or `.ms-seg` raster from (H, W) uint8 labels in segcomp's convention.
-
-    Raises
-    ------
-    SegcompError
-        As `write_raster`, and labels 4..9.
-    """
-    _check_labels(path, np.asarray(image))
-    write_raster(path, image)
-
-
-def to_segcomp(labels: ArrayLike, shadow: ArrayLike | None = None) -> NDArray[np.uint8]:
-    """Convert a label image (0 = none) to segcomp's convention.
-
-    Parameters
-    ----------
-    labels : (H, W) integer
-        0 = no region.
-    shadow : (H, W) bool, optional
-        Pixels without measurement, to become label 2.
-
-    Returns
-    -------
-    (H, W) uint8
-        Regions numbered from 10 in the order of their labels.
-
-    Raises
-    ------
-    SegcompError
-        More than 246 regions.
-    """
-    array = np.asarray(labels)
-    present, index = np.unique(array, return_inverse=True)
-    regions = np.cumsum(present != 0)
-    if regions[-1] > MAX_REGIONS:
-        raise SegcompError(f'{regions[-1]} regions; the segcomp format holds {MAX_REGIONS}')
-    codes = np.where(present != 0, regions + FIRST_REGION - 1, 0).astype(np.uint8)
-    image = codes[index.reshape(array.shape)]
-    if shadow is not None:
-        image[np.asarray(shadow) & (image == 0)] = SHADOW
+    bad = image[(image > EDGE) & (image < FIRST_REGION)]
+    if bad.size:
+        raise SegcompError(f'{path}: label {bad.min()}; 4..9 are not allowed, regions begin at 10')
     return image
 
 
@@ -178,27 +116,6 @@ def read_perceptron(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
     return (values & _RANGE_MASK).astype(np.uint16)
 
 
-def write_perceptron(path: str | os.PathLike[str], values: ArrayLike) -> None:
-    """Write 12-bit range values as a Perceptron image (512 x 512, integer, 0..4095).
-
-    Raises
-    ------
-    SegcompError
-        Another size or type, or values beyond 12 bits.
-    """
-    array = np.asarray(values)
-    if array.shape != (SIZE, SIZE) or array.dtype.kind not in 'iu':
-        raise SegcompError(
-            f'{path}: a Perceptron image is {SIZE}x{SIZE} integers, '
-            f'not {array.shape} {array.dtype}'
-        )
-    if array.min() < 0 or array.max() > _RANGE_MASK:
-        raise SegcompError(f'{path}: Perceptron range values must be in 0..{_RANGE_MASK}')
-    lines = (' '.join(['perceptron', *'x' * (words - 1)]) for words in _PERCEPTRON_WORDS)
-    header = ''.join(f'{line}\n' for line in lines).encode() + b'\x00\x00'
-    _write(path, header + array.astype('>i4').tobytes())
-
-
 class RegionAngle(NamedTuple):
     """Angle between the normals of two adjacent regions of a ground truth, degrees."""
 
@@ -218,12 +135,6 @@ def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
     return [RegionAngle(int(a), int(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
 
 
-def write_angles(path: str | os.PathLike[str], angles: Sequence[RegionAngle]) -> None:
-    """Write a `.gt-ang` file."""
-    lines = [str(len(angles)), *(f'{a} {b} {degrees:.6f}' for a, b, degrees in angles)]
-    _write(path, ('\n'.join(lines) + '\n').encode())
-
-
 def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
     """Read a `.ms-nor` file: a count, then lines `label nx ny nz`.
 
@@ -233,16 +144,6 @@ def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]
         A wrong count or a malformed line.
     """
     return {int(row[0]): np.array(row[1:]) for row in _read_rows(path, 4, integers=1)}
-
-
-def write_normals(path: str | os.PathLike[str], normals: Mapping[int, ArrayLike]) -> None:
-    """Write a `.ms-nor` file from the normal (3,) of each label."""
-    rows = (f'{label} {x:.9f} {y:.9f} {z:.9f}' for label, (x, y, z) in _items(normals))
-    _write(path, ('\n'.join([str(len(normals)), *rows]) + '\n').encode())
-
-
-def _items(normals: Mapping[int, ArrayLike]) -> list[tuple[int, NDArray]]:
-    return [(label, np.asarray(normal, dtype=float)) for label, normal in normals.items()]
 
 
 def _read_rows(path: str | os.PathLike[str], columns: int, integers: int) -> list[list[float]]:
@@ -266,14 +167,3 @@ def _read_rows(path: str | os.PathLike[str], columns: int, integers: int) -> lis
             raise SegcompError(f'{path}: malformed entry {number}: {" ".join(words)[:60]!r}')
         rows.append(row)
     return rows
-
-
-def _check_labels(path: str | os.PathLike[str], image: NDArray) -> None:
-    bad = image[(image > EDGE) & (image < FIRST_REGION)]
-    if bad.size:
-        raise SegcompError(f'{path}: label {bad.min()}; 4..9 are not allowed, regions begin at 10')
-
-
-def _write(path: str | os.PathLike[str], data: bytes) -> None:
-    with replacing(Path(path)) as partial:
-        partial.write_bytes(data)

@@ -11,8 +11,6 @@ A. Hoover et al., "An experimental comparison of range image segmentation algori
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,10 +55,6 @@ class AbwCalibration:
         array = np.asarray(values, dtype=float)
         return np.where(array == 0, np.nan, (array / self.scale + self.offset) * 1e-3)
 
-    def values(self, depth: ArrayLike) -> NDArray[np.float64]:
-        """Range values, not yet rounded, of depths in metres; the inverse of `depth`."""
-        return (np.asarray(depth, dtype=float) * 1e3 - self.offset) * self.scale
-
 
 ABW_FIRST = AbwCalibration(785.410786, 0.773545, 1610.981722)
 ABW_SECOND = AbwCalibration(771.016866, 0.791686, 1586.072821)
@@ -84,62 +78,18 @@ def abw_range_image(values: ArrayLike, calibration: AbwCalibration) -> RangeImag
     return RangeImage.from_depth(calibration.depth(values).astype(np.float32), calibration.camera)
 
 
-class PerceptronRays(NamedTuple):
-    """Rays of the Perceptron's pixels in the optical frame, metres.
-
-    Attributes
-    ----------
-    origins : (512, 512, 3) float64
-        Where the beam leaves the second mirror; no single centre.
-    directions : (512, 512, 3) float64
-        Unit vectors.
-    lead : (512, 512) float64
-        Length of the beam inside the scanner, up to `origins`.
-    """
-
-    origins: NDArray[np.float64]
-    directions: NDArray[np.float64]
-    lead: NDArray[np.float64]
-
-
 # The published program names no unit. With 4096 steps of 0.20236 the range covers 829 units:
 # 8.3 m in centimetres, the ambiguity interval of an 18 MHz modulation, and mirrors 3 and 5.5 cm
 # apart; millimetres would put the mirrors 3 mm from each other.
 _PERCEPTRON_UNIT = 0.01
-_STEP = 0.20236 * _PERCEPTRON_UNIT
+_STEP = 0.20236
 _STANDOFF = 830.3
 
 
-@cache
-def perceptron_rays() -> PerceptronRays:
-    """Rays of the Perceptron laser scanner with its rotating and its nodding mirror."""
-    h1, h2 = 3.0, 5.5
-    gamma = theta = np.pi / 4
-    pixel = np.arange(SIZE)
-    alpha = np.radians(51.65 * (255.5 - pixel) / SIZE)[None, :]
-    beta = np.radians(36.73 * (255.5 - pixel) / SIZE)[:, None]
-    dz = -h1 * (1 - np.cos(alpha)) / np.tan(gamma) + np.zeros_like(beta)
-    dy = dz * np.tan(theta + beta / 2)
-    dx = (h2 + dy) * np.tan(alpha)
-    lead = (dz - h2) + np.hypot(dx, h2 + dy)
-    # Published: x left, y up, z forward.
-    origins = np.stack([-dx, -dy, dz], axis=-1) * _PERCEPTRON_UNIT
-    directions = np.stack(
-        [
-            -np.sin(alpha) + np.zeros_like(beta),
-            -np.cos(alpha) * np.sin(beta),
-            np.cos(alpha) * np.cos(beta),
-        ],
-        axis=-1,
-    )
-    rays = PerceptronRays(origins, directions, lead * _PERCEPTRON_UNIT)
-    for array in rays:
-        array.setflags(write=False)
-    return rays
-
-
 def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
-    """Points of a Perceptron range image.
+    """Points of a range image of the Perceptron laser scanner, which has no single centre.
+
+    Its beams leave a rotating mirror and a nodding one.
 
     Parameters
     ----------
@@ -151,17 +101,22 @@ def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
     (512, 512, 3) float64
         Metres in the optical frame: x right, y down, z forward, the origin at the second mirror.
     """
-    rays = perceptron_rays()
-    length = (np.asarray(values, dtype=float) + _STANDOFF) * _STEP - rays.lead
-    return rays.origins + length[..., None] * rays.directions
-
-
-def perceptron_values(distance: ArrayLike) -> NDArray[np.float64]:
-    """Range values, not yet rounded, of distances along `perceptron_rays`, metres.
-
-    The inverse of `perceptron_points`: point = origin + distance * direction.
-    """
-    return (np.asarray(distance, dtype=float) + perceptron_rays().lead) / _STEP - _STANDOFF
+    h1, h2 = 3.0, 5.5
+    gamma = theta = np.pi / 4
+    pixel = np.arange(SIZE)
+    alpha = np.radians(51.65 * (255.5 - pixel) / SIZE)[None, :]
+    beta = np.radians(36.73 * (255.5 - pixel) / SIZE)[:, None]
+    dz = -h1 * (1 - np.cos(alpha)) / np.tan(gamma)
+    dy = dz * np.tan(theta + beta / 2)
+    dx = (h2 + dy) * np.tan(alpha)
+    # Of the beam inside the scanner.
+    lead = (dz - h2) + np.hypot(dx, h2 + dy)
+    length = (np.asarray(values, dtype=float) + _STANDOFF) * _STEP - lead
+    # Published: x left, y up, z forward.
+    x = -dx - length * np.sin(alpha)
+    y = -dy - length * np.cos(alpha) * np.sin(beta)
+    z = dz + length * np.cos(alpha) * np.cos(beta)
+    return np.stack([x, y, z], axis=-1) * _PERCEPTRON_UNIT
 
 
 def perceptron_range_image(values: ArrayLike) -> RangeImage:

@@ -1,6 +1,6 @@
 """The node for as long as is asked for at 30 Hz: memory over time, and where every frame went.
 
-    python test/node_soak.py --minutes 60 --output soak.json
+    .venv/bin/python .ci/soak.py --minutes 60 --output soak.json
 
 Not a test: it takes its time and all of a computer. Listeners of every output come and go.
 """
@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import random
+import sys
 import time
 from contextlib import ExitStack
 from pathlib import Path
@@ -16,6 +17,7 @@ from pathlib import Path
 PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
 # Before the middleware is loaded.
 os.environ.setdefault('FASTRTPS_DEFAULT_PROFILES_FILE', os.fspath(PROFILE))
+sys.path.insert(0, os.fspath(Path(__file__).parents[1] / 'test'))
 
 from ros_bench import TYPES, Bench, values_of  # noqa: E402
 
