@@ -158,6 +158,7 @@ setup(
             'ezdxf>=1.1',
             'hypothesis>=6.90',
             'mcap>=1.2.1',
+            'pandas>=2.0',
             'pytest>=7.4',
             'pytest-timeout>=2.2',
             'pytest-xdist>=3.3',

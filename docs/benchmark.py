@@ -1,4 +1,4 @@
-"""Measure this package beside other programs on the same frames: python docs/benchmark.py FOLDER...
+"""Measure this package beside other programs: python docs/benchmark.py FOLDER...
 
 Prints the rows of the table in docs/benchmark.md. FOLDER holds depth images with their truth, in a
 layout that `rangeseg evaluate` reads. Programs that are not installed are left out:
@@ -6,7 +6,8 @@ layout that `rangeseg evaluate` reads. Programs that are not installed are left 
     pip install open3d-cpu
 
 OpenCV has findPlanes from 5 on. Every program gets the depth in metres and the camera, and
-returns labels: the time is of all between, on the threads that the program takes by itself.
+returns labels: the time is of all between, on the threads that the program takes by itself, and
+the processor time that of all threads together.
 """
 
 import sys
@@ -21,7 +22,6 @@ from rangeseg_ros.evaluation.datasets import DepthCase, find_cases
 from rangeseg_ros.evaluation.figures import COUNTS
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import overlap_figures
-from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
 
 try:
@@ -73,7 +73,9 @@ def ransac(depth, camera, distance=0.02, trials=300, seed=0):
 def opencv(depth, camera):
     """OpenCV 5: normals by FALS, and findPlanes with the settings tuned on other rooms."""
     height, width = depth.shape
-    matrix = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float32)
+    matrix = np.array(
+        [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float32
+    )
     filled = np.where(depth > 0, depth, np.nan).astype(np.float32)
     points = cv2.depthTo3d(filled, matrix)
     method = cv2.RgbdNormals_RGBD_NORMALS_METHOD_FALS
@@ -116,31 +118,35 @@ def programs():
 
 
 def measure(function, cases):
-    """Mean IoU, planes correct at 0.8, planes, median milliseconds of a frame."""
+    """Mean IoU, planes correct at 0.8, planes, and median times of a frame, milliseconds."""
     overlaps, times = [], []
     for case in cases:
         depth, sample = read_depth(case.image), case.load()
         depth = np.where(sample.image.valid, depth * (0.001 if depth.dtype.kind in 'iu' else 1), 0)
         camera = sample.image.camera
-        function(depth, camera)  # the first one of a program may compile, or read its libraries
-        begin = time.perf_counter()
+        if not overlaps:  # the first call may compile, or load libraries
+            function(depth, camera)
+        begin = time.perf_counter(), time.process_time()
         labels = function(depth, camera)
-        times.append(1000 * (time.perf_counter() - begin))
+        times.append((time.perf_counter() - begin[0], time.process_time() - begin[1]))
         overlaps.append(sample.truth.compare(labels))
     counts = [classify(overlap, 0.8).counts() for overlap in overlaps]
     regions, correct = (sum(count[key] for count in counts) for key in COUNTS[:2])
-    return overlap_figures(overlaps)['mean_iou'], correct, regions, float(np.median(times))
+    milliseconds = 1000 * np.median(times, axis=0)
+    return overlap_figures(overlaps)['mean_iou'], correct, regions, *milliseconds
 
 
 def main():
     """Print a row for each program and folder."""
     for folder in map(Path, sys.argv[1:]):
         cases = [case for case in find_cases(folder) if isinstance(case, DepthCase)]
-        print(f'\n| {folder.name}, {len(cases)} frames | mean IoU | correct at 0.8 | ms |')
-        print('|---|---|---|---|')
+        head = 'mean IoU | correct at 0.8 | ms | processor ms'
+        print(f'\n| {folder.name}, {len(cases)} frames | {head} |')
+        print('|---|---|---|---|---|')
         for name, function in programs().items():
-            iou, correct, regions, milliseconds = measure(function, cases)
-            print(f'| {name} | {iou:.3f} | {correct} of {regions} | {milliseconds:.0f} |')
+            iou, correct, regions, wall, processor = measure(function, cases)
+            row = f'{iou:.3f} | {correct} of {regions} | {wall:.0f} | {processor:.0f}'
+            print(f'| {name} | {row} |', flush=True)
 
 
 if __name__ == '__main__':

@@ -1,10 +1,10 @@
 """Draw the figures of the documents: python docs/figures.py [FOLDER], docs/ by default.
 
-docs/comparison.png: one frame as RANSAC, OpenCV and this package segment it.
+docs/comparison.png: one frame, and the planes of RANSAC, OpenCV and this package.
 docs/terrain.png: depth, planes, and what they are to a robot.
 docs/normals.png: jump edges, and the normals that both methods reconstruct.
-docs/figures/planes.png, uncertainty.png: a Kinect's frame of a room and, on the right, a stereo camera's.
-docs/figures/distortion.png: the fixed pattern of a simulated Kinect, what is learned, what is left.
+docs/figures/planes.png, uncertainty.png: a Kinect's frame of a room and a stereo camera's.
+docs/figures/distortion.png: fixed pattern of a simulated Kinect, what is learned, what is left.
 docs/figures/map.png: the map of a walk through a room, from above and from a side.
 """
 
@@ -53,12 +53,26 @@ def main():
 
 
 def comparison(image):
-    """Depth, RANSAC, OpenCV and this package, from left to right."""
+    """Depth and RANSAC above, OpenCV and this package below."""
     depth = np.where(image.valid, image.points[..., 2], 0)
-    pictures = [in_grey(image)]
-    for program in (benchmark.ransac, benchmark.opencv, benchmark.planes):
-        pictures.append(coloured(image, program(depth, image.camera)))
-    return np.hstack([fitted(picture) for picture in pictures])
+    pictures = [titled(in_grey(image), 'depth')]
+    for title, program in (
+        ('sequential RANSAC', benchmark.ransac),
+        ('OpenCV findPlanes', benchmark.opencv),
+        ('rangeseg_ros', benchmark.planes),
+    ):
+        pictures.append(titled(coloured(image, program(depth, image.camera)), title))
+    return np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:])])
+
+
+def titled(picture, title):
+    """The picture at the common size, with its title in the lower right corner."""
+    picture, font = fitted(picture), cv2.FONT_HERSHEY_SIMPLEX
+    (width, height), below = cv2.getTextSize(title, font, 0.5, 1)
+    left, bottom = WIDTH - width - 12, picture.shape[0] - below - 4
+    picture[bottom - height - 4 :, left - 4 :] = 0
+    cv2.putText(picture, title, (left, bottom), font, 0.5, (255, 255, 255), 1, cv2.LINE_AA)
+    return picture
 
 
 def coloured(image, labels):
