@@ -89,7 +89,8 @@ def run(words):
 
 def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
     pytest.importorskip('pandas')
-    pytest.importorskip('matplotlib').use('agg')
+    pyplot = pytest.importorskip('matplotlib.pyplot')
+    pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/tutorial.md').read_text()
     settings = re.findall(r'^    (up_.*)$', text, re.M)
@@ -99,6 +100,7 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
     (code,) = re.findall(r'```python\n(.*?)```', text, re.S)
     known = {}
     exec(code, known)
+    pyplot.close('all')
     assert known['result'].verdict.ok and known['table'].role.isin(['floor']).any()
     for name in re.findall(r'`((?:planes|recording)/[\w.]+)`', text):
         assert Path(name).is_file(), name
