@@ -17,6 +17,8 @@ from click.testing import CliRunner
 
 from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
+from rangeseg_ros.io.planes import columns
+from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
@@ -130,6 +132,22 @@ def test_recipes_for_data_run(tmp_path, monkeypatch, seen):
         run([*words, '--output', str(number)])  # the last one counts
         (labels,) = Path(str(number)).rglob('*_labels.png')
         assert cv2.imread(str(labels), cv2.IMREAD_UNCHANGED).max() > 5
+
+
+def test_every_column_of_planes_is_explained():
+    text = (ROOT / 'docs/offline.md').read_text()
+    table = text[text.index('## planes.csv') : text.index('## Recordings')]
+    names = re.findall(r'`(\w+)`', table)
+    # Of many alike, as covariance_xx to covariance_dd, the first and the last are named.
+    families = ('covariance_', 'centre_', 'orientation_')
+    for column in columns():
+        assert column in names or column.startswith(families), column
+
+
+def test_every_topic_is_explained():
+    text = (ROOT / 'docs/ros.md').read_text()
+    for topic in (*OUTPUTS, *MAP_OUTPUTS):
+        assert f'`~/{topic}`' in text, topic
 
 
 def test_the_notebook_runs():
