@@ -72,11 +72,13 @@ wheel: $(VENV)/installed
 	  $(BIN)/pip wheel --no-deps --no-build-isolation --wheel-dir dist .
 
 # Who releases it, and where: make release-names MAINTAINER='A Name' EMAIL=name@host URL=https://...
+release-names: CI = $(URL)/actions/workflows/ci.yml
 release-names:
 	test -n '$(MAINTAINER)' -a -n '$(EMAIL)' -a -n '$(URL)'
 	sed -i -e 's|<maintainer .*|<maintainer email="$(EMAIL)">$(MAINTAINER)</maintainer>|' \
 	  -e '/<url /d' -e 's|.*</license>|&\n  <url type="repository">$(URL)</url>|' package.xml
 	sed -i -e '/^repository-code:/d' -e 's|^license: .*|&\nrepository-code: $(URL)|' CITATION.cff
+	sed -i -e '/^\[!\[CI\]/d' -e '1s|$$|\n[![CI]($(CI)/badge.svg)]($(CI))|' README.md
 
 release-check: $(VENV)/installed
 	.ci/release-check $(BIN)/python

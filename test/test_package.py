@@ -61,6 +61,9 @@ def test_the_names_of_a_release_are_in_every_file(tmp_path):
     assert [each.text for each in package.iter('url')] == ['https://b.example/c']
     citation = yaml.safe_load((tmp_path / 'CITATION.cff').read_text())
     assert citation['repository-code'] == 'https://b.example/c'
+    text = (tmp_path / 'README.md').read_text()
+    assert text.count('(https://b.example/c/actions/workflows/ci.yml/badge.svg)') == 1
+    assert text.replace(text.splitlines()[1] + '\n', '') == (ROOT / 'README.md').read_text()
     done = subprocess.run(
         [sys.executable, 'setup.py', '--maintainer', '--maintainer-email', '--url'],
         cwd=tmp_path,
