@@ -13,7 +13,7 @@ from rangeseg_ros.core.sensing.marks import no_marks
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import OUTLIER
 
-_WINDOW = 3
+_WINDOW = 3  # the smallest one
 # The farthest window that a boundary looks at, and rows of means that those of one row need.
 _MARGIN = 2 * _WINDOW - 1
 _ROWS = 2 * _MARGIN
