@@ -14,6 +14,7 @@ import click
 import cv2
 import numpy as np
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from rangeseg_ros import RangeImage
@@ -149,6 +150,13 @@ def test_every_topic_is_explained():
     text = (ROOT / 'docs/ros.md').read_text()
     for topic in (*OUTPUTS, *MAP_OUTPUTS):
         assert f'`~/{topic}`' in text, topic
+
+
+def test_settings_of_nav2_are_yaml_and_name_topics():
+    for text in re.findall(r'```yaml\n(.*?)```', (ROOT / 'docs/navigation.md').read_text(), re.S):
+        assert yaml.safe_load(text)
+        topics = re.findall(r'/segment_planes/(\w+)', text)
+        assert topics and set(topics) <= set(OUTPUTS)
 
 
 def test_the_notebook_runs():
