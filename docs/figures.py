@@ -15,14 +15,14 @@ import benchmark
 import cv2
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 
 from rangeseg_ros import Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.calibration.calibrate import calibrate
 from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
-from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.report.replay import plans
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
@@ -91,6 +91,13 @@ def in_colour(result):
     return overlay(result.image.inverse, result.labels, result.planes)
 
 
+def without_plane(field, known):
+    """A field (H, W) less its least-squares plane over the known pixels: that part is free."""
+    v, u = np.indices(field.shape)
+    terms = np.stack([u, v, np.ones(field.shape)], axis=2)
+    return field - terms @ np.linalg.lstsq(terms[known], field[known], rcond=None)[0]
+
+
 def normals(image):
     """Jump edges, and the normals of methods normals and planes."""
     results = [Segmenter(Config(method=name)).segment(image) for name in METHODS]
@@ -155,12 +162,18 @@ def room_map(scene, seed):
         image = RangeImage.from_depth(view.depth, camera)
         pose = Transform(poses[k].rotation, poses[k].position)
         sequence.segment(image, k * 10**9 // 30, poses[k].rotation.T @ (0, 0, 1), pose)
-    pictures = [picture for _, picture in plans(sequence.map.planes)]
-    height = max(len(picture) for picture in pictures)
-    padded = [
-        np.pad(p, ((0, height - len(p)), (0, 0), (0, 0)), constant_values=255) for p in pictures
-    ]
-    return cv2.resize(np.hstack(padded), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    figure = Figure(figsize=(9, 4), layout='constrained')
+    canvas = FigureCanvasAgg(figure)
+    # From above, and from a side: what is nearer covers the rest, what faces away is left out.
+    for axes, (x, y, depth) in zip(figure.subplots(1, 2), ((0, 1, 2), (0, 2, 1)), strict=True):
+        facing = [plane for plane in sequence.map.planes if plane.normal[depth] > 0]
+        for plane in sorted(facing, key=lambda plane: plane.centroid[depth]):
+            for ring, *_ in plane.outline.parts:
+                axes.fill(ring[:, x], ring[:, y], color=colours([plane.id])[0] / 255)
+        axes.set_aspect('equal')
+        axes.grid()
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
 def frame(sensor, scene, seed):
