@@ -196,7 +196,7 @@ def test_functions_that_the_architecture_names_are_where_it_says():
 def test_the_table_of_constants_is_that_of_the_code():
     """Those that decide results are in the table, the others have a comment."""
     text = (ROOT / 'docs/method.md').read_text()
-    # Several of one module and one reason are in one row: names with commas, values with semicolons.
+    # A row may have several of one module: names with commas, values with semicolons.
     rows = re.findall(r'^\| `([\w/]+)` \| (`.+?`) \| (.*?) \| [ad] \| .+? \|.*\|$', text, re.M)
     assert len(rows) == text[text.index('<!-- const') : text.index('<!-- /const')].count('\n') - 3
     shown = {
