@@ -10,7 +10,7 @@ SYSTEM_ROS := $(shell $(PYTHON) -c 'import rclpy' 2>/dev/null && echo --system-s
 # Most tests keep one core busy. All tests of a file run in the same process.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile
 
-.PHONY: test quick mutants ablate demo demo-ros lint docs wheel release-check clean
+.PHONY: test quick mutants ablate demo demo-ros lint docs wheel release-names release-check clean
 
 test: $(VENV)/installed
 	$(PYTEST)
@@ -70,6 +70,15 @@ wheel: $(VENV)/installed
 	$(BIN)/pip install --quiet setuptools
 	RANGESEG_WHEEL=$(CPU) NUMBA_CPU_NAME=$(CPU) NUMBA_CPU_FEATURES= \
 	  $(BIN)/pip wheel --no-deps --no-build-isolation --wheel-dir dist .
+
+# Who releases it, and where: make release-names MAINTAINER='A Name' EMAIL=name@host URL=https://...
+release-names: CI = $(URL)/actions/workflows/ci.yml
+release-names:
+	test -n '$(MAINTAINER)' -a -n '$(EMAIL)' -a -n '$(URL)'
+	sed -i -e 's|<maintainer .*|<maintainer email="$(EMAIL)">$(MAINTAINER)</maintainer>|' \
+	  -e '/<url /d' -e 's|.*</license>|&\n  <url type="repository">$(URL)</url>|' package.xml
+	sed -i -e '/^repository-code:/d' -e 's|^license: .*|&\nrepository-code: $(URL)|' CITATION.cff
+	sed -i -e '/^\[!\[CI\]/d' -e '1s|$$|\n[![CI]($(CI)/badge.svg)]($(CI))|' README.md
 
 release-check: $(VENV)/installed
 	.ci/release-check $(BIN)/python

@@ -8,14 +8,18 @@ from contextlib import suppress
 from glob import glob
 from importlib import metadata
 from pathlib import Path
+from xml.etree import ElementTree
 
 from setuptools import find_packages, setup
 from setuptools.command.install import install
 
 package_name = 'rangeseg_ros'
 share = f'share/{package_name}'
-# No address, as the project has none yet: `url` and `project_urls` belong beside the version here,
-# and <url> in package.xml, once it is published.
+# Beside the sources: for symlinks colcon runs one to this file, in a folder without them.
+sources = Path(__file__).resolve().parent
+# Who maintains it, and where it is: `make release-names` writes them there.
+package = ElementTree.parse(sources / 'package.xml').getroot()
+maintainer = package.find('maintainer')
 (version,) = re.findall(
     r"^__version__ = '(.+)'$", Path(package_name, '__init__.py').read_text('utf-8'), re.MULTILINE
 )
@@ -99,13 +103,13 @@ setup(
     name=package_name,
     version=version,
     description='Planar segmentation of range images by multi-label graph cuts, for ROS 2',
-    # Beside the sources: for symlinks colcon runs one to this file, in a folder without it.
-    long_description=Path(__file__).resolve().with_name('README.md').read_text(encoding='utf-8'),
+    long_description=(sources / 'README.md').read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
-    author='rangeseg_ros maintainers',
-    author_email='rangeseg-ros@example.org',
-    maintainer='rangeseg_ros maintainers',
-    maintainer_email='rangeseg-ros@example.org',
+    author=maintainer.text,
+    author_email=maintainer.get('email'),
+    maintainer=maintainer.text,
+    maintainer_email=maintainer.get('email'),
+    url=package.findtext('url', ''),
     license='GPL-3.0-or-later',
     keywords=['ROS', 'depth image', 'range image', 'plane segmentation', 'graph cuts'],
     classifiers=[
@@ -158,6 +162,7 @@ setup(
             'ezdxf>=1.1',
             'hypothesis>=6.90',
             'mcap>=1.2.1',
+            'pandas>=2.0',
             'pytest>=7.4',
             'pytest-timeout>=2.2',
             'pytest-xdist>=3.3',

@@ -16,6 +16,7 @@ def on_files(files, config):
     """Add the pages, their links as seen from docs/."""
     for source, page in PAGES.items():
         text = (ROOT / source).read_text(encoding='utf-8')
+        text = re.sub(r'^\[!\[.*\n', '', text, flags=re.M)  # badges come from the network
         text = re.sub(r'\]\((?:docs/)?', '](', text)
         text = re.sub(r'\[([^]]+)\]\((?:LICENSE|CITATION.cff|CHANGELOG.rst)\)', r'\1', text)
         for other, name in PAGES.items():

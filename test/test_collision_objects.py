@@ -126,9 +126,3 @@ def test_the_floor_becomes_a_plane(example, room):
     )
     example['CollisionObjects'].on_planes(scene, empty)
     assert not scene
-
-
-def test_the_readme_shows_the_example():
-    source = (REPOSITORY / 'examples' / 'collision_objects.py').read_text()
-    shown = source[source.index('def mesh_of') : source.index('\n\n\nclass ')]
-    assert shown in (REPOSITORY / 'docs/ros.md').read_text()

@@ -61,12 +61,13 @@ def test_images(kind, depth, tmp_path):
     )
 
 
-@pytest.mark.parametrize('kind', ['pcd', 'binary.ply', 'ascii.ply', 'unsized.ply'])
+@pytest.mark.parametrize('kind', ['pcd', 'unsized.pcd', 'binary.ply', 'ascii.ply', 'unsized.ply'])
 def test_organised_clouds(kind, depth, tmp_path):
     points = RangeImage.from_depth(depth, CAMERA).points
     path = tmp_path / f'cloud.{kind}'
-    if kind == 'pcd':
-        head = 'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 64\nHEIGHT 48\nDATA binary\n'
+    if kind.endswith('pcd'):
+        size = 'WIDTH 3072\nHEIGHT 1' if 'unsized' in kind else 'WIDTH 64\nHEIGHT 48'
+        head = f'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\n{size}\nDATA binary\n'
         path.write_bytes(head.encode() + points.tobytes())
     else:
         write_ply(path, points, binary='ascii' not in kind, size='unsized' not in kind)
@@ -123,7 +124,7 @@ def test_intrinsics_of_open3d(tmp_path):
     k = [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]  # by columns
     flat = {'width': 64, 'height': 48, 'intrinsic_matrix': k}
     for content in (flat, {'class_name': 'PinholeCameraParameters', 'intrinsic': flat}):
-        (tmp_path / 'camera.json').write_text(json.dumps(content))
+        (tmp_path / 'camera.json').write_text(json.dumps(content, indent='\t'))
         assert read_camera(tmp_path / 'camera.json') == Camera(64, 48, 60, 61, 31.5, 23.5)
     (tmp_path / 'camera.json').write_text(json.dumps({'intrinsic_matrix': k}))
     with pytest.raises(ValueError, match=r'Open3D: .*width'):

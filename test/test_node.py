@@ -126,11 +126,8 @@ def test_organised_cloud(node, expected, axes):
     assert np.mean((found > 0) == (expected > 0)) > 0.99
 
 
-def test_the_example_of_the_readme_reads_the_planes(bench, tmp_path):
+def test_the_example_reads_the_planes(bench, tmp_path):
     example = REPOSITORY / 'examples' / 'print_planes.py'
-    source = example.read_text()
-    shown = source[source.index('class ') : source.index('\n\n\nif __name__')]
-    assert shown in (REPOSITORY / 'docs/ros.md').read_text()
     printed = tmp_path / 'printed'
     with printed.open('w') as errors:
         run = subprocess.Popen([sys.executable, example], stderr=errors)

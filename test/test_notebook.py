@@ -48,7 +48,8 @@ def test_points_need_no_camera(seen, result):
 def test_texts_are_short(seen, result):
     for thing in (result, result.planes[0], result.image, Segmenter(Config(noise=0.001))):
         assert 10 < len(repr(thing)) < 200
-    assert f'{len(result.planes)} planes' in repr(result)
+    walls = sum(plane.role == 'wall' for plane in result.planes)
+    assert f'{len(result.planes)} planes (' in repr(result) and f'wall {walls}' in repr(result)
     assert 'noise=0.001' in repr(Segmenter(Config(noise=0.001)))
     assert 'default' in repr(Segmenter())
     assert 'nothing' in repr(RangeImage.from_depth(np.zeros((480, 640)), seen.camera))

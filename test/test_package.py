@@ -48,6 +48,32 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         assert aliases.get(name, name) in keys
 
 
+@pytest.mark.skipif(not shutil.which('make'), reason='make is not installed')
+def test_the_names_of_a_release_are_in_every_file(tmp_path):
+    for name in ('Makefile', 'package.xml', 'CITATION.cff', 'setup.py', 'README.md'):
+        shutil.copy(ROOT / name, tmp_path)
+    (tmp_path / 'rangeseg_ros').mkdir()
+    shutil.copy(ROOT / 'rangeseg_ros/__init__.py', tmp_path / 'rangeseg_ros')
+    names = 'MAINTAINER=A Name', 'EMAIL=a@b.example', 'URL=https://b.example/c'
+    for _ in range(2):
+        subprocess.run(['make', '-C', tmp_path, 'release-names', *names], check=True)
+    package = ElementTree.parse(tmp_path / 'package.xml').getroot()
+    assert [each.text for each in package.iter('url')] == ['https://b.example/c']
+    citation = yaml.safe_load((tmp_path / 'CITATION.cff').read_text())
+    assert citation['repository-code'] == 'https://b.example/c'
+    text = (tmp_path / 'README.md').read_text()
+    assert text.count('(https://b.example/c/actions/workflows/ci.yml/badge.svg)') == 1
+    assert text.replace(text.splitlines()[1] + '\n', '') == (ROOT / 'README.md').read_text()
+    done = subprocess.run(
+        [sys.executable, 'setup.py', '--maintainer', '--maintainer-email', '--url'],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.splitlines()[-3:] == ['A Name', 'a@b.example', 'https://b.example/c']
+
+
 def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
     extras = setup_arguments['extras_require']
     packages = {'rclpy': 'ros-jazzy-rclpy'}

@@ -20,7 +20,7 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.bag_writer import BagWriter
-from rangeseg_ros.io.message_types import make_rosbags, message_types
+from rangeseg_ros.io.message_types import is_rosbag1, make_rosbags, message_types
 from rangeseg_ros.io.recordings import BagError, Recording
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.motion import ODOMETRY, odometry_message
@@ -164,7 +164,7 @@ class ResultBag:
 def open_source(path: Path) -> Recording:
     """Open a recording to copy from; BagError unless it is a whole rosbag2."""
     try:
-        if path.suffix == '.bag':
+        if is_rosbag1(path):
             raise BagError('ROS 1')
         source = Recording(path)
         if not source.connections:

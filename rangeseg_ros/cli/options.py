@@ -48,6 +48,10 @@ class Finite(click.FloatRange):
             self.fail(f'{number} is not finite.', param, ctx)
         return number
 
+    def _describe_range(self) -> str:
+        """Nothing in the help where any number is taken; click writes x<=None there."""
+        return '' if self.min is None and self.max is None else super()._describe_range()
+
 
 FILE = _RegularFile(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -108,11 +109,11 @@ class Segmentation:
         height, width = self.labels.shape
         if not self.planes:
             return f'<Segmentation {width}x{height}: no plane: {self.reason}>'
-        names = (f'{plane.id} {plane.role}'.strip() for plane in self.planes[:6])
-        more = ', ...' if len(self.planes) > 6 else ''
+        roles = Counter(plane.role for plane in self.planes if plane.role).most_common()
+        named = ', '.join(f'{role} {count}' for role, count in roles)
         share = np.count_nonzero(self.labels) / self.labels.size
-        found = f'{len(self.planes)} planes ({", ".join(names)}{more}) over {share:.0%}'
-        return f'<Segmentation {width}x{height}: {found}>'
+        found = f'{len(self.planes)} planes' + (f' ({named})' if named else '')
+        return f'<Segmentation {width}x{height}: {found}, {share:.0%} of the pixels>'
 
     def _repr_html_(self) -> str:
         return str(_notebook().to_html(self))

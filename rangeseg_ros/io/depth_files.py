@@ -14,7 +14,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.images import ImageFileError, read_depth
 from rangeseg_ros.io.pcd import read_pcd
-from rangeseg_ros.io.ply import read_ply
+from rangeseg_ros.io.ply import organised, read_ply
 
 CLOUDS = ('.pcd', '.ply')
 SUFFIXES = ('.png', '.tif', '.tiff', '.exr', '.npy', '.npz', *CLOUDS)
@@ -71,6 +71,8 @@ def read_frame(path: Path, intrinsics: Intrinsics, scale: float | None = None) -
         if suffix == '.pcd':
             fields = read_pcd(path)
             array = np.stack([fields[axis].astype(np.float32) for axis in 'xyz'], axis=-1)
+            if array.shape[0] == 1:
+                array = organised(array[0], known, path)
         elif suffix == '.ply':
             array = read_ply(path, known)
         elif suffix in ('.npy', '.npz'):

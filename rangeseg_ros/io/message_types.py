@@ -37,6 +37,11 @@ def make_rosbags(kind: str, **fields: Any) -> Any:
     return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
 
 
+def is_rosbag1(path: Path) -> bool:
+    """Whether it is a bag of ROS 1, and no folder of a rosbag2 that is called *.bag."""
+    return path.suffix == '.bag' and not path.is_dir()
+
+
 def deserialized(
     path: Path, records: Iterator[Record | Lost], topics: Collection[str]
 ) -> Iterator[tuple[str, int, Any]]:
@@ -45,7 +50,7 @@ def deserialized(
     A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
     """
     deserialize: Callable[[bytes, str], Any] = message_types(Stores.ROS2_JAZZY).deserialize_cdr
-    if path.suffix == '.bag':
+    if is_rosbag1(path):
         deserialize = message_types(Stores.ROS1_NOETIC).deserialize_ros1
     for record in records:
         if record.topic not in topics:

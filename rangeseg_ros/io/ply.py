@@ -18,7 +18,7 @@ _SIZES = ('width', 'num_cols', 'cols'), ('height', 'num_rows', 'rows')
 
 
 class PlyError(ValueError):
-    """A file that is no readable PLY file of an organised cloud."""
+    """A file that is no readable PLY file, or no organised cloud."""
 
 
 def read_ply(path: Path, shape: tuple[int, int] | None = None) -> NDArray[np.floating]:
@@ -68,6 +68,16 @@ def read_ply(path: Path, shape: tuple[int, int] | None = None) -> NDArray[np.flo
     said = [re.search(rf'\b(?:{"|".join(words)})\s+(\d+)', header) for words in _SIZES]
     if said[0] and said[1]:
         shape = int(said[1][1]), int(said[0][1])
-    if shape is None or count != shape[0] * shape[1]:
-        raise PlyError(f'{path}: {count} points, not an organised cloud of known width and height')
+    return organised(points, shape, path)
+
+
+def organised(
+    points: NDArray[np.floating], shape: tuple[int, int] | None, path: Path
+) -> NDArray[np.floating]:
+    """Points (N, 3) of a file as (H, W, 3); PlyError unless N is H x W of a `shape` (H, W)."""
+    if shape is None or len(points) != shape[0] * shape[1]:
+        raise PlyError(
+            f'{path}: {len(points)} points, not an organised cloud of known width and height '
+            '(--camera tells them where no point was left out)'
+        )
     return points.reshape(*shape, 3)

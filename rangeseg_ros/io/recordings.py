@@ -27,7 +27,7 @@ from rangeseg_ros.io.bag_formats import (
     file_records,
 )
 from rangeseg_ros.io.files import natural_order
-from rangeseg_ros.io.message_types import deserialized
+from rangeseg_ros.io.message_types import deserialized, is_rosbag1
 from rangeseg_ros.io.yaml_files import LARGEST
 
 
@@ -91,7 +91,7 @@ class Recording:
         self.connections: list[Any] = []
         self.damage = ''
         check_files(path)
-        self._reader: Any = rosbag1.Reader(path) if path.suffix == '.bag' else None
+        self._reader: Any = rosbag1.Reader(path) if is_rosbag1(path) else None
         try:
             self._reader = self._reader or _Reader(path)
             self._reader.open()

@@ -1,7 +1,8 @@
-"""YAML files that people write: small, and not made to be read for ever."""
+"""YAML and JSON files that people write: small, and not made to be read for ever."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ class YamlError(ValueError):
 
 
 def read_yaml(path: Path) -> Any:
-    """Content of a YAML file.
+    """Content of a YAML file, or of a JSON file that is called *.json.
 
     Raises
     ------
@@ -24,13 +25,15 @@ def read_yaml(path: Path) -> Any:
         A missing file or one that cannot be read; no YAML; one that is too large, also by its
         aliases, too deep or endless.
     """
+    # JSON may be indented by tabs, YAML may not.
+    parse, kind = (json.loads, 'JSON') if path.suffix == '.json' else (yaml.safe_load, 'YAML')
     try:
         size = path.stat().st_size
         if not path.is_file():
             raise YamlError(f'{path}: not a regular file')
         if size > LARGEST:
             raise YamlError(f'{path}: too large for such a file')
-        content = yaml.safe_load(path.read_text())
+        content = parse(path.read_text())
         if _size(content, {}) > LARGEST:
             raise YamlError(f'{path}: too large for such a file')
     except OSError as error:
@@ -41,7 +44,7 @@ def read_yaml(path: Path) -> Any:
         raise
     # Not of YAML alone: dates and numbers raise errors of Python.
     except (ValueError, OverflowError, yaml.YAMLError):
-        raise YamlError(f'{path}: not a YAML file') from None
+        raise YamlError(f'{path}: not a {kind} file') from None
     return content
 
 

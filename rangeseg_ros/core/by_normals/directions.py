@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import PLATONIC_COUNTS, check_directions
 
-_EQUATOR = 1e-9
+_EQUATOR = 1e-9  # rounding
 
 
 @lru_cache(maxsize=8)

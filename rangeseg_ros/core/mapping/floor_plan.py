@@ -20,7 +20,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
 
-_ROUNDS = 5
+_ROUNDS = 5  # until the direction of up settles
 
 
 class Up(NamedTuple):

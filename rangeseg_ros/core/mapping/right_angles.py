@@ -17,7 +17,7 @@ from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.significance import chi2_quantile
 
-_ROUNDS = 3
+_ROUNDS = 3  # until the azimuth of a group settles
 
 
 class Squared(NamedTuple):

@@ -17,7 +17,7 @@ from numba import njit
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
-SIZE = 13
+SIZE = 13  # of the vector of sums
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
 """Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
 NO_PIXEL = (0.0,) * (CHI2 + 1)
