@@ -64,8 +64,8 @@ def _basis(
 ) -> NDArray[np.float64]:
     """(N, M) Chebyshev polynomials of both coordinates."""
     v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
-    basis: NDArray[np.float64] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
-    return basis
+    basis = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis.astype(np.float64, copy=False)
 
 
 def _between(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
