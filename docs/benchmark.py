@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 
 from rangeseg_ros import RangeImage, segment
-from rangeseg_ros.evaluation.datasets import DepthCase, find_cases
+from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import COUNTS
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import overlap_figures
@@ -30,6 +30,10 @@ except ImportError:
     open3d = None
 
 LEAST = 1000  # pixels of a plane, for every program
+
+
+# Files of depth images, as opposed to clouds and to those of the SegComp sets.
+DEPTH = {'.png', '.tif', '.tiff', '.exr'}
 
 
 def planes(depth, camera):
@@ -139,7 +143,7 @@ def measure(function, cases):
 def main():
     """Print a row for each program and folder."""
     for folder in map(Path, sys.argv[1:]):
-        cases = [case for case in find_cases(folder) if isinstance(case, DepthCase)]
+        cases = [case for case in find_cases(folder) if case.image.suffix in DEPTH]
         head = 'mean IoU | correct at 0.8 | ms | processor ms'
         print(f'\n| {folder.name}, {len(cases)} frames | {head} |')
         print('|---|---|---|---|---|')
