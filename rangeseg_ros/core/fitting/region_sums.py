@@ -229,12 +229,18 @@ def _accumulate(
                     continue
                 variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
                 plane, moments = theta[label], blocks.moments[bi, bj]
+                limit = OUTLIER**2 * variance
                 # No pixel is farther off than all together.
-                all_explained = (plane[0] == 0 and plane[1] == 0 and plane[2] == 0) or (
-                    squares_left(moments, plane) <= OUTLIER**2 * variance
-                )
+                explained = not plane.any() or squares_left(moments, plane) <= limit
+                if central and not explained:
+                    explained = True
+                    for i in range(bi * BLOCK, bottom):
+                        for j in range(bj * BLOCK, right):
+                            ray, y = ray_of(rays, pinhole, i, j), float(inverse[i, j])
+                            left = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
+                            explained &= (left * left <= limit) | (y == 0)
                 # Rays of a cloud are not of one length along any axis: their sums are not known.
-                if central and all_explained:
+                if central and explained:
                     record = cells[_cell_of(layout, label, bi, bj)]
                     middle = (bi * BLOCK + bottom - 1) / 2, (bj * BLOCK + right - 1) / 2
                     _add_block(record, moments, squared, sensor, axis, middle)
