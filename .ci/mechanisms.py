@@ -106,8 +106,6 @@ MECHANISMS = (
     Mechanism('distortion measured, not one sd of the noise', _DISTORTION,
               _sensor(distortion=lambda found, _: found.noise,
                       range_distortion=lambda found, _: found.range_noise)),
-    Mechanism('bound of the distortion', 'fitting/noise.py:_bounded',
-              {'fitting.noise._bounded': _unchanged}),
     Mechanism('correlation of the noise measured, not stated', _CORRELATION,
               _stated('white', 'correlation')),
     Mechanism('noise is correlated', f'{_CORRELATION} sensing/sensor.py:correlated_residuals',

@@ -40,7 +40,7 @@ from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
 from rangeseg_ros.core.sensing.verdict import Cells
-from rangeseg_ros.core.significance import CERTAIN, SAMPLES, chi2_quantile
+from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13
 """Chi-squared of 13 degrees of freedom over its mean: what is rougher is no part of a plane."""
@@ -107,7 +107,7 @@ def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorMo
     shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
     within = list(np.array([quantile, *nested.within]) / shares)
     total, white, width = _random(within, nested.between, nested.filled)
-    distortion = _bounded(nested.distortion, noise.times(total), np.median(coarse.squared))
+    distortion = nested.distortion
     # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
     # blocks hide nothing of it.
     turned = np.sqrt(noise.tilt * (total if way == BOTH else 1.0)) * np.array(way)
@@ -207,18 +207,6 @@ def _flat_blocks(
             limit = ROUGH * level[i, j] * max(count - 3, 1.0)
             flat[i, j] = (count >= 6) & (blocks.residual[i, j] < limit)
     return level, flat
-
-
-def _bounded(distortion: Errors, noise: Errors, squared: float) -> Errors:
-    """The distortion of a sensor, at most `CERTAIN` standard deviations of its noise.
-
-    What bends all surfaces of an image by more is their own shape: of 24 sensors that were looked
-    at none is off by more than 3.4.
-    """
-    level = np.array([squared])
-    most = CERTAIN**2 * variances(noise._replace(tilt=0.0), level, level)[0]
-    shown = variances(distortion, level, level)[0]
-    return distortion.times(min(most / shown, 1.0))
 
 
 def _random(within: list[float], between: float, filled: float) -> tuple[float, float, float]:
