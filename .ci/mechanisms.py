@@ -88,7 +88,7 @@ def _near_first_plane(original: Any) -> Any:
     return near
 
 
-_DISTORTION = 'fitting/nested.py fitting/noise.py:_bounded'
+_DISTORTION = 'fitting/nested.py'
 _CORRELATION = 'fitting/noise.py:_random,_white_and_correlated'
 _TURNING = 'fitting/errors.py:ByTurn,by_turn,_by_turn,turning'
 _NOISE = ('noise', 'nested', 'errors', 'scale', 'alike', 'quantisation')
