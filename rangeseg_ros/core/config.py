@@ -119,7 +119,7 @@ class Config:
     min_pixels: int = option(
         0, 'smallest plane, pixels; 0 follows the size of the image: 300 of VGA', 0, 100000000
     )
-    # Errors of the sensor, by default those of a Kinect: noise of 0.45, distortion of half a step of
+    # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
     # its disparity, of which the quantisation is new in every pixel.
     noise: float = option(
         0.0013,
