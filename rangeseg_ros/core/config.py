@@ -65,8 +65,7 @@ class Config:
     )
     edge_step: float = option(
         0.0,
-        'jump_edges plane: smallest jump of the inverse range, 1/m; 0 follows the noise of the '
-        'sensor: about 0.0065 for a Kinect, 26 mm at 2 m',
+        'smallest jump of the inverse range, 1/m; 0 follows the noise (Kinect: 0.0065)',
         0.0,
         10.0,
     )
@@ -76,24 +75,13 @@ class Config:
         choices=('uniform', 'distance'),
     )
     smoothness: float = option(
-        130.0,
-        'method normals: lambda of eq. 5.3, against degrees; the thesis uses 55',
-        0.0,
-        10000.0,
+        130.0, 'method normals: lambda of eq. 5.3, against degrees; thesis: 55', 0.0, 10000.0
     )
     plane_smoothness: float = option(
-        1.2,
-        'method planes: lambda of eq. 5.3, against half the squares of residuals in standard '
-        'deviations, for each pixel whose noise agrees',
-        0.0,
-        10000.0,
+        1.2, 'method planes: lambda of eq. 5.3, against half the squared residuals', 0.0, 10000.0
     )
     plane_probability: float = option(
-        0.3,
-        'method planes: a region is a plane from this probability on, and otherwise a curved '
-        'surface; 0 makes planes of all',
-        0.0,
-        1.0,
+        0.3, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0
     )
     plane_prior: float = option(
         0.5, 'share of planes among the regions, before their bend is looked at', 0.001, 0.999
@@ -128,10 +116,11 @@ class Config:
     min_pixels: int = option(
         0, 'smallest plane, pixels; 0 follows the size of the image: 300 of VGA', 0, 100000000
     )
+    # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
+    # its disparity, of which the quantisation is new in every pixel.
     noise: float = option(
         0.0013,
-        'random error of the inverse range, 1/m; the default is 0.45 steps of the disparity of a '
-        'Kinect, more is taken where the image shows more',
+        'random error of the inverse range, 1/m, more where the image shows more',
         0.0,
         10.0,
     )
@@ -151,21 +140,13 @@ class Config:
         2.0, 'width of the Gaussian the noise looks smoothed with, pixels; 0 = white', 0.0, 100.0
     )
     distortion: float = option(
-        0.00145,
-        'smooth systematic error of the inverse range, 1/m; the default is half a step of the '
-        'disparity of a Kinect',
-        0.0,
-        10.0,
+        0.00145, 'smooth systematic error of the inverse range, 1/m', 0.0, 10.0
     )
     range_distortion: float = option(
         0.0, 'smooth systematic error of the range, metres', 0.0, 10.0
     )
     distortion_length: float = option(
-        0.0,
-        'width of the Gaussian the distortion looks smoothed with, pixels; 0 follows the size of '
-        'the image: 35 of VGA',
-        0.0,
-        10000.0,
+        0.0, 'width of the distortion, pixels, as of the noise; 0 = 35 in VGA', 0.0, 10000.0
     )
     sensor_model: str = option(
         'measured',
@@ -258,10 +239,7 @@ class Config:
     )
     # The ground.
     sensor_height: float = option(
-        0.0,
-        'height of the sensor above the ground below it, along up, metres; 0 = unknown',
-        0.0,
-        100.0,
+        0.0, 'height of the sensor above the ground, along up, metres; 0 = unknown', 0.0, 100.0
     )
     ground_slope: float = option(
         12.0, 'steepest ground, against the ground under the robot, degrees', 0.0, 45.0
@@ -283,10 +261,7 @@ class Config:
     )
     grid_size: float = option(8.0, 'side of ~/grid, metres', 0.1, 50.0)
     grid_memory: float = option(
-        30.0,
-        'how long ~/grid remembers what is out of sight, with fixed_frame or odometry, seconds',
-        0.0,
-        86400.0,
+        30.0, 'seconds that ~/grid remembers, with fixed_frame or odometry', 0.0, 86400.0
     )
     grid_clearance: float = option(
         2.0, 'what hangs higher above the ground is no obstacle of ~/grid, metres', 0.0, 100.0

@@ -167,7 +167,7 @@ class Segmentation:
         }
         return judge(self.image, self.labels, thetas)
 
-    def _of_all(self, array: NDArray[Any]) -> NDArray[Any]:
+    def _at_full_size(self, array: NDArray[Any]) -> NDArray[Any]:
         """Values of all pixels."""
         return array if self.cells is None else self.cells.enlarged(array, self.labels.shape)
 
@@ -188,7 +188,7 @@ class Segmentation:
         """
         normals = self.labelling.normals()
         if normals is not None:
-            normals = self._of_all(normals)
+            normals = self._at_full_size(normals)
             return np.where((self.labels > 0)[..., None], normals, np.float32(np.nan))
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
@@ -200,7 +200,7 @@ class Segmentation:
         """(H, W) True on either side of a jump edge, worked out when read."""
         if self.jumps is None:
             return np.zeros(self.labels.shape, np.bool_)
-        return self._of_all(pixels_beside(self.jumps))
+        return self._at_full_size(pixels_beside(self.jumps))
 
     @cached_property
     def ground(self) -> Terrain | None:
@@ -239,14 +239,14 @@ class Segmentation:
         """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
         if self.ground is None:
             return np.zeros(self.labels.shape, np.uint8)
-        return self._of_all(self.ground.classes)
+        return self._at_full_size(self.ground.classes)
 
     @property
     def height(self) -> NDArray[np.float32]:
         """(H, W) metres along up above the ground; NaN where that is not known."""
         if self.ground is None:
             return np.full(self.labels.shape, np.nan, np.float32)
-        return self._of_all(self.ground.height)
+        return self._at_full_size(self.ground.height)
 
     @cached_property
     def energy(self) -> float:

@@ -214,10 +214,10 @@ def describe_regions(
         cells, start, fits.total, theta, theta_covariance, fits.outlier_share(), fits.sensor
     )
     if image.place.any():
-        # They are seen from the sensor, and told in the frame of the points.
-        told = np.eye(4)
-        told[3, :3] = -image.place
-        distance, covariance = distance - normal @ image.place, told @ covariance @ told.T
+        # From the sensor to the frame of the points.
+        shift = np.eye(4)
+        shift[3, :3] = -image.place
+        distance, covariance = distance - normal @ image.place, shift @ covariance @ shift.T
         centroid = centroid + image.place
 
     shapes = Shapes(labels, image, theta)
@@ -225,11 +225,11 @@ def describe_regions(
     places = boxes.tolist()
     outlines = {k: _outline(k, labels, image, places[k], theta[k]) for k in found.tolist()}
     # Of steep planes neither need be finite.
-    doubtful = found[~lies_ahead(boxes[found], theta[found], image.camera)]
-    if len(doubtful):
+    steep = found[~lies_ahead(boxes[found], theta[found], image.camera)]
+    if len(steep):
         finite = shapes.finite() & np.isfinite(centroid).all(1)
-        kept = finite[doubtful] & np.array([outlines[int(k)].exists() for k in doubtful])
-        found = np.setdiff1d(found, doubtful[~kept])
+        kept = finite[steep] & np.array([outlines[int(k)].exists() for k in steep])
+        found = np.setdiff1d(found, steep[~kept])
     surface = surfaces.result()
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
     columns = surface, distance, fits.pixels, rms, confidence, probability

@@ -71,19 +71,19 @@ def fronts(
         The first of the rows, and the one after the last.
     """
     first, after = rows[0] * width, rows[1] * width
-    beside, sites = np.empty((2, 4 * (after - first)), np.int32)
+    owners, sites = np.empty((2, 4 * (after - first)), np.int32)
     found = 0
     for p in range(max(first - width, 0), after):
         # The last pixel of a row has no link to the right.
         for k, q in enumerate((p + 1, p + width)):
             if q < len(labels) and labels[q] != labels[p] and links[k, p] > 0:
                 if first <= q < after:
-                    beside[found], sites[found] = labels[p], q
+                    owners[found], sites[found] = labels[p], q
                     found += 1
                 if p >= first:
-                    beside[found], sites[found] = labels[q], p
+                    owners[found], sites[found] = labels[q], p
                     found += 1
-    return group_sites(beside[:found], sites[:found], count)
+    return group_sites(owners[:found], sites[:found], count)
 
 
 @njit(cache=True, nogil=True)

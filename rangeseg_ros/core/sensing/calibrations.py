@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.camera import Camera, CameraError, CameraWarning, whole
+from rangeseg_ros.core.sensing.camera import Camera, CameraError, CameraWarning, positive_integer
 
 
 def camera_from_matrices(
@@ -52,7 +52,7 @@ def camera_from_matrices(
         As `Camera`; matrices of a wrong size or form; a rectified image without P of
         a lens that distorts.
     """
-    width, height = whole('width', width), whole('height', height)
+    width, height = positive_integer('width', width), positive_integer('height', height)
     matrix = _matrix('camera matrix K', k, 3)
     projection = None if p is None or raw else _matrix('projection matrix P', p, 4)
     if projection is not None and not projection.any():

@@ -76,7 +76,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         checked: dict[str, Any] = {
-            name: whole(name, getattr(self, name)) for name in ('width', 'height')
+            name: positive_integer(name, getattr(self, name)) for name in ('width', 'height')
         }
         checked |= {
             name: _finite(name, getattr(self, name)) for name in ('fx', 'fy', 'cx', 'cy', 'skew')
@@ -197,7 +197,7 @@ class Camera:
         return rays if self.turn == OPTICAL else rays @ self.axes.T
 
 
-def whole(name: str, value: Any) -> int:
+def positive_integer(name: str, value: Any) -> int:
     """`value` of the size of an image, or a `CameraError` that tells its name."""
     try:
         number = operator.index(value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -46,39 +45,18 @@ def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 
     -------
     Grid
     """
-    height, width = image.shape
-    if jumps is None:
-        jumps = np.zeros((height, width - 1), np.bool_), np.zeros((height - 1, width), np.bool_)
-    horizontal, vertical = (np.empty(edges.shape, np.float32) for edges in jumps)
-    # On this thread alone: to hand rows over takes longer than to do them.
-    _connect(image.inverse, *jumps, horizontal, vertical)
+    valid = image.valid
+    across, down = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
+    if jumps is not None:
+        across, down = across & ~jumps[0], down & ~jumps[1]
+    horizontal, vertical = across.astype(np.float32), down.astype(np.float32)
     if weighting == 'distance':
         points = image.points
-        across = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
-        down = np.linalg.norm(points[1:] - points[:-1], axis=2)
-        known = np.concatenate([across[np.isfinite(across)], down[np.isfinite(down)]])
+        width = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
+        height = np.linalg.norm(points[1:] - points[:-1], axis=2)
+        known = np.concatenate([width[np.isfinite(width)], height[np.isfinite(height)]])
         median = np.median(known) if known.size else np.float32(1)
         with np.errstate(invalid='ignore'):
-            horizontal = np.where(horizontal > 0, 2 * median / (median + across), 0)
-            vertical = np.where(vertical > 0, 2 * median / (median + down), 0)
+            horizontal = np.where(across, 2 * median / (median + width), 0)
+            vertical = np.where(down, 2 * median / (median + height), 0)
     return Grid(horizontal, vertical)
-
-
-@njit(cache=True, nogil=True)
-def _connect(
-    inverse: NDArray[np.float32],
-    across: NDArray[np.bool_],
-    down: NDArray[np.bool_],
-    right: NDArray[np.float32],
-    below: NDArray[np.float32],
-) -> None:
-    """Give 1 to edges between measured pixels that do not jump, 0 to others."""
-    height, width = inverse.shape
-    for i in range(height):
-        for j in range(width - 1):
-            both = (inverse[i, j] > 0) & (inverse[i, j + 1] > 0)
-            right[i, j] = both & ~across[i, j]
-        if i + 1 < height:
-            for j in range(width):
-                both = (inverse[i, j] > 0) & (inverse[i + 1, j] > 0)
-                below[i, j] = both & ~down[i, j]

@@ -212,7 +212,7 @@ def sobel(image: RangeImage) -> GridEdges:
     threshold = 2 * np.sqrt(strength[complete].mean()) if complete.any() else np.float32(np.inf)
     ridge = _ridges(strength, np.abs(gx) >= np.abs(gy)) & (strength > threshold**2)
     pixels = bridge_edges(ridge | ~valid) & valid
-    horizontal, vertical = beside(pixels)
+    horizontal, vertical = edges_of(pixels)
     # A step between two columns or rows responds with the sum of the kernel's one side.
     step = threshold / _SOBEL_GAIN
     horizontal |= (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
@@ -235,7 +235,7 @@ def _ridges(strength: NDArray[np.float32], across: NDArray[np.bool_]) -> NDArray
     )
 
 
-def beside(pixels: NDArray[np.bool_]) -> GridEdges:
+def edges_of(pixels: NDArray[np.bool_]) -> GridEdges:
     """All edges of the given pixels (H, W): edge pixels are disconnected from everything."""
     return pixels[:, 1:] | pixels[:, :-1], pixels[1:] | pixels[:-1]
 

@@ -24,8 +24,8 @@ _CLOSE = 0.01
 # Largest standard deviation of a camera's place over its distance from what it sees: half a degree
 # of the rays. Rounding leaves 1e-5 of what has any depth, and 1 of a plane or of parallel rays.
 _PLACED = 0.01
-# Rows and columns that tell the camera, about.
-_TELLING = 64
+# Rows and columns of the sample that the camera is estimated from, about.
+_SAMPLES = 64
 
 
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
@@ -50,16 +50,16 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
     """
     height, width = valid.shape
     # Odd steps, as holes come in every second row or column.
-    down, across = max(height // _TELLING, 1) | 1, max(width // _TELLING, 1) | 1
+    down, across = max(height // _SAMPLES, 1) | 1, max(width // _SAMPLES, 1) | 1
     v, u = np.nonzero(valid[::down, ::across])
-    told = points[::down, ::across][v, u].astype(np.float64)
+    sample = points[::down, ::across][v, u].astype(np.float64)
     u, v = u * across, v * down
-    for turn, place in _frames(told, u, v, valid.shape):
+    for turn, place in _candidate_frames(sample, u, v, valid.shape):
         axes = rotation_matrix(turn)
-        x, y, z = ((told - place) @ axes).T
+        x, y, z = ((sample - place) @ axes).T
         if not (z > 0).all():
             continue
-        columns, rows = _line(u, x / z, width), _line(v, y / z, height)
+        columns, rows = _fitted_line(u, x / z, width), _fitted_line(v, y / z, height)
         if columns is None or rows is None:
             continue
         lens = columns[0], rows[0], columns[1], rows[1]
@@ -93,7 +93,7 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     """
     width = valid.shape[1]
     # Of a scanner that turns all the way, the other half looks back.
-    across = max(width // _TELLING, 1)
+    across = max(width // _SAMPLES, 1)
     front = slice(width // 4, width - width // 4, across)
     forward = _nearest_axis(rays[:, front][valid[:, front]].sum(axis=0, dtype=np.float64))
     both = (valid[1:] & valid[:-1])[:, ::across]
@@ -103,14 +103,14 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 
 
 def _nearest_axis(
-    vector: NDArray[np.float64], beside: ArrayLike = (0, 0, 0)
+    vector: NDArray[np.float64], other_than: ArrayLike = (0, 0, 0)
 ) -> NDArray[np.float64]:
-    """Unit vector (3,) of the axis along which `vector` is longest, other than `beside`."""
-    k = int(np.argmax(np.where(np.equal(beside, 0), np.abs(vector), -1.0)))
+    """Unit vector (3,) of the axis along which `vector` is longest, other than another one."""
+    k = int(np.argmax(np.where(np.equal(other_than, 0), np.abs(vector), -1.0)))
     return np.eye(3)[k] * (-1.0 if vector[k] < 0 else 1.0)
 
 
-def _frames(
+def _candidate_frames(
     points: NDArray[np.float64],
     u: NDArray[np.intp],
     v: NDArray[np.intp],
@@ -130,8 +130,8 @@ def _frames(
     size = np.abs(points).max()
     ray = points / np.abs(points).max(axis=1, keepdims=True)  # whose squares are finite
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    _, found = _maps(pixel, ray)
-    turn = _turn(found[0])
+    _, found = _linear_maps(pixel, ray)
+    turn = _rotation(found[0])
     if turn:
         yield turn, _ORIGIN
     # About their middle and of size 1, for the sake of rounding.
@@ -143,20 +143,20 @@ def _frames(
         return
     scaled = np.append(scaled / spread, np.ones((len(points), 1)), axis=1)
     pixel /= np.linalg.norm(pixel, axis=1, keepdims=True)
-    squares, found = _maps(scaled, pixel)
+    squares, found = _linear_maps(scaled, pixel)
     back = np.linalg.pinv(found[0, :, :3])
     at = np.append(-back @ found[0, :, 3], 1)
     # How much each of the other matrices moves the camera, by how little it is worse.
     moves = np.linalg.norm(found[1:] @ at @ back.T, axis=1)
     noise = np.maximum(squares, np.finfo(float).eps * squares[-1])
     variance = noise[0] / (2 * len(points)) * (moves**2 / noise[1:]).sum()
-    turn = _turn(back)
+    turn = _rotation(back)
     if turn and variance <= _PLACED**2 * (at[:3] @ at[:3]):
         place = (at[:3] * spread + mean) * size
         yield turn, tuple((np.rint(place / _PLACE) * _PLACE).tolist())
 
 
-def _maps(
+def _linear_maps(
     start: NDArray[np.float64], end: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Matrices (3 K, 3, K) that take vectors (N, K) along unit vectors (N, 3), best ones first.
@@ -175,7 +175,7 @@ def _maps(
     return values, found
 
 
-def _turn(rays: NDArray[np.floating]) -> tuple[float, ...] | None:
+def _rotation(rays: NDArray[np.floating]) -> tuple[float, ...] | None:
     """The rotation in a matrix (3, 3) that takes pixels to rays; None for a mirror image."""
     axes, lens = np.linalg.qr(rays)
     axes = axes * np.where(np.diag(lens) < 0, -1.0, 1.0)
@@ -186,7 +186,7 @@ def _turn(rays: NDArray[np.floating]) -> tuple[float, ...] | None:
     return tuple(turn.tolist())
 
 
-def _line(
+def _fitted_line(
     place: NDArray[np.intp], slope: NDArray[np.float64], size: int
 ) -> tuple[float, float] | None:
     """Focal length and centre, pixels, of rays of these slopes (N,) in columns or rows."""

@@ -45,10 +45,10 @@ def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.b
     basis = _basis(rows, columns, image.shape)
     coefficients = np.linalg.lstsq(basis, known, rcond=None)[0]
     error = np.linalg.norm(basis @ coefficients - known, axis=1)
-    beside = valid[:, 1:] & valid[:, :-1]
-    if not beside.any():
+    neighbours = valid[:, 1:] & valid[:, :-1]
+    if not neighbours.any():
         return None
-    pixel = np.median(np.linalg.norm(np.diff(image.rays, axis=1)[beside], axis=1))
+    pixel = np.median(np.linalg.norm(np.diff(image.rays, axis=1)[neighbours], axis=1))
     if np.quantile(error, 0.95) > _SMOOTH * pixel:
         return None
     between = _between(valid) | _between(valid.T).T
