@@ -22,7 +22,6 @@ from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.figures import COUNTS
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.overlap import overlap_figures
-from rangeseg_ros.io.images import read_depth
 
 try:
     import open3d
@@ -30,10 +29,6 @@ except ImportError:
     open3d = None
 
 LEAST = 1000  # pixels of a plane, for every program
-
-
-# Files of depth images, as opposed to clouds and to those of the SegComp sets.
-DEPTH = {'.png', '.tif', '.tiff', '.exr'}
 
 
 def planes(depth, camera):
@@ -121,13 +116,12 @@ def programs():
     return table | {'sequential RANSAC, 20 mm': ransac}
 
 
-def measure(function, cases):
+def measure(function, samples):
     """Mean IoU, planes correct at 0.8, planes, and median times of a frame, milliseconds."""
     overlaps, times = [], []
-    for case in cases:
-        depth, sample = read_depth(case.image), case.load()
-        depth = np.where(sample.image.valid, depth * (0.001 if depth.dtype.kind in 'iu' else 1), 0)
-        camera = sample.image.camera
+    for sample in samples:
+        image, camera = sample.image, sample.image.camera
+        depth = np.where(image.valid, image.points[..., 2], 0)
         if not overlaps:  # the first call may compile, or load libraries
             function(depth, camera)
         begin = time.perf_counter(), time.process_time()
@@ -143,12 +137,13 @@ def measure(function, cases):
 def main():
     """Print a row for each program and folder."""
     for folder in map(Path, sys.argv[1:]):
-        cases = [case for case in find_cases(folder) if case.image.suffix in DEPTH]
+        samples = [case.load() for case in find_cases(folder)]
+        samples = [sample for sample in samples if sample.image.camera]  # no scans
         head = 'mean IoU | correct at 0.8 | ms | processor ms'
-        print(f'\n| {folder.name}, {len(cases)} frames | {head} |')
+        print(f'\n| {folder.name}, {len(samples)} frames | {head} |')
         print('|---|---|---|---|---|')
         for name, function in programs().items():
-            iou, correct, regions, wall, processor = measure(function, cases)
+            iou, correct, regions, wall, processor = measure(function, samples)
             row = f'{iou:.3f} | {correct} of {regions} | {wall:.0f} | {processor:.0f}'
             print(f'| {name} | {row} |', flush=True)
 
