@@ -129,7 +129,7 @@ MECHANISMS = (
               {'segmenter.find_holes': _returning(np.empty(0, np.int32))}),
     Mechanism('enlarged images found', 'sensing/verdict.py:Cells,replication,_period',
               {'segmenter.replication': _returning(None)}),
-    Mechanism('weights by distance', 'sensing/grid.py:_connect', {'weighting': 'distance'},
+    Mechanism('weights by distance', 'sensing/grid.py:weights', {'weighting': 'distance'},
               option=True),
     # Regions.
     Mechanism('patches as wide as the distortion',
