@@ -19,13 +19,14 @@ from rangeseg_ros.core.by_normals.angles import degrees
 from rangeseg_ros.core.graphcut.cut import ROUNDING
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.expansion import expand
-from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts
+from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts, group_sites
 from rangeseg_ros.core.regions import connected_components
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Pixels along a side of a cell, 4800 cells in VGA, and from a border that a label is expanded to.
 _CELL = 8
+_SMALL = _CELL // 2
 # Cells across the smallest region that the prior is to leave.
 _REGION = 6
 
@@ -57,14 +58,14 @@ def minimise(
     normals, directions = (np.ascontiguousarray(a, np.float32) for a in (normals, directions))
     links, inside = link_costs(grid, smoothness), _largest_parts(grid)
     cells = _label_cells(normals, directions, links.reshape(2, height, width), inside)
-    labels = cells.repeat(_CELL, axis=0).repeat(_CELL, axis=1)[:height, :width]
-    labels = np.where(inside, labels, np.int32(-1)).ravel()
+    labels = np.where(inside, _enlarged(cells, _CELL, inside.shape), np.int32(-1)).ravel()
     normals = normals.reshape(-1, 3)
     _fill_in(labels, normals, directions, links, width)
     data = np.empty(labels.shape, np.float32)
     run_rows(_find_costs, len(labels), labels, normals, directions, data)
     labelling = GridLabelling.of(labels, data, links, width)
-    run_halves(_expand_near, height, normals, directions, labelling)
+    suited = _suited(normals.reshape(height, width, 3), directions, data, smoothness)
+    run_halves(_expand_near, height, normals, directions, suited, labelling)
     return labels.reshape(height, width)
 
 
@@ -96,10 +97,11 @@ def _label_cells(
     )
     below = below[_CELL - 1 : -1 : _CELL] * (inside[_CELL - 1 : -1 : _CELL] & inside[_CELL::_CELL])
     known = inside & ~np.isnan(normals[..., 0])
-    mean: NDArray[Any] = _sums(_sums(np.where(known[..., None], normals, 0), 0), 1)
+    mean = _square_sums(np.where(known[..., None], normals, np.float32(0)), _CELL)
     height, width = mean.shape[:2]
     sums = np.zeros((2, height, width), np.float32)
-    sums[0, :, :-1], sums[1, :-1] = _sums(right, 0), _sums(below, 1)
+    sums[0, :, :-1] = np.add.reduceat(right, np.arange(0, len(right), _CELL), axis=0)
+    sums[1, :-1] = np.add.reduceat(below, np.arange(0, below.shape[1], _CELL), axis=1)
     linked = sums.reshape(2, -1)
     labels = np.full(height * width, -1, np.int32)
     _fill_in(labels, mean.reshape(-1, 3), directions, linked, width)
@@ -114,9 +116,39 @@ def _label_cells(
     return labels.reshape(height, width)
 
 
-def _sums(values: NDArray[np.float32], axis: int) -> NDArray[np.float32]:
-    """Sums over the squares along an axis."""
-    return np.add.reduceat(values, np.arange(0, values.shape[axis], _CELL), axis=axis)
+def _suited(
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    data: NDArray[np.float32],
+    smoothness: float,
+) -> NDArray[np.int32]:
+    """Labels (n,) that cost pixels much less than theirs, `data`, -1 where there is none.
+
+    Those nearest to the mean normal of smaller squares, as a cell may hold several surfaces.
+    """
+    shape = normals.shape[:2]
+    # The share in the border around the smallest region, half as many of them across.
+    least = 4 * _SMALL * smoothness / (_REGION // 2)
+    labels = np.where(_square_sums(data.reshape(shape), _SMALL) > least, np.int32(-1), np.int32(0))
+    mean = _square_sums(np.nan_to_num(normals), _SMALL).reshape(-1, 3)
+    run_rows(_choose_nearest, labels.size, labels.reshape(-1), mean, directions)
+    found = _enlarged(np.maximum(labels, 0), _SMALL, shape).ravel()
+    costs = np.empty(data.shape, np.float32)
+    run_rows(_find_costs, len(data), found, normals.reshape(-1, 3), directions, costs)
+    gain = _square_sums((data - costs).reshape(shape), _SMALL)
+    return np.where(_enlarged(gain > least, _SMALL, shape).ravel(), found, np.int32(-1))
+
+
+def _square_sums(values: NDArray[np.float32], size: int) -> NDArray[np.float32]:
+    """Sums (h, w, ...) over squares of an image (H, W, ...)."""
+    for axis in (0, 1):
+        values = np.add.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
+    return values
+
+
+def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, int]) -> NDArray[Any]:
+    """Values (h, w) of the squares for their pixels (H, W)."""
+    return squares.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]]
 
 
 def _fill_in(
@@ -243,14 +275,21 @@ def _expand_near(
     rows: tuple[int, int],
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
+    suited: NDArray[np.int32],
     labelling: GridLabelling,
 ) -> None:
-    """Expand every label from the borders of its regions in some rows, as far as it gains."""
-    start, sites = fronts(
-        labelling.labels, labelling.links, labelling.width, len(directions), rows
-    )
-    for alpha in range(len(directions)):
-        front = sites[start[alpha] : start[alpha + 1]]
+    """Expand every label in some rows, as far as it gains; in place.
+
+    From the borders of its regions and from the pixels that it suits.
+    """
+    width, count = labelling.width, len(directions)
+    start, sites = fronts(labelling.labels, labelling.links, width, count, rows)
+    first = rows[0] * width
+    found = first + np.flatnonzero(suited[first : rows[1] * width] >= 0)
+    begin, seeds = group_sites(suited[found], found.astype(np.int32), count)
+    for alpha in range(count):
+        borders = sites[start[alpha] : start[alpha + 1]]
+        front = np.concatenate((borders, seeds[begin[alpha] : begin[alpha + 1]]))
         while len(front) > 0:
             near = band(alpha, front, _CELL, labelling, rows)
             new = np.empty(len(near), np.float32)
