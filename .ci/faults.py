@@ -58,9 +58,8 @@ def start(*words, env=None, prefix=(), **options):
     given = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **(env or {})}
     given = {name: value for name, value in given.items() if value is not None}
     options = {'stdin': subprocess.DEVNULL, 'stdout': subprocess.PIPE, **options}
-    command = [*prefix, *RANGESEG, *map(str, words)]
-    streams = {'stderr': subprocess.PIPE, 'start_new_session': True}
-    return subprocess.Popen(command, env=given, **streams, **options)
+    options |= {'stderr': subprocess.PIPE, 'start_new_session': True}
+    return subprocess.Popen([*prefix, *RANGESEG, *map(str, words)], env=given, **options)
 
 
 def answer(process, right=lambda: True, codes=(0,)):
@@ -328,6 +327,7 @@ def main():
         for what, found in CASES[given.case]():
             print(f'{what}\t{found}', flush=True)
         return 0
+    start('compile').communicate()  # which would take the time of the first case
     total = Counter()
     for name in (name for name in CASES if re.search(given.pattern, name)):
         with tempfile.TemporaryDirectory(prefix='faults-') as folder:
@@ -342,8 +342,8 @@ def main():
         counts = Counter(outcome.partition(':')[0] for _, outcome in found)
         print(f'{name:24}', ', '.join(f'{n} {kind}' for kind, n in counts.items()), flush=True)
         total += counts
-    print(f'{"all":24}', ', '.join(f'{count} {kind}' for kind, count in total.most_common()))
-    return 1 if set(total) - set(GOOD) else 0
+    print(f'{"all":24}', ', '.join(f'{n} {kind}' for kind, n in total.most_common()))
+    return bool(set(total) - set(GOOD))
 
 
 if __name__ == '__main__':
