@@ -178,7 +178,7 @@ def _upright(
     place[0] += height
     seen: list[Continuation] = []
     left = variance.copy()
-    for _ in range(_TRIALS):
+    for _ in range(1 if height_sd > 0 else _TRIALS):
         reached = _reach(place, left, height_sd, limits, turned)
         if not reached.any():
             break
@@ -211,13 +211,6 @@ def _smoothed(
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     square = cells.error.astype(np.float64) ** 2
     variance = np.where(there & ~cells.mixed, square * share + 1e-8, 0.0)
-    noisy = variance > (least / 8) ** 2
-    if noisy.any():
-        lowest = np.float32(-1e4)
-        median = cv2.medianBlur(np.where(there, cells.place[0], lowest), 5)
-        noisy &= median > lowest
-        place[0][noisy] = median[noisy]
-        variance[noisy] /= 4
     return place, variance
 
 
@@ -247,11 +240,9 @@ def _reach(
     turned: bool,
 ) -> NDArray[np.bool_]:
     """Cells that a chain from the nearest ones leads to."""
-    nearest = _nearest(variance, turned)
-    errors = (2 * height_sd or 1.0, float(np.tan(limits.slope)) / 2)
-    plane = first_plane(place, variance, nearest, errors, limits.least)
     steepest = float(np.tan(limits.slope + limits.tilt))
-    return reach(place, variance, nearest, plane, limits.least, steepest, turned)
+    highest = HIGHEST if height_sd > 0 else np.inf
+    return reach(place, variance, highest, limits.least, steepest, turned)
 
 
 def _smooth_variance(
