@@ -17,6 +17,8 @@ from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Columns on either side whose ground leads to a cell.
 _BESIDE = 4
+# The widest gap in a chain, metres.
+_GAP = 0.15
 # Half the width of a small robot, metres: how far the ground that leads to a cell is looked for,
 # and how much farther than the nearest ground in view a chain begins.
 _RADIUS = 0.25
@@ -174,7 +176,7 @@ def _spread(
                             nearest = min(nearest, way)
                             total += weight[q]
                             summed += weight[q] * mean[q]
-                    if nearest > 2 * length or abs(h - summed / total) >= least / 2:
+                    if nearest > _GAP or abs(h - summed / total) >= least / 2:
                         continue
                 reached[i, c] = True
                 kept = 0.0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued, first_plane
+from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -24,13 +24,8 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, systematic_variance
 # Standard deviations of the noise within which the ground is the ground, and beyond which it is
 # known to be none.
 _CERTAIN = 3.0
-# Of the least obstacle or drop: what ground differs by however precise the sensor is, what is none
-# of it where it was reached, and where no chain leads.
-_FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
 # Cells over which the relief of the ground is measured.
 _RELIEF = (9, 25)
-# Surfaces that are tried, the nearest first, until one agrees with the stated height.
-_TRIALS = 3
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
 FURNITURE = 1.5
@@ -172,77 +167,29 @@ def _upright(
     """The same for an image whose columns are along up; `turned` where up is down in it."""
     size = CellSize.for_image(image.shape)
     cells = cells_of(image, size, up, sensor)
-    place, variance = _smoothed(cells, size, sensor, limits.least)
+    place, variance = cells.place.astype(np.float64), cells.variance
     height, height_sd = known
-    height = height or _lowest(place, variance, turned)
+    height = height or _nearest(place[0], turned)
     place[0] += height
-    seen: list[Continuation] = []
-    left = variance.copy()
-    for _ in range(1 if height_sd > 0 else _TRIALS):
-        reached = _reach(place, left, height_sd, limits, turned)
-        if not reached.any():
-            break
-        smooth = _smooth_variance(place[:, reached], height, sensor, size)
-        error = 4 * variance[reached] + smooth
-        slope = float(np.tan(limits.slope))
-        found = continued(place[:, reached], error, height_sd, slope, limits.least)
-        # Without a height the ground is what the camera stands on: a table tells by its size.
-        sure = found.confidence >= SURE if height_sd > 0 else found.size >= FURNITURE
-        # What is nearer may be the robot's own floor, by another height than the stated one.
-        highest = HIGHEST if height_sd > 0 else np.inf
-        if sure and not any(found.behind_step(nearer, highest) for nearer in seen):
-            stand = Stand(1, _theta(found, height, up), found.confidence)
-            return _with_ground(image, cells, size, reached, stand, up, limits, turned)
-        seen.append(found)
-        left[reached] = 0
-    nearest = seen[0] if seen else None
-    return _without_ground(image, cells, size, nearest, up, known, limits)
+    steepest, highest = limits.slope + limits.tilt, HIGHEST if height_sd > 0 else np.inf
+    reached = reach(place, variance, highest, limits.least, float(np.tan(steepest)), turned)
+    if not reached.any():
+        return _without_ground(image, cells, size, None, up, known, limits)
+    error = 4 * variance[reached] + _smooth_variance(place[:, reached], height, sensor, size)
+    slope = float(np.tan(limits.slope))
+    found = continued(place[:, reached], error, height_sd, slope, limits.least)
+    # Without a height the ground is what the camera stands on: a table tells by its size.
+    if found.confidence < SURE if height_sd > 0 else found.size < FURNITURE:
+        return _without_ground(image, cells, size, found, up, known, limits)
+    stand = Stand(1, _theta(found, height, up), found.confidence)
+    return _with_ground(image, cells, size, reached, stand, up, limits, turned)
 
 
-def _smoothed(
-    cells: Cells, size: CellSize, sensor: SensorModel, least: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places of cells and the variances of their heights, 0 where nothing is measured.
-
-    Where noise is a large part of the least step, heights are medians of neighbours.
-    """
-    place = cells.place.astype(np.float64)
-    there = cells.inverse > 0
-    share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
-    square = cells.error.astype(np.float64) ** 2
-    variance = np.where(there & ~cells.mixed, square * share + 1e-8, 0.0)
-    return place, variance
-
-
-def _nearest(variance: NDArray[np.float64], turned: bool) -> NDArray[np.int64]:
-    """Row of the nearest measured cell of each column; -1 for none."""
-    there = variance > 0 if turned else variance[::-1] > 0
-    row = there.argmax(axis=0)
-    if not turned:
-        row = len(variance) - 1 - row
-    return np.where(there.any(axis=0), row, -1)
-
-
-def _lowest(place: NDArray[np.float64], variance: NDArray[np.float64], turned: bool) -> float:
+def _nearest(above: NDArray[np.float64], turned: bool) -> float:
     """How far below the sensor the nearest cells are, metres, where no height is stated."""
-    nearest = _nearest(variance, turned)
-    columns = np.flatnonzero(nearest >= 0)
-    if not len(columns):
-        return 1.0
-    return max(-float(np.median(place[0, nearest[columns], columns])), 0.02)
-
-
-def _reach(
-    place: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    height_sd: float,
-    limits: Limits,
-    turned: bool,
-) -> NDArray[np.bool_]:
-    """Cells that a chain from the nearest ones leads to."""
-    steepest = float(np.tan(limits.slope + limits.tilt))
-    highest = HIGHEST if height_sd > 0 else np.inf
-    return reach(place, variance, highest, limits.least, steepest, turned)
+    rows = above if turned else above[::-1]
+    nearest = rows[np.isfinite(rows).argmax(axis=0), np.arange(rows.shape[1])]
+    return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
 
 
 def _smooth_variance(
@@ -291,19 +238,17 @@ def _with_ground(
         relief = np.where(count > 0, squares / count, 0)
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
     beside = cv2.dilate(reached.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    flat = np.clip(noise, _FLAT * limits.least, limits.least)
-    flat = np.where(reached, flat, np.minimum(flat, limits.least / 2))
-    share = np.where(reached, np.float32(_NEAR), np.float32(_APART))
-    bounds = np.empty((4, *reached.shape), np.float32)
+    # Where no chain leads, half as much is no ground.
+    share = np.where(reached, np.float32(1), np.float32(0.5))
     sure = np.float32(_CERTAIN) * cells.error
-    bounds[0] = -np.maximum(share * limits.drop, np.minimum(sure, _CERTAIN * limits.drop))
-    bounds[3] = np.maximum(share * limits.obstacle, np.minimum(sure, _CERTAIN * limits.obstacle))
-    bounds[1] = np.where(beside, np.maximum(-flat, bounds[0]), np.inf)
-    bounds[2] = np.where(beside, np.minimum(flat, bounds[3]), -np.inf)
+    bounds = np.empty((3, *reached.shape), np.float32)
+    bounds[0] = np.where(beside, np.clip(noise, limits.least / 4, share * limits.least), -1)
+    bounds[1] = -np.maximum(share * limits.drop, sure)
+    bounds[2] = np.maximum(share * limits.obstacle, sure)
     classes, heights = classify(image, field, bounds)
     kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
-    kind[height > bounds[3]] = OBSTACLE
-    kind[height < bounds[0]] = DROP
+    kind[height > bounds[2]] = OBSTACLE
+    kind[height < bounds[1]] = DROP
     along = (field.theta * cells.ray).sum(axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):
         flat_axes = axes_of(up)[1:].astype(np.float32)
