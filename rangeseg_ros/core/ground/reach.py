@@ -1,8 +1,8 @@
 """Ground is reached: a chain of seen ground, link by link, leads from the robot to it.
 
 Cells that are neither steps nor too steep are looked at from near to far, and once more from far
-to near. What is reached already predicts the next cell: the mean height of what was reached last in
-its own column and those beside it, an exponential moving average along each. A chain so goes
+to near. What is reached already predicts the next cell: the mean height of what was reached last
+in its own column and those beside it, an exponential moving average along each. A chain so goes
 around what stands in its way, and a cell that noise leads across an edge leads no others.
 """
 
@@ -77,9 +77,8 @@ def _find_even(
     Against those beside them, whatever they are, so that the foot of a wall is none; and on no
     slope that goes on to either side. Of rows first...after.
     """
-    rows, columns = variance.shape
     for i in range(first, after):
-        for c in range(columns):
+        for c in range(variance.shape[1]):
             even[i, c] = variance[i, c] > 0 and not _steep(place, variance, i, c, least, slope)
 
 

@@ -19,7 +19,7 @@ from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, cont
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of the noise within which the ground is the ground, and beyond which it is
 # known to be none.
@@ -100,8 +100,6 @@ class Terrain(NamedTuple):
         The ground continued everywhere; zeros where none is known.
     cells : CellTerrain or None
         The same of cells, where ground is known.
-    remembered : float
-        How far below the camera the ground was, metres, when it is out of view; 0 for unknown.
     """
 
     classes: NDArray[np.uint8]
@@ -109,13 +107,11 @@ class Terrain(NamedTuple):
     stand: Stand
     field: GroundField
     cells: CellTerrain | None = None
-    remembered: float = 0.0
 
     def __str__(self) -> str:
         """Where the ground is and how sure that is, in a few words."""
         if not self.stand.surface:
-            where = f': it was {self.remembered:.2f} m below' if self.remembered else ''
-            return '; '.join([f'no ground in view{where}', *self.stand.reasons])
+            return '; '.join(['no ground in view', *self.stand.reasons])
         height, confidence = self.stand.height(self.field.up), self.stand.confidence
         return f'ground {height:.2f} m below, confidence {confidence:.2f}'
 
@@ -175,9 +171,8 @@ def _upright(
     reached = reach(place, variance, highest, limits.least, float(np.tan(steepest)), turned)
     if not reached.any():
         return _without_ground(image, cells, size, None, up, known, limits)
-    error = 4 * variance[reached] + _smooth_variance(place[:, reached], height, sensor, size)
     slope = float(np.tan(limits.slope))
-    found = continued(place[:, reached], error, height_sd, slope, limits.least)
+    found = continued(place[:, reached], 4 * variance[reached], height_sd, slope, limits.least)
     # Without a height the ground is what the camera stands on: a table tells by its size.
     if found.confidence < SURE if height_sd > 0 else found.size < FURNITURE:
         return _without_ground(image, cells, size, found, up, known, limits)
@@ -190,21 +185,6 @@ def _nearest(above: NDArray[np.float64], turned: bool) -> float:
     rows = above if turned else above[::-1]
     nearest = rows[np.isfinite(rows).argmax(axis=0), np.arange(rows.shape[1])]
     return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
-
-
-def _smooth_variance(
-    place: NDArray[np.float64], height: float, sensor: SensorModel, size: CellSize
-) -> NDArray[np.float64]:
-    """Variance (N,) of the heights of cells by the sensor's distortion, metres^2.
-
-    All of a patch of it errs alike, 4 pi times the square of its width: it counts for every cell.
-    """
-    square = (place[0] - height) ** 2 + place[1] ** 2 + place[2] ** 2
-    patch = max(4 * np.pi * sensor.distortion_length**2 / (size.rows * size.columns), 1.0)
-    variance: NDArray[np.float64] = (
-        patch * systematic_variance.py_func(sensor, 1 / square) * square * (place[0] - height) ** 2
-    )
-    return variance
 
 
 def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -302,7 +282,7 @@ def _without_ground(
             why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
         reasons = (why,)
     elif height > 0:
-        reasons = (f'no ground that is seen is {height:.2f} m below, as is stated',)
+        reasons = (f'no ground that is seen is {height:.2f} m below, as is known',)
     elif seen:
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
