@@ -134,9 +134,9 @@ def test_the_table_tells_the_kinds_apart(drawn, evaluate):
 
 
 def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate):
-    """Nothing is ground where a height of 3 m contradicts the floor that is seen 2 m below."""
+    """Nothing is ground where a height of 2.2 m contradicts the floor that is seen 2 m below."""
     text = (drawn / 'terrain.csv').read_text()
-    (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,3,'))
+    (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,2.2,'))
     assert evaluate(drawn)[1]['by_kind']['near']['ground_kept'] == 0
     assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
 

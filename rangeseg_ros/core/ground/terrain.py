@@ -84,6 +84,12 @@ class CellTerrain(NamedTuple):
     crossing: NDArray[np.float32]
     turned: bool
 
+    def turned_over(self) -> CellTerrain:
+        """With the rows in the other order."""
+        place, crossing = self.place[:, ::-1], self.crossing[:, ::-1]
+        height, kind, unsure = self.height[::-1], self.kind[::-1], self.unsure[::-1]
+        return CellTerrain(place, height, kind, unsure, crossing, not self.turned)
+
 
 class Terrain(NamedTuple):
     """What the pixels of an image are to a robot.
