@@ -1,9 +1,9 @@
 """Ground is reached: a chain of seen ground, link by link, leads from the robot to it.
 
-Cells that are neither steps nor too steep are looked at from near to far, and once more from far
-to near. What is reached already predicts the next cell: the mean height of what was reached last
-in its own column and those beside it, an exponential moving average along each. A chain so goes
-around what stands in its way, and a cell that noise leads across an edge leads no others.
+Cells that are neither steps nor too steep are looked at from near to far. What is reached already
+predicts the next cell: the mean height of what was reached last in its own column and those beside
+it, an exponential moving average along each. A chain so goes around what stands in its way, and a
+cell that noise leads across an edge leads no others.
 """
 
 from __future__ import annotations
@@ -158,30 +158,28 @@ def _spread(
     # Of each column: weight, mean, and where the cell is that was reached last.
     weight, mean = np.zeros(columns), np.zeros(columns)
     last = np.full((columns, 2), np.nan)
-    for sweep in range(2):
-        for m in range(rows):
-            i = m if sweep == 0 else rows - 1 - m
-            for n in range(columns):
-                c = n if m % 2 == 0 else columns - 1 - n
-                if not even[i, c]:
+    for i in range(rows):
+        for n in range(columns):
+            c = n if i % 2 == 0 else columns - 1 - n
+            if not even[i, c]:
+                continue
+            x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
+            if not reached[i, c] and not (front[c] == i and abs(h - level) < least / 2):
+                total = summed = 0.0
+                nearest = np.inf
+                for q in range(max(c - _BESIDE, 0), min(c + _BESIDE + 1, columns)):
+                    way = np.sqrt((last[q, 0] - x) ** 2 + (last[q, 1] - y) ** 2)
+                    if way <= _RADIUS:
+                        nearest = min(nearest, way)
+                        total += weight[q]
+                        summed += weight[q] * mean[q]
+                if nearest > _GAP or abs(h - summed / total) >= least / 2:
                     continue
-                x, y, h = place[1, i, c], place[2, i, c], place[0, i, c]
-                if not reached[i, c] and not (front[c] == i and abs(h - level) < least / 2):
-                    total = summed = 0.0
-                    nearest = np.inf
-                    for q in range(max(c - _BESIDE, 0), min(c + _BESIDE + 1, columns)):
-                        way = np.sqrt((last[q, 0] - x) ** 2 + (last[q, 1] - y) ** 2)
-                        if way <= _RADIUS:
-                            nearest = min(nearest, way)
-                            total += weight[q]
-                            summed += weight[q] * mean[q]
-                    if nearest > _GAP or abs(h - summed / total) >= least / 2:
-                        continue
-                reached[i, c] = True
-                kept = 0.0
-                if weight[c] > 0:
-                    way = np.sqrt((last[c, 0] - x) ** 2 + (last[c, 1] - y) ** 2)
-                    kept = weight[c] * np.exp(-way / length)
-                weight[c] = kept + 1 / variance[i, c]
-                mean[c] += (h - mean[c]) / (variance[i, c] * weight[c])
-                last[c, 0], last[c, 1] = x, y
+            reached[i, c] = True
+            kept = 0.0
+            if weight[c] > 0:
+                way = np.sqrt((last[c, 0] - x) ** 2 + (last[c, 1] - y) ** 2)
+                kept = weight[c] * np.exp(-way / length)
+            weight[c] = kept + 1 / variance[i, c]
+            mean[c] += (h - mean[c]) / (variance[i, c] * weight[c])
+            last[c, 0], last[c, 1] = x, y

@@ -26,6 +26,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 _CERTAIN = 3.0
 # Cells over which the relief of the ground is measured.
 _RELIEF = (9, 25)
+_SQUARE = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
 FURNITURE = 1.5
@@ -223,7 +224,9 @@ def _with_ground(
     with np.errstate(divide='ignore', invalid='ignore'):
         relief = np.where(count > 0, squares / count, 0)
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
-    beside = cv2.dilate(reached.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    # Among cells that a chain leads to, noise keeps some out of it.
+    closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
+    reached, beside = closed > 0, cv2.dilate(closed, _SQUARE[1:-1, 1:-1]) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
     sure = np.float32(_CERTAIN) * cells.error
