@@ -11,10 +11,13 @@ import json
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import beta
 
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.evaluation.detection import LEVEL, lower_bound
 from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.simulation.terrain.testpieces import all_pieces
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
 BOX = np.s_[20:60, 20:60]
@@ -193,6 +196,30 @@ def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, evaluat
         ((85, 125), (blue, green, black)),  # out of reach
     ):
         assert [tuple(part[place]) for part in (true, found, wrong)] == list(colours)
+
+
+def test_lower_bounds_are_those_of_the_beta_distribution():
+    for successes, trials in ((0, 5), (1, 1), (3, 7), (10, 10), (19, 20)):
+        expected = beta.ppf(1 - LEVEL, successes, trials - successes + 1) if successes else 0
+        assert lower_bound(successes, trials) == pytest.approx(expected, abs=1e-9)
+
+
+def test_pieces_are_detected_by_size_and_distance(run, tmp_path):
+    """Without noise: all of 20 cm and more, and no ramp but the steep ones."""
+    size = '--width', 160, '--height', 120
+    words = 'simulate', 'testpieces', '--sensor', 'ideal', '--scenes', 1, *size
+    assert run(*words, '--output', tmp_path / 'set')[0] == 0
+    output = tmp_path / 'output'
+    words = 'experiment', 'detection', tmp_path / 'set', '--jobs', 1, '--output', output
+    assert run(*words)[0] == 0 and (output / 'detection.png').stat().st_size > 10_000
+    with (output / 'detection.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert [(r['kind'], float(r['size']), float(r['distance'])) for r in rows] == [*all_pieces()]
+    for row in rows:
+        assert row['ground'] == '0', row
+        if float(row['size']) >= 0.2 and int(row['scenes']):
+            assert row['detected'] == '1' and float(row['bound']) == pytest.approx(0.05), row
+    assert sum(int(row['scenes']) for row in rows) > 40
 
 
 def test_a_simulated_set_is_measured(run, evaluate, tmp_path):

@@ -53,6 +53,8 @@ def _gap(site: Site, ahead: float, size: float) -> None:
     site.floor(end=ahead)
     site.continued(ahead, ahead + size)
     site.piece(slab(ahead, ahead + size, -1, -1, ALL), DROP, 1.0)
+    # Its far side belongs to it.
+    site.piece(slab(ahead + size - 0.01, ahead + size, -0.002, -0.002, ALL), DROP, 1.0)
     site.ground.append(slab(ahead + size, FAR, 0, 0, ALL))
     site.piece(site.ground[-1], UNKNOWN, 0.0)
 
