@@ -22,8 +22,8 @@ _GAP = 0.15
 # Half the width of a small robot, metres: how far the ground that leads to a cell is looked for,
 # and how much farther than the nearest ground in view a chain begins.
 _RADIUS = 0.25
-# Cells, as powers of two, over which a slope is measured, and the longest such way, metres.
-_BASELINES, _WAY = 6, 0.8
+# Cells, as powers of two, over which a slope is measured.
+_BASELINES = 6
 # The last of these baselines, along columns and rows, that are beside a cell.
 _NEXT = (2, 0)
 
@@ -110,8 +110,6 @@ def _steep(
                 if abs(up) < CLEARLY * noise:
                     continue
                 way = (place[1, p, q] - x) ** 2 + (place[2, p, q] - y) ** 2
-                if way > _WAY * _WAY:
-                    continue
                 # Beyond an edge the ground is hidden: what is next is farther than it is deep.
                 if e == 0 or (near and way < least * least):
                     more = abs(up) - off
