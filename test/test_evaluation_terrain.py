@@ -204,22 +204,22 @@ def test_lower_bounds_are_those_of_the_beta_distribution():
         assert lower_bound(successes, trials) == pytest.approx(expected, abs=1e-9)
 
 
-def test_pieces_are_detected_by_size_and_distance(run, tmp_path):
-    """Without noise: all of 20 cm and more, and no ramp but the steep ones."""
-    size = '--width', 160, '--height', 120
+def test_pieces_are_detected_by_size_and_distance(run, evaluate, tmp_path):
+    """Without noise: all of 20 cm and more, and nothing dangerous is ground."""
+    folder, size = tmp_path / 'set', ('--width', 160, '--height', 120)
     words = 'simulate', 'testpieces', '--sensor', 'ideal', '--scenes', 1, *size
-    assert run(*words, '--output', tmp_path / 'set')[0] == 0
-    output = tmp_path / 'output'
-    words = 'experiment', 'detection', tmp_path / 'set', '--jobs', 1, '--output', output
-    assert run(*words)[0] == 0 and (output / 'detection.png').stat().st_size > 10_000
-    with (output / 'detection.csv').open(newline='') as file:
-        rows = list(csv.DictReader(file))
-    assert [(r['kind'], float(r['size']), float(r['distance'])) for r in rows] == [*all_pieces()]
+    assert run(*words, '--output', folder)[0] == 0
+    code, figures, out, _ = evaluate(folder)
+    rows = figures['detection']
+    assert code == 0 and 'test pieces detected' in out
+    assert [(r['kind'], r['size'], r['distance']) for r in rows] == [*all_pieces()]
     for row in rows:
-        assert row['ground'] == '0', row
-        if float(row['size']) >= 0.2 and int(row['scenes']):
-            assert row['detected'] == '1' and float(row['bound']) == pytest.approx(0.05), row
-    assert sum(int(row['scenes']) for row in rows) > 40
+        assert row['ground'] == 0, row
+        if row['size'] >= 0.2 and row['scenes']:
+            assert row['detected'] == 1 and row['bound'] == pytest.approx(0.05), row
+    assert sum(row['scenes'] for row in rows) > 40
+    # Of a set without noise every confidence is right.
+    assert all(row['right'] == 1 for row in figures['reliability'])
 
 
 def test_a_simulated_set_is_measured(run, evaluate, tmp_path):
