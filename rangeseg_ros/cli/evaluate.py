@@ -75,8 +75,7 @@ def command(
         pieces = detections(measured)
         if pieces:
             figures['detection'] = [row._asdict() for row in pieces]
-            click.echo(detection_table(pieces))
-        click.echo(terrain_table(figures))
+        click.echo(detection_table(pieces) if pieces else terrain_table(figures))
         options.write_json(json_file, figures)
         return
     known = find_cases(folder, min_pixels)
