@@ -84,9 +84,10 @@ class Shares(NamedTuple):
         obstacles, and how many of them were found.
     stairs : StairsCheck
     confidence : float
-        That the nearest surface is the ground that the robot stands on.
+        That the ground seen is the one that the robot stands on.
     own : bool
-        Whether it is: the nearest hundredth of the judged pixels is ground.
+        Whether it is: most of what is called ground, or where nothing is, of the nearest hundredth
+        of the pixels.
     """
 
     name: str
@@ -141,10 +142,10 @@ class TerrainTask:
             here = (sizes == key[0]) & (at == key[1])
             table[key] = int(here.sum()), int((found[obstacle][here] == OBSTACLE).sum())
         confidence = result.ground.stand.confidence if result.ground else 0.0
-        nearest = (
-            judged & (metres <= np.quantile(metres[judged], 0.01)) if judged.any() else judged
-        )
-        own = bool(np.count_nonzero(truth[nearest] == GROUND) * 2 > np.count_nonzero(nearest))
+        limit = np.quantile(metres[judged], 0.01) if judged.any() else 0.0
+        called = judged & (found == GROUND)
+        surface = called if called.any() else judged & (metres <= limit)
+        own = bool(np.count_nonzero(truth[surface] == GROUND) * 2 > np.count_nonzero(surface))
         if self.output:
             wrong = judged & (found != truth)
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
