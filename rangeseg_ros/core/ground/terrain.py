@@ -235,7 +235,7 @@ def _with_ground(
     bounds[1] = -np.maximum(share * limits.drop, sure)
     bounds[2] = np.maximum(share * limits.obstacle, sure)
     classes, heights = classify(image, field, bounds)
-    kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
+    kind = np.where(reached & np.isfinite(height), GROUND, UNKNOWN).astype(np.int8)
     kind[height > bounds[2]] = OBSTACLE
     kind[height < bounds[1]] = DROP
     along = (field.theta * cells.ray).sum(axis=0)
