@@ -11,10 +11,13 @@ import json
 import cv2
 import numpy as np
 import pytest
+from scipy.stats import beta
 
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.evaluation.detection import LEVEL, lower_bound
 from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.simulation.terrain.testpieces import all_pieces
 
 CAMERA = Camera(160, 120, 100.0, 100.0, 79.5, 59.5)
 BOX = np.s_[20:60, 20:60]
@@ -134,9 +137,9 @@ def test_the_table_tells_the_kinds_apart(drawn, evaluate):
 
 
 def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate):
-    """Nothing is ground where a height of 3 m contradicts the floor that is seen 2 m below."""
+    """Nothing is ground where a height of 2.2 m contradicts the floor that is seen 2 m below."""
     text = (drawn / 'terrain.csv').read_text()
-    (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,3,'))
+    (drawn / 'terrain.csv').write_text(text.replace('-1,2,', '-1,2.2,'))
     assert evaluate(drawn)[1]['by_kind']['near']['ground_kept'] == 0
     assert evaluate(drawn, '--unknown-height')[1]['pooled'] == pytest.approx(POOLED)
 
@@ -193,6 +196,30 @@ def test_pictures_show_truth_what_was_found_and_where_they_differ(drawn, evaluat
         ((85, 125), (blue, green, black)),  # out of reach
     ):
         assert [tuple(part[place]) for part in (true, found, wrong)] == list(colours)
+
+
+def test_lower_bounds_are_those_of_the_beta_distribution():
+    for successes, trials in ((0, 5), (1, 1), (3, 7), (10, 10), (19, 20)):
+        expected = beta.ppf(1 - LEVEL, successes, trials - successes + 1) if successes else 0
+        assert lower_bound(successes, trials) == pytest.approx(expected, abs=1e-9)
+
+
+def test_pieces_are_detected_by_size_and_distance(run, evaluate, tmp_path):
+    """Without noise: all of 20 cm and more, and nothing dangerous is ground."""
+    folder, size = tmp_path / 'set', ('--width', 160, '--height', 120)
+    words = 'simulate', 'testpieces', '--sensor', 'ideal', '--scenes', 1, *size
+    assert run(*words, '--output', folder)[0] == 0
+    code, figures, out, _ = evaluate(folder)
+    rows = figures['detection']
+    assert code == 0 and 'test pieces detected' in out
+    assert [(r['kind'], r['size'], r['distance']) for r in rows] == [*all_pieces()]
+    for row in rows:
+        assert row['ground'] == 0, row
+        if row['size'] >= 0.2 and row['scenes']:
+            assert row['detected'] == 1 and row['bound'] == pytest.approx(0.05), row
+    assert sum(row['scenes'] for row in rows) > 40
+    # Of a set without noise every confidence is right.
+    assert all(row['right'] == 1 for row in figures['reliability'])
 
 
 def test_a_simulated_set_is_measured(run, evaluate, tmp_path):

@@ -75,10 +75,10 @@ class Robot:
             )
         )
 
-    def at(self, stamp, x, yaw=0.0):
-        """Where the robot is: x metres along the odometry's x axis."""
+    def at(self, stamp, x, yaw=0.0, z=0.0):
+        """Where the robot is: x metres along the odometry's x axis, z above it."""
         turn = Rotation.from_euler('z', yaw).as_quat()
-        message = transform('odom', 'base_footprint', stamp, turn, (x, 0, 0))
+        message = transform('odom', 'base_footprint', stamp, turn, (x, 0, z))
         self.moving.publish(self.kind(transforms=[message]))
 
 
@@ -197,18 +197,21 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
 
 def test_without_an_up_there_is_no_terrain(tf_messages):
-    """Before tf has come, a minute after it has stopped, and of a camera knocked over."""
+    """Before tf has come, a minute after it has stopped, and of a camera knocked over.
+
+    Nor ground where tf has the camera higher than it is.
+    """
     options = {'gravity_frame': 'odom', 'tf_timeout': 0.1, 'track_time': 20.0}
     arguments = [word for name, value in options.items() for word in ('-p', f'{name}:={value}')]
     topics = 'terrain', 'obstacles', 'grid'
 
-    def published(bench, pitch=PITCH, robot=None, ahead=0):
+    def published(bench, pitch=PITCH, robot=None, ahead=0, z=0.0):
         """Ground pixels, points of obstacles and free cells of an image `ahead` of the clock."""
         image = bench.image(floor_depth(bench.camera, pitch))
         image.header.stamp = later(image.header.stamp, ahead)
         if robot:
             for seconds in (-0.02, 0.02):
-                robot.at(later(image.header.stamp, seconds), 0.0)
+                robot.at(later(image.header.stamp, seconds), 0.0, z=z)
         bench.camera_info.publish(bench.info())
         bench.depth.publish(image)
         terrain, obstacles, grid = (
@@ -233,6 +236,12 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
             lambda s: s.level == DiagnosticStatus.ERROR and 'not known' in s.message,
             lambda: published(bench, ahead=60),
         )
+        found = []
+        bench.reported(
+            lambda s: 'or a wrong height' in values_of(s).get('ground', ''),
+            lambda: found.append(published(bench, robot=robot, ahead=60, z=0.15)),
+        )
+        assert (0, 0) in {(ground, free) for ground, _, free in found}
         assert published(bench, PITCH + np.radians(25), robot, ahead=60) == (0, 0, 0)
         bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'tilted by' in s.message)
 

@@ -253,13 +253,12 @@ def test_what_was_the_ground_stays_it_while_it_is_out_of_view():
     assert share('landing', 1.2, GROUND) < 0.01
     assert share('wall', 1.3, OBSTACLE) > 0.95
     hidden = ground_at('wall', 1.4)
-    assert hidden.remembered == pytest.approx(HEIGHT, abs=0.03)
-    assert str(hidden).startswith('no ground in view: it was')
+    assert 'm below, as is known' in str(hidden)
     assert share('floor', 1.5, GROUND) > 0.95
-    # A table is an obstacle however long it is seen, a deeper level in the end the ground.
-    assert share('table', 30.0, GROUND) < 0.1
-    assert share('landing', 31.0, GROUND) < 0.01
-    assert share('landing', 35.0, GROUND) > 0.9
+    # What holds while no ground is seen is forgotten in the end.
+    patience = Config().track_time
+    assert share('table', 1.4 + patience, GROUND) < 0.1
+    assert share('landing', 1.6 + patience, GROUND) > 0.9
     # Where time begins anew, nothing is known.
     assert share('table', 0.0, GROUND) > 0.95
 

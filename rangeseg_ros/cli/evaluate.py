@@ -9,6 +9,7 @@ import click
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli.compare import ToleranceCommand, tolerance
 from rangeseg_ros.evaluation.datasets import find_cases
+from rangeseg_ros.evaluation.detection import detection_table, detections
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
 from rangeseg_ros.evaluation.measure import Task
 from rangeseg_ros.evaluation.terrain import terrain_figures, terrain_table, terrain_tasks
@@ -60,7 +61,7 @@ def command(
       depth/*.png, truth/*.png, camera.yaml, as `simulate kinect` writes
       folders of depth.png or .tiff, truth.png and camera.txt (fx fy cx cy)
       labelled laser scans *.pcd (x forward, z up, intensity >= 10)
-      terrain.csv, as `simulate terrain` writes: terrain classes
+      terrain.csv, as `simulate terrain` or `testpieces` write: terrain classes
 
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
     with errors of angles and planes where the truth knows them, and each image in `per_image`.
@@ -71,7 +72,10 @@ def command(
         measured = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))
         figures = terrain_figures(measured)
         click.echo(f'{folder}: {len(measured)} images')
-        click.echo(terrain_table(figures))
+        pieces = detections(measured)
+        if pieces:
+            figures['detection'] = [row._asdict() for row in pieces]
+        click.echo(detection_table(pieces) if pieces else terrain_table(figures))
         options.write_json(json_file, figures)
         return
     known = find_cases(folder, min_pixels)

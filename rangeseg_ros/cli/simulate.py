@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,8 @@ from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.hard import HARD
 from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.scene import Terrain
+from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
 from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
@@ -174,21 +176,63 @@ def terrain(
     of pixels with the truth.
     """
     names = [kind] if kind else list(HARD if hard else KINDS)
-    camera = _camera(sensor, seed, width, height)
+    numbers = range(seed, seed + scenes)
+    made = [terrain_scene(names[number % len(names)], number) for number in numbers]
+    _write_terrains(made, sensor, seed, (width, height), output)
+
+
+@command.command()
+@_sensor
+@options.count('--scenes', default=10, help='Of each piece.')
+@click.option(
+    '--mount',
+    type=click.FloatRange(0.1, 3.0),
+    default=0.5,
+    show_default=True,
+    help='Height of the camera above the ground, metres; it is aimed 1.5 m ahead.',
+)
+@_of_all_sets
+def testpieces(
+    sensor: str,
+    scenes: int,
+    mount: float,
+    seed: int,
+    width: int | None,
+    height: int | None,
+    output: Path,
+) -> None:
+    """Cylinders, boxes, kerbs, edges, gaps and ramps of known size at known distances.
+
+    OUTPUT is as that of `simulate terrain`; `rangeseg evaluate OUTPUT` says which of the pieces
+    are detected.
+    """
+    numbers = range(seed, seed + scenes)
+    made = [piece_scene(*piece, mount, number) for piece in all_pieces() for number in numbers]
+    _write_terrains(made, sensor, seed, (width, height), output)
+
+
+def _write_terrains(
+    scenes: Sequence[Terrain],
+    sensor: str,
+    seed: int,
+    size: tuple[int | None, int | None],
+    output: Path,
+) -> None:
+    """Write scenes with numbers from `seed` on, as images of so many columns and rows."""
+    camera = _camera(sensor, seed, *size)
     with (
         options.new_folder(output) as folder,
         TerrainTable(folder / 'terrain.csv') as table,
     ):
         write_camera(folder / 'camera.yaml', camera)
-        for number in options.progress(range(seed, seed + scenes), scenes, 'image'):
-            scene = terrain_scene(names[number % len(names)], number)
+        for number, scene in options.progress(enumerate(scenes, seed), len(scenes), 'image'):
             frame = simulate_terrain(scene, SENSORS[sensor](number), camera, seed=number)
             name = f'{number:06d}'
             _write_depth(folder, name, frame.depth, frame.terrain)
             for part in ('height', 'size', 'crossing'):
                 write_image(folder / part / f'{name}.tiff', getattr(frame, part))
             table.write(name, scene.kind, sensor, *stated(scene, number), scene.stairs)
-    click.echo(f'{output}: {scenes} images')
+    click.echo(f'{output}: {len(scenes)} images')
 
 
 def _camera(sensor: str, seed: int, width: int | None, height: int | None) -> Camera:

@@ -11,9 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GridMemory
-from rangeseg_ros.core.ground.memory import HeightMemory
 from rangeseg_ros.core.ground.roles import roles, unit
-from rangeseg_ros.core.ground.survey import Survey, grid_options
+from rangeseg_ros.core.ground.survey import HeightMemory, Survey, grid_options
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.placement import moved_planes

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,6 +34,8 @@ MARGIN = 3
 """Pixels beside borders of classes that do not count."""
 SIZES = (0.05, 0.075, 0.11, 0.2, 0.4)
 """Heights of obstacles that the table tells apart, metres."""
+CONFIDENCES = (0.0, 0.5, 0.9, 0.99, 0.999, 1.01)
+"""Between which images are counted together."""
 _COLUMNS = ('name', 'kind', 'sensor', 'up_x', 'up_y', 'up_z', 'sensor_height')
 _STAIRS = ('direction', 'count', 'rise', 'run')
 _DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 'tiff'))
@@ -80,6 +83,11 @@ class Shares(NamedTuple):
         (height of the obstacle: index in `SIZES`, distance in whole metres) to pixels of
         obstacles, and how many of them were found.
     stairs : StairsCheck
+    confidence : float
+        That the ground seen is the one that the robot stands on.
+    own : bool
+        Whether it is: most of what is called ground, or where nothing is, of the nearest hundredth
+        of the pixels.
     """
 
     name: str
@@ -87,6 +95,8 @@ class Shares(NamedTuple):
     pixels: NDArray[np.int64]
     found: dict[tuple[int, int], tuple[int, int]]
     stairs: StairsCheck
+    confidence: float = 0.0
+    own: bool = False
 
 
 @dataclass(frozen=True)
@@ -131,11 +141,16 @@ class TerrainTask:
         for key in {(int(a), int(b)) for a, b in zip(sizes, at, strict=True)}:
             here = (sizes == key[0]) & (at == key[1])
             table[key] = int(here.sum()), int((found[obstacle][here] == OBSTACLE).sum())
+        confidence = result.ground.stand.confidence if result.ground else 0.0
+        limit = np.quantile(metres[judged], 0.01) if judged.any() else 0.0
+        called = judged & (found == GROUND)
+        surface = called if called.any() else judged & (metres <= limit)
+        own = bool(np.count_nonzero(truth[surface] == GROUND) * 2 > np.count_nonzero(surface))
         if self.output:
             wrong = judged & (found != truth)
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
             write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
-        return Shares(name, self.row['kind'], pixels, table, stairs)
+        return Shares(name, self.row['kind'], pixels, table, stairs, confidence, own)
 
 
 def _read_truth(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -220,6 +235,7 @@ def terrain_figures(images: Sequence[Shares]) -> dict[str, Any]:
         'pooled': shares(_pooled(images)),
         'by_kind': {kind: shares(_pooled(i for i in images if i.kind == kind)) for kind in kinds},
         'by_size': _by_size(images),
+        'reliability': _reliability(images),
         'stairs': stairs_figures([image.stairs for image in images]),
         'per_image': {i.name: {'kind': i.kind, **shares(i.pixels)} for i in images},
         'drop_scenes_above_0.01': [
@@ -230,6 +246,17 @@ def terrain_figures(images: Sequence[Shares]) -> dict[str, Any]:
 
 def _pooled(images: Iterable[Shares]) -> NDArray[np.int64]:
     return sum((image.pixels for image in images), np.zeros((4, 4), np.int64))
+
+
+def _reliability(images: Sequence[Shares]) -> list[dict[str, float]]:
+    """Of images by their confidence, how often the ground seen is the robot's own."""
+    rows = []
+    for low, high in pairwise(CONFIDENCES):
+        told = np.array([(i.confidence, i.own) for i in images if low <= i.confidence < high])
+        if len(told):
+            mean, right = told.mean(axis=0).tolist()
+            rows.append({'from': low, 'images': len(told), 'confidence': mean, 'right': right})
+    return rows
 
 
 def _by_size(images: Sequence[Shares]) -> dict[str, dict[str, float]]:
@@ -254,6 +281,11 @@ def terrain_table(figures: Mapping[str, Any]) -> str:
     for kind, row in {**figures['by_kind'], 'all': figures['pooled']}.items():
         lines.append(f'{kind:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))
     lines.append(f'drop called ground above 0.01: {len(figures["drop_scenes_above_0.01"])} scenes')
+    told = (
+        f'{row["confidence"]:.3f}: {row["right"]:.3f} of {row["images"]}'
+        for row in figures['reliability']
+    )
+    lines.append(f'confidence in the ground, and how often it was right: {", ".join(told)}')
     lines.append('obstacles found, from this height (m) on, at 0, 1, 2, 3 m:')
     for least, row in figures['by_size'].items():
         lines.append(f'{least:<18}' + ''.join(f'{_share(value):>9}' for value in row.values()))

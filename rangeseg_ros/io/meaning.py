@@ -17,9 +17,9 @@ STAIRS = (
 )
 """Columns of stairs: ends of the first edge in the frame of the image; metres."""
 GROUND = ('found', 'height', 'confidence', 'tilt')
-"""Columns of the ground: whether one is found, how far below the camera it is, or was when it is
-out of view, metres, how likely it is the floor that the robot stands on, and degrees between the
-stated up and that of the planes, 0 where they agree."""
+"""Columns of the ground: whether one is found, how far below the camera it is, metres, how likely
+it is the floor that the robot stands on, and degrees between the stated up and that of the planes,
+0 where they agree."""
 
 
 def stairs_row(stairs: Stairs) -> list[str]:
@@ -37,8 +37,7 @@ def ground_row(result: Segmentation) -> list[str]:
     """Values of an image for the columns `GROUND`."""
     ground, tilt = result.ground, result.tilt.degrees if result.tilt else 0.0
     if ground is None or not ground.stand.surface:
-        remembered = ground.remembered if ground else 0.0
-        return ['0', f'{remembered:.9g}' if remembered else '', '', f'{tilt:.9g}']
+        return ['0', '', '', f'{tilt:.9g}']
     height = ground.stand.height(ground.field.up)
     return ['1', *(f'{x:.9g}' for x in (height, ground.stand.confidence, tilt))]
 

@@ -56,15 +56,16 @@ class Cells(NamedTuple):
     error : (...) float32
         Standard deviation of the height of a pixel, metres: by the sensor model, or by how much
         neighbouring pixels differ where that is more, as it is on grass and gravel.
-    mixed : (...) bool
-        Whether the pixels are of two surfaces: they differ by more than by noise.
+    variance : (...) float64
+        Of the mean height, metres^2; 0 where not measured, and where the pixels are of two
+        surfaces: they differ by more than by noise.
     """
 
     ray: NDArray[np.float32]
     inverse: NDArray[np.float32]
     place: NDArray[np.float32]
     error: NDArray[np.float32]
-    mixed: NDArray[np.bool_]
+    variance: NDArray[np.float64]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -102,8 +103,10 @@ def cells_of(
             random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter[0], 5)
         )
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
-    mixed = (scatter > OUTLIER * variance).any(axis=0)
-    return Cells(ray, inverse, place, error.astype(np.float32), mixed)
+    whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
+    share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
+    of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
+    return Cells(ray, inverse, place, error.astype(np.float32), of_mean)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

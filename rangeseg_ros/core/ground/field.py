@@ -156,7 +156,9 @@ def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np
 
 
 def classify(
-    image: RangeImage, field: GroundField, bounds: NDArray[np.float32]
+    image: RangeImage,
+    field: GroundField,
+    bounds: NDArray[np.float32],
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Class and height of every pixel.
 
@@ -165,9 +167,9 @@ def classify(
     image : RangeImage
         (H, W).
     field : GroundField
-    bounds : (4, rows, columns) float32
-        Of the cells, metres: a pixel that is lower than the first is a drop, between the second
-        and the third ground, higher than the fourth an obstacle.
+    bounds : (3, rows, columns) float32
+        Of the cells, metres: up to the first off the ground a pixel is ground, below the second
+        a drop, above the third an obstacle, and these count more than the first.
 
     Returns
     -------
@@ -203,8 +205,8 @@ def _classify(
         for v in range(i * size.rows, min((i + 1) * size.rows, height)):
             for c in range(rise.shape[1]):
                 a, b, d, up = theta[0, i, c], theta[1, i, c], theta[2, i, c], rise[i, c]
-                lowest, low, high = bounds[0, i, c], bounds[1, i, c], bounds[2, i, c]
-                highest = bounds[3, i, c]
+                flat, lowest, highest = bounds[0, i, c], bounds[1, i, c], bounds[2, i, c]
+                low, high = max(-flat, lowest), min(flat, highest)
                 for j in range(c * size.columns, min((c + 1) * size.columns, width)):
                     x, y, z = ray_of(rays, pinhole, v, j)
                     s = inverse[v, j]

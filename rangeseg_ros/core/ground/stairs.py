@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -28,8 +27,8 @@ The rise from the International Building Code (1011.5.2, four inches at least) t
 (24 cm at most), the run from private stairs to those of general access in the British Approved
 Document K, table 1.1.
 """
-# Tangents of the flattest and the steepest stairs: what is flatter is level.
-_FLATTEST, _STEEPEST = RISE[0] / _RUN[1], RISE[1] / _RUN[0]
+# Tangent of the flattest stairs: what is flatter is level.
+_FLATTEST = RISE[0] / _RUN[1]
 # Treads and noses are within so much of a rise and a run of where they should be: nearer to that
 # than to the middle between two.
 _UNEVEN = 1 / 4
@@ -67,21 +66,6 @@ class Stairs:
         return f'{self.direction} {self.count} x {self.rise:.2f} / {self.run:.2f} m'
 
 
-class _Noses(NamedTuple):
-    """Noses of treads in the columns of cells.
-
-    Attributes
-    ----------
-    number : (N,) int64
-        Of the tread; 0 for the edge of the ground.
-    place : (N, 2) float64
-        On two horizontal axes, metres.
-    """
-
-    number: NDArray[np.int64]
-    place: NDArray[np.float64]
-
-
 def stairs_of(terrain: Terrain) -> list[Stairs]:
     """Staircases in sight: none or one up, none or one down.
 
@@ -94,6 +78,8 @@ def stairs_of(terrain: Terrain) -> list[Stairs]:
     if cells is None:
         return []
     found = []
+    if not cells.turned:
+        cells = cells.turned_over()
     for sign in (1, -1):
         # Nobody sees a tread from below.
         highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST
@@ -105,42 +91,21 @@ def stairs_of(terrain: Terrain) -> list[Stairs]:
     return found
 
 
-@njit(cache=True, nogil=True)
 def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.float32]:
-    """Heights of level cells off the ground, times `sign`; 0 for all others.
-
-    Only those that can be of stairs which begin where the ground ends in their column: not nearer
-    than the steepest stairs are so high, not farther than the flattest.
-    """
-    height, place, kind, unsure = cells.height, cells.place, cells.kind, cells.unsure
-    rows, columns = height.shape
-    level = np.zeros((rows, columns), np.float32)
-    for c in range(columns):
-        x = y = np.float32(np.nan)
-        for m in range(rows):
-            i = m if cells.turned else rows - 1 - m
-            h = sign * height[i, c]
-            if kind[i, c] == GROUND and abs(h) < RISE[0] / 2:
-                x, y = place[1, i, c], place[2, i, c]
-            # Also false where nothing is measured.
-            if not RISE[0] / 2 < h < highest or unsure[i, c] > _UNEVEN * RISE[1]:
-                continue
-            a, b = place[1, i, c] - x, place[2, i, c] - y
-            way = np.sqrt(a * a + b * b)
-            # Half as steep where the columns are at 60 degrees to the stairs. Also false where no
-            # ground was.
-            if not _FLATTEST / 2 * way - RISE[1] < h < _STEEPEST * way + RISE[1]:
-                continue
-            # A tread that is too thin to be measured is still seen between two risers.
-            for step in (-1, 1):
-                k = i + step
-                while 0 < k < rows - 1 and np.isnan(height[k, c]):
-                    k += step
-                if 0 <= k < rows:
-                    p, q = place[1, i, c] - place[1, k, c], place[2, i, c] - place[2, k, c]
-                    if abs(height[i, c] - height[k, c]) < _FLATTEST * np.sqrt(p * p + q * q):
-                        level[i, c] = h
-    return level
+    """Heights of level cells off the ground, times `sign`; 0 for all others."""
+    rows = np.arange(len(cells.height))[:, None]
+    columns = np.arange(cells.height.shape[1])[None]
+    measured = np.isfinite(cells.height)
+    before = np.maximum.accumulate(np.where(measured, rows, 0), axis=0)[:-1]
+    # A tread that is too thin to be measured is still seen between two risers.
+    apart = cells.place[:, 1:] - cells.place[:, before, columns]
+    flat = np.abs(apart[0]) < _FLATTEST * np.hypot(apart[1], apart[2])
+    level = np.zeros(measured.shape, np.bool_)
+    level[1:] = flat
+    level[before[flat], np.nonzero(flat)[1]] = True
+    height = sign * cells.height
+    level &= (height > RISE[0] / 2) & (height < highest)
+    return np.where(level & (cells.unsure <= _UNEVEN * RISE[1]), height, np.float32(0))
 
 
 @njit(cache=True, nogil=True)
@@ -174,49 +139,25 @@ def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
     return rise, count
 
 
-@njit(cache=True, nogil=True)
 def _find_noses(
-    cells: CellTerrain, level: NDArray[np.float32], up: bool, rise: float, count: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-    """Noses of treads, their places, and the number of each cell's tread; 0 elsewhere."""
-    place, kind, height = cells.place, cells.kind, cells.height
-    rows, columns = level.shape
-    number, found = np.zeros((rows, columns), np.int64), 0
-    numbers, places = np.empty(rows * columns, np.int64), np.empty((rows * columns, 2))
-    for c in range(columns):
-        # The cell measured before, and the farthest one of the tread or the ground that was last.
-        before, last, tread = -1, -1, 0
-        for m in range(rows):
-            i = m if cells.turned else rows - 1 - m
-            if np.isnan(place[0, i, c]):
-                continue
-            k = int(level[i, c] / rise + 0.5)
-            if k > count or abs(level[i, c] - k * rise) > _UNEVEN * rise:
-                k = 0
-            number[i, c] = k
-            # Near its edge, the ground is not told as such.
-            if abs(height[i, c]) < _UNEVEN * rise and (kind[i, c] == GROUND or tread == 0):
-                last, tread = i, 0
-            elif k and last >= 0:
-                if k == tread + 1 and up:
-                    # The riser below is where the nose is, the tread begins behind it.
-                    numbers[found] = k
-                    places[found] = place[1:, before, c]
-                    found += 1
-                elif k == tread + 1:
-                    numbers[found] = tread
-                    # Half a cell goes on behind its middle.
-                    inner = last + 1 if not cells.turned else last - 1
-                    for n in range(2):
-                        places[found, n] = place[1 + n, last, c]
-                        if 0 <= inner < rows and not np.isnan(place[0, inner, c]):
-                            step = place[1 + n, last, c] - place[1 + n, inner, c]
-                            places[found, n] += step / 2
-                    found += 1
-                if k >= tread:
-                    last, tread = i, k
-            before = i
-    return numbers[:found].copy(), places[:found].copy(), number
+    place: NDArray[np.float32], tread: NDArray[np.int64], up: bool, count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Numbers (N,) of treads and places (N, 2) of their noses, in each column from near to far.
+
+    Where a tread comes into view behind its riser, and where one ends going down.
+    """
+    rows = np.arange(len(tread))[:, None]
+    numbers, places = [], []
+    for k in range(1, count + 1):
+        begin = np.where((tread == k).any(axis=0), (tread == k).argmax(axis=0), 0)
+        before = (tread == k - 1) & (rows < begin)
+        last = len(tread) - 1 - before[::-1].argmax(axis=0)
+        columns = np.flatnonzero(before.any(axis=0))
+        nose = (begin - 1 if up else last)[columns]
+        there = np.isfinite(place[0, nose, columns])
+        places.append(place[1:, nose[there], columns[there]].T)
+        numbers.append(np.full(np.count_nonzero(there), k if up else k - 1))
+    return np.concatenate(numbers), np.concatenate(places).astype(np.float64)
 
 
 def _staircase(
@@ -228,18 +169,18 @@ def _staircase(
     terrain: Terrain,
 ) -> Stairs | None:
     """The staircase with so many treads of that rise; None where the noses do not fit."""
-    number, place, tread = _find_noses(cells, level, sign > 0, rise, count)
-    seen = _Noses(number, place)
+    tread = np.rint(level / rise).astype(np.int64)
+    tread[(tread < 1) | (tread > count) | (np.abs(level - rise * tread) > _UNEVEN * rise)] = -1
+    tread[(cells.kind == GROUND) & (np.abs(cells.height) < _UNEVEN * rise)] = 0
+    number, place = _find_noses(cells.place, tread, sign > 0, count)
     first = int(sign > 0)
     # Treads that follow each other, each with a nose but the landing at the foot of stairs down.
-    enough = np.bincount(number, minlength=count + 1) >= SAMPLES
-    last = first
-    while last <= count and enough[last]:
-        last += 1
-    seen = _Noses(number[number < last], place[number < last])
+    enough = np.bincount(number, minlength=count + 2) >= SAMPLES
+    last = first + int(enough[first:].argmin())
     if last - first < 2:
         return None
-    fitted = _fit_noses(seen)
+    number, place = number[number < last], place[number < last]
+    fitted = _fit_noses(number, place)
     if fitted is None:
         return None
     start, ahead, run, fits = fitted
@@ -248,10 +189,10 @@ def _staircase(
     across = np.array([-ahead[1], ahead[0]])
     sides = []
     for k in range(first, last):
-        here = fits & (seen.number == k)
+        here = fits & (number == k)
         if here.sum() < SAMPLES:
             return None
-        sides.append(np.quantile(seen.place[here] @ across, (0.02, 0.98)))
+        sides.append(np.quantile(place[here] @ across, (0.02, 0.98)))
     # Boxes of several heights stand side by side, treads one behind the other.
     for (left, right), (low, high) in pairwise(sides):
         if min(right, high) - max(left, low) < min(right - left, high - low) / 2:
@@ -273,14 +214,14 @@ def _staircase(
 
 
 def _fit_noses(
-    noses: _Noses,
+    number: NDArray[np.int64], place: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], float, NDArray[np.bool_]] | None:
     """Where tread 0 has its nose, direction, run, and which noses fit; None if most do not."""
-    design = np.column_stack([np.ones(len(noses.place)), noses.place])
+    design = np.column_stack([np.ones(len(place)), place])
     fits = np.ones(len(design), np.bool_)
     for _ in range(4):
-        solved = np.linalg.lstsq(design[fits], noses.number[fits].astype(float), rcond=None)[0]
-        off = np.abs(design @ solved - noses.number)
+        solved = np.linalg.lstsq(design[fits], number[fits].astype(float), rcond=None)[0]
+        off = np.abs(design @ solved - number)
         fits = off <= max(_UNEVEN, float(np.median(off)))
     fits = off <= _UNEVEN
     slope = float(np.linalg.norm(solved[1:]))

@@ -9,11 +9,36 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.grid import GridMemory, GridOptions, GroundGrid
-from rangeseg_ros.core.ground.memory import HeightMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+class HeightMemory:
+    """How high a camera is above the ground, found where it is not stated.
+
+    Parameters
+    ----------
+    patience : float
+        Seconds for which it holds while no ground is seen.
+    """
+
+    def __init__(self, patience: float) -> None:
+        self.patience = patience
+        self.forget()
+
+    def forget(self) -> None:
+        """Know nothing."""
+        self._height, self._stamp = 0.0, 0
+
+    def recall(self, stamp: int) -> float:
+        """The height, metres, as it was found last; 0 for unknown."""
+        return self._height if stamp - self._stamp <= 1e9 * self.patience else 0.0
+
+    def remember(self, height: float, stamp: int) -> None:
+        """Take a height that was found, metres, in the image of a time, nanoseconds."""
+        self._height, self._stamp = height, stamp
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,21 +113,20 @@ class Survey:
 
     def terrain(self) -> Terrain:
         """Find it."""
-        if self.sensor_height > 0:
-            return self._found((self.sensor_height, self.height_noise))
-        if self.memory is None:
-            return self._found((0.0, 0.0))
-        # A robot nods and a floor undulates, by less than an obstacle is high.
-        doubt = min(self.limits.obstacle, self.limits.drop)
-        return self.memory.terrain(self._found, doubt, self.stamp)
+        known = self.sensor_height, self.height_noise
+        remembered = self.memory.recall(self.stamp) if self.memory else 0.0
+        if self.sensor_height <= 0:
+            # A robot nods and a floor undulates, by less than an obstacle is high.
+            known = (remembered, self.limits.least) if remembered else (0.0, 0.0)
+        found = terrain_of(self.image, self.sensor, self.up, known, self.limits)
+        if self.memory and found.stand.surface:
+            self.memory.remember(found.stand.height(self.up), self.stamp)
+        return found
 
     def ground_grid(self, terrain: Terrain) -> GroundGrid:
         """The grid of the images before, with the terrain of this one."""
         place = self.image.place
         return self.grid.add(terrain, self.up, self.stamp, place, self.pose, self.fixed_frame)
-
-    def _found(self, known: tuple[float, float]) -> Terrain:
-        return terrain_of(self.image, self.sensor, self.up, known, self.limits)
 
 
 def grid_options(config: Config) -> GridOptions:

@@ -15,22 +15,18 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
-from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued, first_plane
+from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of the noise within which the ground is the ground, and beyond which it is
 # known to be none.
 _CERTAIN = 3.0
-# Of the least obstacle or drop: what ground differs by however precise the sensor is, what is none
-# of it where it was reached, and where no chain leads.
-_FLAT, _NEAR, _APART = 0.25, 0.8, 0.5
 # Cells over which the relief of the ground is measured.
 _RELIEF = (9, 25)
-# Surfaces that are tried, the nearest first, until one agrees with the stated height.
-_TRIALS = 3
+_SQUARE = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
 FURNITURE = 1.5
@@ -89,6 +85,12 @@ class CellTerrain(NamedTuple):
     crossing: NDArray[np.float32]
     turned: bool
 
+    def turned_over(self) -> CellTerrain:
+        """With the rows in the other order."""
+        place, crossing = self.place[:, ::-1], self.crossing[:, ::-1]
+        height, kind, unsure = self.height[::-1], self.kind[::-1], self.unsure[::-1]
+        return CellTerrain(place, height, kind, unsure, crossing, not self.turned)
+
 
 class Terrain(NamedTuple):
     """What the pixels of an image are to a robot.
@@ -105,8 +107,6 @@ class Terrain(NamedTuple):
         The ground continued everywhere; zeros where none is known.
     cells : CellTerrain or None
         The same of cells, where ground is known.
-    remembered : float
-        How far below the camera the ground was, metres, when it is out of view; 0 for unknown.
     """
 
     classes: NDArray[np.uint8]
@@ -114,13 +114,11 @@ class Terrain(NamedTuple):
     stand: Stand
     field: GroundField
     cells: CellTerrain | None = None
-    remembered: float = 0.0
 
     def __str__(self) -> str:
         """Where the ground is and how sure that is, in a few words."""
         if not self.stand.surface:
-            where = f': it was {self.remembered:.2f} m below' if self.remembered else ''
-            return '; '.join([f'no ground in view{where}', *self.stand.reasons])
+            return '; '.join(['no ground in view', *self.stand.reasons])
         height, confidence = self.stand.height(self.field.up), self.stand.confidence
         return f'ground {height:.2f} m below, confidence {confidence:.2f}'
 
@@ -172,101 +170,28 @@ def _upright(
     """The same for an image whose columns are along up; `turned` where up is down in it."""
     size = CellSize.for_image(image.shape)
     cells = cells_of(image, size, up, sensor)
-    place, variance = _smoothed(cells, size, sensor, limits.least)
+    place, variance = cells.place.astype(np.float64), cells.variance
     height, height_sd = known
-    height = height or _lowest(place, variance, turned)
+    height = height or _nearest(place[0], turned)
     place[0] += height
-    seen: list[Continuation] = []
-    left = variance.copy()
-    for _ in range(_TRIALS):
-        reached = _reach(place, left, height_sd, limits, turned)
-        if not reached.any():
-            break
-        smooth = _smooth_variance(place[:, reached], height, sensor, size)
-        error = 4 * variance[reached] + smooth
-        slope = float(np.tan(limits.slope))
-        found = continued(place[:, reached], error, height_sd, slope, limits.least)
-        # Without a height the ground is what the camera stands on: a table tells by its size.
-        sure = found.confidence >= SURE if height_sd > 0 else found.size >= FURNITURE
-        # What is nearer may be the robot's own floor, by another height than the stated one.
-        highest = HIGHEST if height_sd > 0 else np.inf
-        if sure and not any(found.behind_step(nearer, highest) for nearer in seen):
-            stand = Stand(1, _theta(found, height, up), found.confidence)
-            return _with_ground(image, cells, size, reached, stand, up, limits, turned)
-        seen.append(found)
-        left[reached] = 0
-    nearest = seen[0] if seen else None
-    return _without_ground(image, cells, size, nearest, up, known, limits)
+    steepest, highest = limits.slope + limits.tilt, HIGHEST if height_sd > 0 else np.inf
+    reached = reach(place, variance, highest, limits.least, float(np.tan(steepest)), turned)
+    if not reached.any():
+        return _without_ground(image, cells, size, None, up, known, limits)
+    slope = float(np.tan(limits.slope))
+    found = continued(place[:, reached], 4 * variance[reached], height_sd, slope, limits.least)
+    # Without a height the ground is what the camera stands on: a table tells by its size.
+    if found.confidence < SURE if height_sd > 0 else found.size < FURNITURE:
+        return _without_ground(image, cells, size, found, up, known, limits)
+    stand = Stand(1, _theta(found, height, up), found.confidence)
+    return _with_ground(image, cells, size, reached, stand, up, limits, turned)
 
 
-def _smoothed(
-    cells: Cells, size: CellSize, sensor: SensorModel, least: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places of cells and the variances of their heights, 0 where nothing is measured.
-
-    Where noise is a large part of the least step, heights are medians of neighbours.
-    """
-    place = cells.place.astype(np.float64)
-    there = cells.inverse > 0
-    share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
-    square = cells.error.astype(np.float64) ** 2
-    variance = np.where(there & ~cells.mixed, square * share + 1e-8, 0.0)
-    noisy = variance > (least / 8) ** 2
-    if noisy.any():
-        lowest = np.float32(-1e4)
-        median = cv2.medianBlur(np.where(there, cells.place[0], lowest), 5)
-        noisy &= median > lowest
-        place[0][noisy] = median[noisy]
-        variance[noisy] /= 4
-    return place, variance
-
-
-def _nearest(variance: NDArray[np.float64], turned: bool) -> NDArray[np.int64]:
-    """Row of the nearest measured cell of each column; -1 for none."""
-    there = variance > 0 if turned else variance[::-1] > 0
-    row = there.argmax(axis=0)
-    if not turned:
-        row = len(variance) - 1 - row
-    return np.where(there.any(axis=0), row, -1)
-
-
-def _lowest(place: NDArray[np.float64], variance: NDArray[np.float64], turned: bool) -> float:
+def _nearest(above: NDArray[np.float64], turned: bool) -> float:
     """How far below the sensor the nearest cells are, metres, where no height is stated."""
-    nearest = _nearest(variance, turned)
-    columns = np.flatnonzero(nearest >= 0)
-    if not len(columns):
-        return 1.0
-    return max(-float(np.median(place[0, nearest[columns], columns])), 0.02)
-
-
-def _reach(
-    place: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    height_sd: float,
-    limits: Limits,
-    turned: bool,
-) -> NDArray[np.bool_]:
-    """Cells that a chain from the nearest ones leads to."""
-    nearest = _nearest(variance, turned)
-    errors = (2 * height_sd or 1.0, float(np.tan(limits.slope)) / 2)
-    plane = first_plane(place, variance, nearest, errors, limits.least)
-    steepest = float(np.tan(limits.slope + limits.tilt))
-    return reach(place, variance, nearest, plane, limits.least, steepest, turned)
-
-
-def _smooth_variance(
-    place: NDArray[np.float64], height: float, sensor: SensorModel, size: CellSize
-) -> NDArray[np.float64]:
-    """Variance (N,) of the heights of cells by the sensor's distortion, metres^2.
-
-    All of a patch of it errs alike, 4 pi times the square of its width: it counts for every cell.
-    """
-    square = (place[0] - height) ** 2 + place[1] ** 2 + place[2] ** 2
-    patch = max(4 * np.pi * sensor.distortion_length**2 / (size.rows * size.columns), 1.0)
-    variance: NDArray[np.float64] = (
-        patch * systematic_variance.py_func(sensor, 1 / square) * square * (place[0] - height) ** 2
-    )
-    return variance
+    rows = above if turned else above[::-1]
+    nearest = rows[np.isfinite(rows).argmax(axis=0), np.arange(rows.shape[1])]
+    return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
 
 
 def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -299,20 +224,20 @@ def _with_ground(
     with np.errstate(divide='ignore', invalid='ignore'):
         relief = np.where(count > 0, squares / count, 0)
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
-    beside = cv2.dilate(reached.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-    flat = np.clip(noise, _FLAT * limits.least, limits.least)
-    flat = np.where(reached, flat, np.minimum(flat, limits.least / 2))
-    share = np.where(reached, np.float32(_NEAR), np.float32(_APART))
-    bounds = np.empty((4, *reached.shape), np.float32)
+    # Among cells that a chain leads to, noise keeps some out of it.
+    closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
+    reached, beside = closed > 0, cv2.dilate(closed, _SQUARE[1:-1, 1:-1]) > 0
+    # Where no chain leads, half as much is no ground.
+    share = np.where(reached, np.float32(1), np.float32(0.5))
     sure = np.float32(_CERTAIN) * cells.error
-    bounds[0] = -np.maximum(share * limits.drop, np.minimum(sure, _CERTAIN * limits.drop))
-    bounds[3] = np.maximum(share * limits.obstacle, np.minimum(sure, _CERTAIN * limits.obstacle))
-    bounds[1] = np.where(beside, np.maximum(-flat, bounds[0]), np.inf)
-    bounds[2] = np.where(beside, np.minimum(flat, bounds[3]), -np.inf)
+    bounds = np.empty((3, *reached.shape), np.float32)
+    bounds[0] = np.where(beside, np.clip(noise, limits.least / 4, share * limits.least), -1)
+    bounds[1] = -np.maximum(share * limits.drop, sure)
+    bounds[2] = np.maximum(share * limits.obstacle, sure)
     classes, heights = classify(image, field, bounds)
-    kind = np.where(reached, GROUND, UNKNOWN).astype(np.int8)
-    kind[height > bounds[3]] = OBSTACLE
-    kind[height < bounds[0]] = DROP
+    kind = np.where(reached & np.isfinite(height), GROUND, UNKNOWN).astype(np.int8)
+    kind[height > bounds[2]] = OBSTACLE
+    kind[height < bounds[1]] = DROP
     along = (field.theta * cells.ray).sum(axis=0)
     with np.errstate(divide='ignore', invalid='ignore'):
         flat_axes = axes_of(up)[1:].astype(np.float32)
@@ -366,7 +291,7 @@ def _without_ground(
             why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
         reasons = (why,)
     elif height > 0:
-        reasons = (f'no ground that is seen is {height:.2f} m below, as is stated',)
+        reasons = (f'no ground that is seen is {height:.2f} m below, as is known',)
     elif seen:
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
