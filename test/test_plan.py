@@ -12,6 +12,7 @@ import trimesh
 import yaml
 from click.testing import CliRunner
 from recordings import Recording
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.cli.main import rangeseg
@@ -216,7 +217,8 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
         plane(3, turned(25.0), (-2, 0, 1), one),
         plane(4, turned(24.0), (-3, 0, 1), 10 * one),
     ]
-    squared = square_up(walls, np.radians(10))
+    joint = block_diag(*(wall.covariance for wall in walls))
+    squared = square_up(walls, joint, np.radians(10))
     assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
     assert abs(squared[0].plane.normal @ squared[1].plane.normal) < 1e-12
     assert abs(np.cross(squared[0].plane.normal, squared[3].plane.normal)).max() < 1e-12

@@ -19,6 +19,7 @@ from rangeseg_ros.core.mapping.right_angles import Squared, square_up
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 _ROUNDS = 5  # until the direction of up settles
 
@@ -162,6 +163,7 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
 
 def make_plan(
     planes: Sequence[MapPlane],
+    covariance: NDArray[np.float64],
     frame: str,
     up: Up,
     voxels: tuple[NDArray[np.float64], NDArray[np.int64]],
@@ -174,6 +176,9 @@ def make_plan(
     Parameters
     ----------
     planes : sequence of MapPlane
+        P of them.
+    covariance : (4 P, 4 P) float64
+        Of the normals and distances of all of them.
     frame : str
         Their frame.
     up : Up
@@ -188,7 +193,9 @@ def make_plan(
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)
-    squared = square_up(moved_planes(planes, motion), tolerance)
+    turned = np.kron(np.eye(len(planes)), moved_plane(*motion))
+    covariance = turned @ covariance @ turned.T
+    squared = square_up(moved_planes(planes, motion), covariance, tolerance)
     roles, ground = _roles([s.plane for s in squared], config)
     squared = [
         s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
