@@ -36,9 +36,8 @@ class Sightings(NamedTuple):
         Mean inverse depth 1/z, 1/m.
     ray : (N, 3) float64
         Mean ray, scaled to z = 1.
-    jumps : (F, 2, W - 1) float64
-        Of each frame and pair of neighbouring columns: the sum over the rows of the change of the
-        residual from the left to the right column, 1/m, and the number of rows.
+    frames : int
+        Number of frames, with those that show no plane.
     """
 
     frame: NDArray[np.intp]
@@ -46,7 +45,7 @@ class Sightings(NamedTuple):
     cell: NDArray[np.intp]
     inverse: NDArray[np.float64]
     ray: NDArray[np.float64]
-    jumps: NDArray[np.float64]
+    frames: int
 
     def plane(self) -> NDArray[np.intp]:
         """Plane (N,) that each cell belongs to."""
@@ -59,19 +58,12 @@ class Sightings(NamedTuple):
         shape = len(self.cell), 3 * len(self.frame)
         return sparse.csr_array((self.ray.ravel(), columns.ravel(), pointers), shape)
 
-    def of_frames(self, chosen: NDArray[np.bool_]) -> Sightings:
-        """Those of the frames that are chosen, (F,); the frames keep their numbers."""
-        plane = chosen[self.frame]
-        cells = plane[self.plane()]
-        counts = np.diff(self.start)[plane]
-        return Sightings(
-            self.frame[plane],
-            np.concatenate([[0], np.cumsum(counts)]),
-            self.cell[cells],
-            self.inverse[cells],
-            self.ray[cells],
-            self.jumps * chosen[:, None, None],
-        )
+    def of_planes(self, chosen: NDArray[np.bool_]) -> Sightings:
+        """Those of the planes that are chosen, (P,)."""
+        cells = chosen[self.plane()]
+        start = np.concatenate([[0], np.cumsum(np.diff(self.start)[chosen])])
+        parts = self.cell[cells], self.inverse[cells], self.ray[cells]
+        return Sightings(self.frame[chosen], start, *parts, self.frames)
 
 
 def cell_size(shape: tuple[int, int]) -> int:
@@ -98,10 +90,8 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     size, (rows, columns) = cell_size(labels.shape), cell_grid(labels.shape)
     height, width = labels.shape
     cells = np.arange(height)[:, None] // size * columns + np.arange(width) // size
-    residual = np.full(labels.shape, np.nan)
     found = []
-    for mask, y, ray, error in plane_pixels(labels, image, SAMPLES * size * size):
-        residual[mask] = error
+    for mask, y, ray, _ in plane_pixels(labels, image, SAMPLES * size * size):
         own = cells[mask]
         count = np.bincount(own, minlength=rows * columns)
         # Where half of a cell is the plane's, its mean stands for the cell.
@@ -110,8 +100,6 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
             continue
         sums = [np.bincount(own, part, len(count))[kept] for part in (y, *ray.T)]
         found.append((kept, np.stack(sums, axis=1) / count[kept, None]))
-    step = np.where(labels[:, 1:] == labels[:, :-1], np.diff(residual, axis=1), np.nan)
-    jumps = np.stack([np.nansum(step, axis=0), np.isfinite(step).sum(axis=0)])
     means = np.concatenate([np.empty((0, 4)), *(part for _, part in found)])
     return Sightings(
         np.zeros(len(found), np.intp),
@@ -119,7 +107,7 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
         np.concatenate([np.empty(0, np.intp), *(kept for kept, _ in found)]),
         means[:, 0],
         means[:, 1:],
-        jumps[None].astype(np.float64),
+        1,
     )
 
 
@@ -168,13 +156,13 @@ def _residual(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArra
 
 def concatenate(frames: Sequence[Sightings]) -> Sightings:
     """Sightings of several frames, numbered one after the other."""
-    first = np.cumsum([0, *(len(part.jumps) for part in frames)])
+    first = np.cumsum([0, *(part.frames for part in frames)]).tolist()
     counts = np.concatenate([np.diff(part.start) for part in frames])
     return Sightings(
-        np.concatenate([part.frame + at for part, at in zip(frames, first, strict=False)]),
+        np.concatenate([part.frame + at for part, at in zip(frames, first[:-1], strict=True)]),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         np.concatenate([part.cell for part in frames]),
         np.concatenate([part.inverse for part in frames]),
         np.concatenate([part.ray for part in frames]),
-        np.concatenate([part.jumps for part in frames]),
+        first[-1],
     )
