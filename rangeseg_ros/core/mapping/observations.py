@@ -71,6 +71,10 @@ class Observations(NamedTuple):
         index = np.array(chosen, np.intp)
         return Observations(*(part[index] for part in self))
 
+    def covariance(self) -> NDArray[np.float64]:
+        """(M, 4, 4) of all of the error."""
+        return self.fresh + congruent(self.lasting, np.eye(3))
+
     def tangent_frame(self) -> tuple[NDArray[np.float64], ...]:
         """Normals (M, 3), their tangents (M, 2, 3), and points (M, 3) on the planes."""
         normal = self.plane[:, :3]
