@@ -13,7 +13,6 @@ from rangeseg_ros.core.calibration.calibrate import (
     without_plane,
 )
 from rangeseg_ros.core.calibration.field import _roughness, solve
-from rangeseg_ros.core.calibration.residuals import LAGS, products, randomness
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
 from rangeseg_ros.simulation.fields import smooth_field
 
@@ -177,23 +176,6 @@ def test_smoothness_does_not_punish_what_is_free():
     assert roughness(offset, u * v) == pytest.approx(2 * 5 * 8)
     assert roughness(offset, u * u) == pytest.approx(2**2 * 6 * 7)
     assert roughness(slope, u) == pytest.approx(6 * 8)
-
-
-def test_noise_and_what_remains_are_measured():
-    random = np.random.default_rng(1)
-    labels = np.ones(CAMERA.shape, np.uint16)
-    sums = np.zeros((2, len(LAGS)))
-    for _ in range(30):
-        error = 0.0005 * random.standard_normal(CAMERA.shape)
-        error += 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
-        depth = (1 / (CAMERA.rays.astype(float) @ [0.1, 0.1, 0.6] + error)).astype(np.float32)
-        sums += products(labels, RangeImage.from_depth(depth, CAMERA))
-    found = randomness(sums)
-    assert found.noise == pytest.approx(np.hypot(0.0005, 0.001), rel=0.05)
-    assert found.white_noise == pytest.approx(0.2, abs=0.05)
-    assert found.noise_correlation == pytest.approx(2.0, rel=0.15)
-    assert found.distortion < 0.0003
-    assert randomness(np.zeros((2, len(LAGS)))) is None
 
 
 @pytest.mark.parametrize(

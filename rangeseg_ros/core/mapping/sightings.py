@@ -35,18 +35,13 @@ def may_be_in_sight(
     camera = image.camera
     if camera is None:
         return np.zeros(len(centres), np.bool_)
-    # Four sides of a pyramid through the borders of the outermost pixels, and its front.
-    sides = np.array(
-        [
-            (camera.fx, 0, camera.cx + 0.5),
-            (-camera.fx, 0, camera.width - 0.5 - camera.cx),
-            (0, camera.fy, camera.cy + 0.5),
-            (0, -camera.fy, camera.height - 0.5 - camera.cy),
-            (0, 0, 1),
-        ]
-    )
-    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    return (centres @ camera.axes @ sides.T >= -radii[:, None]).all(axis=1)
+    # A cone around the optical axis, through the farthest corner.
+    right = max(camera.cx + 0.5, camera.width - 0.5 - camera.cx) / camera.fx
+    down = max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy
+    slope = float(np.hypot(right, down))
+    x, y, z = (centres @ camera.axes).T
+    outside: NDArray[np.float64] = np.hypot(x, y) - slope * z
+    return (outside <= radii * np.hypot(1, slope)) & (z >= -radii)
 
 
 def find_sightings(
