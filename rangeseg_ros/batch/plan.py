@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
@@ -16,7 +17,7 @@ from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
 from rangeseg_ros.core.mapping.floor_plan import FloorPlan, Up, estimate_up, make_plan
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.observations import PoseNoise
-from rangeseg_ros.core.mapping.occupancy import VoxelCounts
+from rangeseg_ros.core.mapping.occupancy import points_within
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -147,8 +148,8 @@ class PlanTask:
         solution = best.seen.solve(best.planes, best.successors)
         if solution.drifts:
             warnings.append(solution.drift_text())
-        voxels = self._voxels(dict(zip(best.frames, solution.poses, strict=True)), config)
-        plan = self._plan(best, solution, voxels, config)
+        points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
+        plan = self._plan(best, solution, points, config)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_plan_page(self.folder / PAGE, self.recording.name, plan, warnings)
@@ -196,24 +197,29 @@ class PlanTask:
         best = max(stretches, key=lambda stretch: stretch.extent)
         return frames, best, warnings + sequence.map.doubts
 
-    def _voxels(self, poses: dict[int, Transform], config: Config) -> VoxelCounts:
+    def _points(
+        self, poses: dict[int, Transform], config: Config
+    ) -> Iterator[NDArray[np.float64]]:
         """Points of the frames, by their numbers, where their poses were solved."""
-        voxels = VoxelCounts(self.resolution, SensorModel.from_config(config))
+        sensor = SensorModel.from_config(config)
         with self._open() as source:
             try:
                 for done, frame in enumerate(source):
                     pose = poses.get(done + source.lost.total())
                     if pose:
                         image = corrected(frame.range_image(), config)
-                        sensor = Transform(np.eye(3), -image.place)
-                        voxels.add(image, pose.after(sensor))
+                        points = points_within(image, sensor, self.resolution) - image.place
+                        yield points @ pose.rotation.T + pose.shift
             # What comes after the damage has no poses.
             except DamagedBagError:
                 pass
-        return voxels
 
     def _plan(
-        self, best: _Stretch, solution: Solution, voxels: VoxelCounts, config: Config
+        self,
+        best: _Stretch,
+        solution: Solution,
+        points: Iterator[NDArray[np.float64]],
+        config: Config,
     ) -> FloorPlan:
         tolerance = np.radians(config.role_tolerance)
         if best.told.any():
@@ -226,7 +232,7 @@ class PlanTask:
             solution.covariance,
             config.map_frame,
             up,
-            voxels.points(),
+            points,
             config,
             self.headroom,
             self.resolution,

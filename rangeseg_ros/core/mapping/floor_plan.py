@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -166,7 +166,7 @@ def make_plan(
     covariance: NDArray[np.float64],
     frame: str,
     up: Up,
-    voxels: tuple[NDArray[np.float64], NDArray[np.int64]],
+    points: Iterable[NDArray[np.float64]],
     config: Config,
     headroom: float,
     resolution: float,
@@ -182,8 +182,8 @@ def make_plan(
     frame : str
         Their frame.
     up : Up
-    voxels : ((N, 3) float64, (N,) int64)
-        Points of the frames and their numbers, in that frame, see `VoxelCounts`.
+    points : iterable of (N, 3) float64
+        Of each frame, in that frame.
     config : Config
         `role_tolerance`, `role_area`, `role_height`, `obstacle_height`.
     headroom : float
@@ -200,11 +200,10 @@ def make_plan(
     squared = [
         s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
     ]
-    points, counts = voxels
-    points = points @ motion.rotation.T + motion.shift
-    # Ground that errs by half a voxel is ground.
+    # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
-    grid = occupancy(points, counts, ground, band, resolution)
+    upright = (some @ motion.rotation.T + motion.shift for some in points)
+    grid = occupancy(upright, ground, band, resolution)
     reach = ground + band[0], ground + headroom
     walls = [
         wall
