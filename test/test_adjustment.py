@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from map_squares import plane as map_plane
 from scipy.spatial.transform import Rotation
-from test_plan import plane as map_plane
 
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment

@@ -228,8 +228,7 @@ class PlanTask:
         else:
             up = estimate_up(solution.planes, best.looked, tolerance)
         return make_plan(
-            solution.planes,
-            solution.covariance,
+            solution,
             config.map_frame,
             up,
             points,

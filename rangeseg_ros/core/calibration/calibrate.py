@@ -31,8 +31,8 @@ _VIEW, _FEWEST_VIEWS = 0.1, 3
 # Smoothness that is tried, in sightings of a cell: with each step, waves that are shorter by a
 # factor of 1.7 are kept. A slope is known worse, as distances differ little.
 _STEP = 8.0
-_SMOOTHNESS = tuple((_STEP**power,) for power in (4, 3, 2, 1))
-_SLOPES = (_STEP**3, _STEP**2)
+_SMOOTHNESS = ((4096.0,), (512.0,), (64.0,), (8.0,))
+_SLOPES = (512.0, 64.0)
 # Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
 # is low by chance would be trusted most.
 _AVERAGED = 5.0

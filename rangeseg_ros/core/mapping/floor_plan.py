@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_outlines import valid
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, occupancy
@@ -162,8 +163,7 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
 
 
 def make_plan(
-    planes: Sequence[MapPlane],
-    covariance: NDArray[np.float64],
+    solution: Solution,
     frame: str,
     up: Up,
     points: Iterable[NDArray[np.float64]],
@@ -175,10 +175,8 @@ def make_plan(
 
     Parameters
     ----------
-    planes : sequence of MapPlane
-        P of them.
-    covariance : (4 P, 4 P) float64
-        Of the normals and distances of all of them.
+    solution : Solution
+        Its planes.
     frame : str
         Their frame.
     up : Up
@@ -193,9 +191,9 @@ def make_plan(
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)
-    turned = np.kron(np.eye(len(planes)), moved_plane(*motion))
-    covariance = turned @ covariance @ turned.T
-    squared = square_up(moved_planes(planes, motion), covariance, tolerance)
+    turned = np.kron(np.eye(len(solution.planes)), moved_plane(*motion))
+    covariance = turned @ solution.covariance @ turned.T
+    squared = square_up(moved_planes(solution.planes, motion), covariance, tolerance)
     roles, ground = _roles([s.plane for s in squared], config)
     squared = [
         s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
