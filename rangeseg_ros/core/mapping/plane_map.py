@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.evidence import see
+from rangeseg_ros.core.mapping.evidence import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.map_outlines import (
     polygon_of,
     simplify,
@@ -28,7 +28,6 @@ from rangeseg_ros.core.mapping.observations import (
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
-from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -353,8 +352,8 @@ class PlaneMap:
             if not record.followed and record.frames > 1:
                 record.evidence.follow(record.outline)
                 record.followed = True
-        middles = np.array([record.evidence.middle for record in self._records])
-        reaches = np.array([record.evidence.reach for record in self._records])
+        circles = [record.evidence.circle() for record in self._records]
+        middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
         middles = filters.points(np.arange(len(middles)), middles)
         middles = (middles - pose.shift) @ pose.rotation
         shown = np.flatnonzero(may_be_in_sight(middles, reaches, image))
@@ -386,11 +385,11 @@ class PlaneMap:
             image,
             SensorModel.from_config(self.config),
         )
-        there = np.bincount(which[found == THERE], minlength=len(evidence))
-        for k in np.flatnonzero(2 * there > np.bincount(which, minlength=len(evidence))).tolist():
-            records[k].looks += 1
-        for k in see(evidence, which, found).tolist():
-            records[k].reshape(records[k].evidence.remaining(records[k].outline))
+        for number, record in enumerate(records):
+            part = found[which == number]
+            record.looks += int(2 * np.count_nonzero(part == THERE) > len(part))
+            if record.evidence.see(part):
+                record.reshape(record.evidence.remaining(record.outline))
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, those not confirmed, and what is too much."""
