@@ -77,15 +77,12 @@ class Calibration(NamedTuple):
     distortion : DistortionMap
     views : (rows, columns) int
         Different distances at which each cell was seen.
-    smoothness : tuple of float
-        Of the offset and the slope.
     folds : list of Fold
         The blocks left out.
     """
 
     distortion: DistortionMap
     views: NDArray[np.intp]
-    smoothness: tuple[float, ...]
     folds: list[Fold]
 
     @property
@@ -166,7 +163,7 @@ def calibrate(
         camera,
         0.0 if slope is None else reference,
     )
-    return Calibration(distortion, views, smoothness, folds)
+    return Calibration(distortion, views, folds)
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
