@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment
-from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise
-from rangeseg_ros.core.mapping.plane_map import Sighting
+from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
 

@@ -32,10 +32,10 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
+    Sighting,
     continuity,
     observations,
 )
-from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import (

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -24,6 +23,7 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
+    Sighting,
     observations,
     views,
 )
@@ -39,27 +39,6 @@ from rangeseg_ros.core.tracking.tracker import NOMINAL, Jump
 _LOOKED_AT = 1 / 8
 # Jumps of the poses that are told one by one.
 _TOLD = 10
-
-
-class Sighting(NamedTuple):
-    """What a frame shows of the planes of a map.
-
-    Attributes
-    ----------
-    pose : Transform
-        Fixed frame from the frame of the image.
-    planes : sequence of Plane
-        M of them, in the frame of the image.
-    ids : (M,) int
-        Of the planes of the map that they are.
-    view : (M, C) float64
-        See `views`.
-    """
-
-    pose: Transform
-    planes: Sequence[Plane]
-    ids: NDArray[np.int64]
-    view: NDArray[np.float64]
 
 
 class PlaneMap:
