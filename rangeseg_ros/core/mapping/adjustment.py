@@ -48,7 +48,7 @@ from rangeseg_ros.core.tracking.plane_errors import (
     to_errors,
 )
 
-_ROUNDS = 6
+_ROUNDS = 6  # until weights settle
 _SYMMETRIC = {'SymmetricMode': True}
 # Columns of the inverse that are worked out at a time.
 _COLUMNS = 64

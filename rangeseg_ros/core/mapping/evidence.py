@@ -14,7 +14,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER
 
-THERE, UNSEEN, THROUGH = 1, 0, -1
+THERE, UNSEEN, THROUGH = 1, 0, -1  # what a ray says of a place
 HIT, MISS, _MOST, LEAST = 0.85, -0.4, 3.5, -2.0
 """Log-odds of a ray that ends at a cell and of one that passes through it, and the bounds of their
 sum, so that a cell follows a change within ten looks: Hornung et al., "OctoMap", Autonomous
