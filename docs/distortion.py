@@ -13,10 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from rangeseg_ros import RangeImage, Segmenter
-from rangeseg_ros.core.calibration.calibrate import calibrate
+from rangeseg_ros.core.calibration.calibrate import calibrate, without_plane
 from rangeseg_ros.core.calibration.field import residuals
 from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
-from rangeseg_ros.core.calibration.validation import without_plane
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.fields import smooth_field

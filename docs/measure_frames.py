@@ -18,8 +18,9 @@ import shapely
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage
+from rangeseg_ros.core.mapping.adjustment import Adjustment
 from rangeseg_ros.core.mapping.mount import mount_of
-from rangeseg_ros.core.mapping.observations import views
+from rangeseg_ros.core.mapping.observations import PoseNoise, views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -71,12 +72,13 @@ def room_of(seed: int) -> Scene:
 
 
 def measure_map(*seeds: str) -> None:
-    """Planes per face, faces missed, errors, NEES and time."""
-    rows, single, found, seen, ghosts = [], [], 0, 0, 0
+    """Planes per face, faces missed, errors, NEES and time, before and after the solution."""
+    rows, solved, poses, single, found, seen, ghosts = [], [], [], [], 0, 0, 0
     for seed in map(int, seeds):
         scene, random = room_of(seed), np.random.default_rng(seed)
         truth = np.vstack([solid.planes for solid in scene.solids])
         plane_map, spent, pixels = PlaneMap(CONFIG), [], np.zeros(len(truth), int)
+        adjustment, walls = Adjustment(PoseNoise(0.005, np.radians(0.3))), []
         for frame in walked(scene, seed):
             off = Rotation.from_rotvec(random.normal(0, np.radians(0.3), 3)).as_matrix()
             shift = frame.pose.shift + random.normal(0, 0.005, 3)
@@ -84,6 +86,8 @@ def measure_map(*seeds: str) -> None:
             begin = time.thread_time()
             plane_map.add(frame.labels, frame.planes, frame.image, told, frame.stamp)
             spent.append(1e3 * (time.thread_time() - begin))
+            adjustment.add(plane_map.sighting)
+            walls.append((frame.image, frame.faces, told, frame.pose))
             pixels += np.bincount(frame.faces[frame.faces >= 0], minlength=len(truth)) >= 1000
             for plane in frame.planes:
                 under = frame.faces[frame.labels == plane.label]
@@ -95,23 +99,49 @@ def measure_map(*seeds: str) -> None:
                     at = frame.pose.rotation @ plane.centroid + frame.pose.shift
                     single.append(errors(normal, distance, at, face))
         faces = [face_of(plane, scene, truth) for plane in plane_map.planes]
-        for plane, face in zip(plane_map.planes, faces, strict=True):
-            if face >= 0:
-                error = np.append(plane.normal, plane.distance) - truth[face]
-                nees = error @ np.linalg.pinv(plane.covariance, 1e-10) @ error / 3
-                at = plane.centroid
-                rows.append((*errors(plane.normal, plane.distance, at, truth[face]), nees))
+        solution = adjustment.solve(plane_map.planes, plane_map.successors)
+        for into, planes in ((rows, plane_map.planes), (solved, solution.planes)):
+            for plane, face in zip(planes, faces, strict=True):
+                if face >= 0:
+                    error = np.append(plane.normal, plane.distance) - truth[face]
+                    nees = error @ np.linalg.pinv(plane.covariance, 1e-10) @ error / 3
+                    at = plane.centroid
+                    into.append((*errors(plane.normal, plane.distance, at, truth[face]), nees))
+        poses.append([thickness(walls, each) for each in ('told', 'true', solution.poses)])
         there = set(np.flatnonzero(pixels >= 10).tolist())
         found, seen = found + len(set(faces) - {-1}), seen + len(there)
         ghosts += faces.count(-1)
         missed = sorted(there - set(faces))
         print(f'{seed}: {len(there)} faces, missed {missed}, {np.median(spent):.2f} ms a frame')
-    angle, offset, nees = np.array(rows).T
     alone = np.median(single, axis=0)
     print(f'planes per face {len(rows) / found:.3f} of {seen}; {ghosts} on no face')
-    print(f'normals {np.median(angle):.3f} degrees, single frames {alone[0]:.3f}')
-    print(f'offsets {np.median(offset):.2f} mm, single frames {alone[1]:.2f}')
-    print(f'NEES {nees.mean():.2f} in the mean, {np.median(nees):.2f} in the median')
+    print(f'single frames: normals {alone[0]:.3f} degrees, offsets {alone[1]:.2f} mm')
+    for name, each in (('map', rows), ('solution', solved)):
+        angle, offset, nees = np.array(each).T
+        print(
+            f'{name}: normals {np.median(angle):.3f} degrees, offsets {np.median(offset):.2f} mm'
+        )
+        print(f'{name}: NEES {nees.mean():.2f} in the mean, {np.median(nees):.2f} in the median')
+    print('walls are thick by (mm): poses as told, true, solved', np.median(poses, axis=0))
+
+
+def thickness(walls: list, poses) -> float:
+    """Root mean square distance of the points of faces from their planes, millimetres."""
+    points: dict[int, list] = {}
+    for k in range(0, len(walls), 3):
+        image, faces, told, true = walls[k]
+        turn, shift = {'told': told, 'true': true}[poses] if isinstance(poses, str) else poses[k]
+        near = image.valid & (image.inverse > 1 / 3)
+        for face in np.unique(faces[near & (faces >= 0)]).tolist():
+            some = image.points[near & (faces == face)][::40]
+            if len(some) > 25:
+                points.setdefault(face, []).append(some @ turn.T + shift)
+    squares = []
+    for parts in (np.concatenate(p) for p in points.values() if len(p) > 4):
+        left = parts - parts.mean(axis=0)
+        off = left @ np.linalg.eigh(left.T @ left)[1][:, 0]
+        squares.append(off[np.abs(off) < 0.05] ** 2)
+    return 1e3 * float(np.sqrt(np.concatenate(squares).mean()))
 
 
 def errors(normal, distance, at, face) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 import numpy as np
 
 from rangeseg_ros import Camera, RangeImage
-from rangeseg_ros.core.calibration.validation import without_plane
+from rangeseg_ros.core.calibration.calibrate import without_plane
 from rangeseg_ros.simulation.fields import smooth_field
 
 CAMERA = Camera(80, 60, 73.0, 73.0, 39.5, 29.5)

@@ -11,14 +11,13 @@ import shapely
 import trimesh
 import yaml
 from click.testing import CliRunner
+from map_squares import plane
 from recordings import Recording
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.cli.main import rangeseg
-from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.floor_plan import estimate_up
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
-from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.right_angles import square_up
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
@@ -172,38 +171,6 @@ def test_files_of_others_are_kept_and_what_lacks_is_said(folders, tmp_path):
     assert 'nowhere' in str(result.exception) and not (tmp_path / 'out').exists()
 
 
-def plane(number, normal, at, sigma, size=2.0):
-    """A square of a plane around a point, whose direction is known to `sigma` radians."""
-    normal = np.array(normal, float) / np.linalg.norm(normal)
-    along = np.cross(normal, np.eye(3)[np.argmin(abs(normal))])
-    along /= np.linalg.norm(along)
-    axes = np.stack([along, np.cross(normal, along)])
-    corners = at + size / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) @ axes
-    jacobian = np.zeros((4, 3))
-    jacobian[:3, :2], jacobian[3, :2], jacobian[3, 2] = axes.T, -axes @ at, 1
-    covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T
-    shape = Shape(size**2, np.array([size, size]), np.array(at), np.array([0, 0, 0, 1.0]))
-    return MapPlane(
-        label=number,
-        id=number,
-        surface=number,
-        normal=normal,
-        distance=float(-normal @ at),
-        covariance=covariance,
-        centroid=np.array(at, float),
-        count=1000,
-        rms=0.002,
-        probability=1.0,
-        confidence=1.0,
-        shape=shape,
-        outline=MapOutline([[corners]]),
-        observations=9,
-        age=1.0,
-        first_stamp=0,
-        last_stamp=10**9,
-    )
-
-
 def turned(degrees):
     return np.cos(np.radians(degrees)), np.sin(np.radians(degrees)), 0.002
 
@@ -216,7 +183,8 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
         plane(3, turned(25.0), (-2, 0, 1), one),
         plane(4, turned(24.0), (-3, 0, 1), 10 * one),
     ]
-    squared = square_up(walls, np.radians(10))
+    joint = block_diag(*(wall.covariance for wall in walls))
+    squared = square_up(walls, joint, np.radians(10))
     assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
     assert abs(squared[0].plane.normal @ squared[1].plane.normal) < 1e-12
     assert abs(np.cross(squared[0].plane.normal, squared[3].plane.normal)).max() < 1e-12

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.sightings import find_sightings, may_be_in_sight
+from rangeseg_ros.core.mapping.evidence import find_sightings, may_be_in_sight
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.calibrate import CalibrationError
-from rangeseg_ros.core.calibration.residuals import products
 from rangeseg_ros.core.calibration.sightings import Sightings, find_sightings
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
@@ -161,15 +160,12 @@ class Residuals(NamedTuple):
 
     Attributes
     ----------
-    products : (2, L) float64
-        See `residuals.products`, after the correction.
     images : (2, H, W) float32
         Residuals, 1/m, NaN where there is no plane.
     planes : (int, int)
         Number of planes.
     """
 
-    products: NDArray[np.float64]
     images: NDArray[np.float32]
     planes: tuple[int, int]
 
@@ -207,9 +203,7 @@ class ResidualsOfFrame:
                 residual[mask] = error / along[mask]
             pictures.append(residual)
             counts.append(len(result.planes))
-        return Residuals(
-            products(result.labels, version), np.stack(pictures), (counts[0], counts[1])
-        )
+        return Residuals(np.stack(pictures), (counts[0], counts[1]))
 
 
 def parts(sources: list[Source], config: Config, kept: Path) -> list[SightingsOfPart]:

@@ -8,16 +8,21 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
 from rangeseg_ros.core.mapping.floor_plan import FloorPlan, Up, estimate_up, make_plan
 from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.occupancy import VoxelCounts
+from rangeseg_ros.core.mapping.observations import PoseNoise
+from rangeseg_ros.core.mapping.occupancy import points_within
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.bags import DepthBag
+from rangeseg_ros.io.bags import DamagedBagError, DepthBag
+from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.io.plans import plan_files, write_plan
 from rangeseg_ros.io.recordings import BagError
@@ -57,18 +62,28 @@ class PlanOutcome:
 
 @dataclass
 class _Stretch:
-    """What was seen while the map was one: it begins anew where the fixed frame jumps."""
+    """What was seen while the map was one: it begins anew where the fixed frame jumps.
 
-    voxels: VoxelCounts
+    `frames` are the numbers of its frames; `looked` and `told` are sums of the directions of up in
+    the images, by the parameters and by the sensors.
+    """
+
+    seen: Adjustment
+    frames: list[int] = field(default_factory=list)
     planes: list[MapPlane] = field(default_factory=list)
+    successors: dict[int, int] = field(default_factory=dict)
     looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
     told: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    frames: int = 0
+
+    def end(self, planes: list[MapPlane], successors: dict[int, int]) -> _Stretch:
+        """Take the planes that the map has now."""
+        self.planes, self.successors = planes, successors
+        return self
 
     @property
-    def area(self) -> float:
-        """Of its planes."""
-        return sum(plane.area for plane in self.planes)
+    def extent(self) -> tuple[float, int]:
+        """Area of its planes, and number of frames."""
+        return sum(plane.area for plane in self.planes), len(self.frames)
 
 
 @dataclass(frozen=True)
@@ -129,14 +144,18 @@ class PlanTask:
                 f'any of {frames} frames: {"; ".join(warnings) or "no tf"}'
             )
         if not best.planes:
-            raise BagError(f'{self.recording}: no planes in {best.frames} frames')
-        plan = self._plan(best, config)
+            raise BagError(f'{self.recording}: no planes in {len(best.frames)} frames')
+        solution = best.seen.solve(best.planes, best.successors)
+        if solution.drifts:
+            warnings.append(solution.drift_text())
+        points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
+        plan = self._plan(best, solution, points, config)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_plan_page(self.folder / PAGE, self.recording.name, plan, warnings)
         return PlanOutcome(
             frames,
-            best.frames,
+            len(best.frames),
             config.map_frame,
             len(plan.planes),
             len(plan.walls),
@@ -148,47 +167,71 @@ class PlanTask:
 
     def _map(self, config: Config, progress: Progress | None) -> tuple[int, _Stretch, list[str]]:
         """Number of frames, the stretch with the largest map, and what is to be told."""
-        sequence, sensor = SequenceSegmenter(config), SensorModel.from_config(config)
-        now = best = _Stretch(VoxelCounts(self.resolution, sensor))
-        frames, warnings, epoch = 0, [], sequence.map.epoch
+        sequence = SequenceSegmenter(config)
+        noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
+
+        def begin() -> _Stretch:
+            return _Stretch(Adjustment(noise, odometry=not config.fixed_frame))
+
+        stretches, frames, warnings, epoch = [begin()], 0, [], sequence.map.epoch
         with self._open() as source, Locator(self.recording, config) as located:
-            found = segment_frames(source, sequence, located.place, progress)
-            for _, _, image, _ in found:
+            for number, *_ in segment_frames(source, sequence, located.place, progress):
                 frames += 1
                 if sequence.map.epoch != epoch:
                     epoch = sequence.map.epoch
-                    now.planes = sequence.map.planes_before
-                    warnings.append(f'frame {frames - 1}: {sequence.map.begun_anew}')
-                    best = max(best, now, key=lambda stretch: stretch.area)
-                    now = _Stretch(VoxelCounts(self.resolution, sensor))
-                if sequence.pose is None:
-                    continue
-                now.frames += 1
-                now.voxels.add(image, sequence.pose)
-                turn = sequence.pose.rotation
-                now.looked += turn @ (config.up_x, config.up_y, config.up_z)
-                if located.last.up is not None:
-                    now.told += turn @ located.last.up
+                    stretches[-1].end(sequence.map.planes_before, sequence.map.successors_before)
+                    warnings.append(f'frame {number}: {sequence.map.begun_anew}')
+                    stretches.append(begin())
+                now = stretches[-1]
+                if sequence.map.sighting and sequence.pose:
+                    now.frames.append(number)
+                    now.seen.add(sequence.map.sighting)
+                    turn = sequence.pose.rotation
+                    now.looked += turn @ (config.up_x, config.up_y, config.up_z)
+                    if located.last.up is not None:
+                        now.told += turn @ located.last.up
             warnings += [f'{n} frames without the {why}' for why, n in located.problems.items()]
             if source.damage:
                 warnings.append(source.damage)
-        now.planes = sequence.map.planes
-        best = max(best, now, key=lambda stretch: (stretch.area, stretch.frames))
-        warnings += sequence.map.doubts
-        return frames, best, warnings
+        stretches[-1].end(sequence.map.planes, sequence.map.successors)
+        best = max(stretches, key=lambda stretch: stretch.extent)
+        return frames, best, warnings + sequence.map.doubts
 
-    def _plan(self, best: _Stretch, config: Config) -> FloorPlan:
+    def _points(
+        self, poses: dict[int, Transform], config: Config
+    ) -> Iterator[NDArray[np.float64]]:
+        """Points of the frames, by their numbers, where their poses were solved."""
+        sensor = SensorModel.from_config(config)
+        with self._open() as source:
+            try:
+                for done, frame in enumerate(source):
+                    pose = poses.get(done + source.lost.total())
+                    if pose:
+                        image = corrected(frame.range_image(), config)
+                        points = points_within(image, sensor, self.resolution) - image.place
+                        yield points @ pose.rotation.T + pose.shift
+            # What comes after the damage has no poses.
+            except DamagedBagError:
+                pass
+
+    def _plan(
+        self,
+        best: _Stretch,
+        solution: Solution,
+        points: Iterator[NDArray[np.float64]],
+        config: Config,
+    ) -> FloorPlan:
         tolerance = np.radians(config.role_tolerance)
         if best.told.any():
             source = config.gravity_frame or 'the accelerometer'
             up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
         else:
-            up = estimate_up(best.planes, best.looked, tolerance)
+            up = estimate_up(solution.planes, best.looked, tolerance)
         return make_plan(
-            best.planes,
+            solution,
             config.map_frame,
             up,
-            best.voxels.points(),
+            points,
             config,
             self.headroom,
             self.resolution,

@@ -13,7 +13,6 @@ import yaml
 from rangeseg_ros.batch.calibration import ResidualsOfFrame, Seen, Source, parts
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.calibration.calibrate import Calibration, calibrate
-from rangeseg_ros.core.calibration.residuals import randomness
 from rangeseg_ros.core.calibration.sightings import Sightings, concatenate
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.distortion import DistortionError
@@ -24,8 +23,8 @@ from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.report.calibration import Shown, write_calibration
 from rangeseg_ros.tasks import run_all
 
-# Frames that the noise is measured on, and how many of them the report shows.
-_SAMPLED, _SHOWN = 24, 3
+# Frames that the report shows.
+_SHOWN = 3
 _HEADER = '# Written by rangeseg calibrate.\n'
 
 
@@ -38,7 +37,7 @@ _HEADER = '# Written by rangeseg calibrate.\n'
     type=click.Path(exists=True, path_type=Path),
 )
 @options.output_file('--output', 'Distortion map to write: TIFF.', required=True)
-@options.output_file('--params', 'Parameter file to write: the map, and what noise remains.')
+@options.output_file('--params', 'Parameter file to write: with the map.')
 @options.camera
 @options.depth_scale
 @options.topics
@@ -87,27 +86,20 @@ def command(
     _report(result)
 
     numbered = [(source, number) for source in sources for number in range(len(source))]
-    chosen = np.linspace(0, len(numbered) - 1, min(_SAMPLED, len(numbered))).round().astype(int)
+    chosen = np.linspace(0, len(numbered) - 1, min(_SHOWN, len(numbered))).round().astype(int)
     frames = [
         ResidualsOfFrame(source, config, number, result.distortion)
         for source, number in (numbered[n] for n in chosen)
     ]
     left = list(options.progress(run_all(frames, jobs), len(frames), 'frame'))
-    sensor = randomness(np.sum([each.products for each in left], axis=0))
     parameters: dict[str, Any] = {**given, 'distortion_map': str(output.absolute())}
-    if sensor:
-        parameters |= {name: float(f'{value:.3g}') for name, value in sensor._asdict().items()}
-        click.echo(
-            f'noise {sensor.noise:.2g} 1/m, correlated over {sensor.noise_correlation:.2g} px, '
-            f'distortion that remains {sensor.distortion:.2g} 1/m'
-        )
     Config.from_mapping(parameters)
     write_distortion(output, result.distortion)
     if params:
         with replacing(params) as partial:
             partial.write_text(_HEADER + yaml.safe_dump(parameters, sort_keys=False))
-    spread = np.linspace(0, len(left) - 1, min(_SHOWN, len(left))).round().astype(int)
-    shown = [Shown(int(chosen[n]), left[n].images, left[n].planes) for n in spread]
+    pairs = zip(chosen.tolist(), left, strict=True)
+    shown = [Shown(number, frame.images, frame.planes) for number, frame in pairs]
     write_calibration(report, [path.name for path in recordings], result, parameters, shown)
     shutil.rmtree(kept, ignore_errors=True)
     click.echo(f'{output}, {report}')

@@ -74,7 +74,7 @@ def write_calibration(
         known=float(np.sqrt((deviation**2).mean())),
         regions=_regions(result),
         fields=_images([(title, *field) for title, field in fields.items()], 2),
-        profiles=_profiles(distortion.offset, result.profile),
+        profiles=_profiles(distortion.offset),
         walls=[
             (
                 frame.frame,
@@ -134,14 +134,12 @@ def _images(
     return svg(figure)
 
 
-def _profiles(offset: NDArray[np.float32], bands: NDArray[np.float64]) -> str:
-    """Mean of the field over rows and over columns, and the bands."""
+def _profiles(offset: NDArray[np.float32]) -> str:
+    """Mean of the field over rows and over columns."""
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     left, right = figure.subplots(1, 2, sharey=True)
-    left.plot(offset.mean(axis=0), label='mean over the rows')
-    left.plot(bands, label='bands', linewidth=1)
-    left.legend(fontsize=8)
-    left.set_xlabel('column')
+    left.plot(offset.mean(axis=0))
+    left.set_xlabel('column, mean over the rows')
     left.set_ylabel('1/m')
     right.plot(offset.mean(axis=1))
     right.set_xlabel('row, mean over the columns')

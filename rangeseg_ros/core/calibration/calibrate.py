@@ -1,31 +1,41 @@
-"""From the sightings of a recording to the distortion map, or to what the recording lacks."""
+"""From the sightings of a recording to the distortion map, or to what the recording lacks.
+
+The recording is cut into blocks of consecutive frames, as neighbours in time see almost the same.
+Each block is left out once, and the field of the others tried on it: that decides how smooth the
+field is and whether it depends on the distance (cross-validation), tells how much of the residual
+it explains, and how uncertain it is (delete-a-group jackknife).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
-from rangeseg_ros.core.calibration.validation import (
-    BLOCKS,
-    Fold,
-    learn,
-    root_mean_square,
-    without_plane,
-)
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 
+BLOCKS = 5
+"""Parts of the recording that are left out in turn."""
 # Each block that is left out has two frames at least.
 _FEWEST_FRAMES = 2 * BLOCKS
-# Inverse depths that count as different views of a cell differ by this part.
-_VIEW = 0.1
-# Different views that most cells need, one more than the two coefficients of a cell: what one
-# surface shows in one place may be its own shape.
-_FEWEST_VIEWS = 3
+# Inverse depths that count as different views of a cell differ by this part; and the views that
+# most cells need, one more than the two coefficients of a cell: what one surface shows in one
+# place may be its own shape.
+_VIEW, _FEWEST_VIEWS = 0.1, 3
+# Smoothness that is tried, in sightings of a cell: with each step, waves that are shorter by a
+# factor of 1.7 are kept. A slope is known worse, as distances differ little.
+_STEP = 8.0
+_SMOOTHNESS = ((4096.0,), (512.0,), (64.0,), (8.0,))
+_SLOPES = (512.0, 64.0)
+# Cells over which the uncertainty is averaged: of four degrees of freedom much is chance, and what
+# is low by chance would be trusted most.
+_AVERAGED = 5.0
 ADVICE = (
     'record walls, floor and other flat things for half a minute while the camera moves slowly: '
     'nearer and farther, turned in all directions, so that flat surfaces cross every part of the '
@@ -37,6 +47,28 @@ class CalibrationError(ValueError):
     """A recording from which the distortion cannot be learned."""
 
 
+class Fold(NamedTuple):
+    """One block of frames left out.
+
+    Attributes
+    ----------
+    frames : (first, last) int
+        The block.
+    field : (K, G) float64
+        Of the other frames, 1/m.
+    before, after : float
+        Root mean square residual of the cells of the block, without and with the field, 1/m.
+    weight : float
+        Sum of the weights of these cells.
+    """
+
+    frames: tuple[int, int]
+    field: NDArray[np.float64]
+    before: float
+    after: float
+    weight: float
+
+
 class Calibration(NamedTuple):
     """What was learned.
 
@@ -45,32 +77,27 @@ class Calibration(NamedTuple):
     distortion : DistortionMap
     views : (rows, columns) int
         Different distances at which each cell was seen.
-    profile : (W,) float64
-        Bands of columns within the map, 1/m.
-    gain : float
-        Share of the field that held on frames left out.
-    smoothness : tuple of float
-        Of the offset and the slope.
     folds : list of Fold
         The blocks left out.
     """
 
     distortion: DistortionMap
     views: NDArray[np.intp]
-    profile: NDArray[np.float64]
-    gain: float
-    smoothness: tuple[float, ...]
     folds: list[Fold]
 
     @property
     def before(self) -> float:
         """Root mean square residual of the cells of planes, 1/m."""
-        return root_mean_square([(fold.weight, fold.before) for fold in self.folds])
+        return self._rms([fold.before for fold in self.folds])
 
     @property
     def after(self) -> float:
         """The same on frames left out, with the map of the others, 1/m."""
-        return root_mean_square([(fold.weight, fold.after) for fold in self.folds])
+        return self._rms([fold.after for fold in self.folds])
+
+    def _rms(self, values: list[float]) -> float:
+        weight = [fold.weight for fold in self.folds]
+        return float(np.sqrt(np.average(np.square(values), weights=weight)))
 
 
 def calibrate(
@@ -94,26 +121,49 @@ def calibrate(
     """
     views = _views(seen, shape)
     _check(seen, views)
-    learned = learn(seen, shape)
-    known = _in_pixels(views > 0, shape)
-    offset = _smooth_in_pixels(learned.field[0], shape) + learned.profile
+    grid, reference = cell_grid(shape), float(np.median(seen.inverse))
+    # By the planes, not by the measurements: a slope that is the same everywhere only scales the
+    # planes, so that it is free and cannot explain the noise away.
+    change = seen.inverse - residuals(seen, seen.inverse) - reference
+    spread = max(float(np.median(np.abs(change))), 1e-6)
+    basis = np.stack([np.ones(len(change)), change / spread])
+    splits = _splits(seen, grid)
+
+    def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
+        found = [_folds(split, basis, grid, tried) for split in splits]
+        pairs = zip(tried, map(list, zip(*found, strict=True)), strict=True)
+        return min(pairs, key=lambda pair: _left(pair[1]))
+
+    smoothness, folds = best(_SMOOTHNESS)
+    sloped = best([(*smoothness, slope) for slope in _SLOPES])
+    # The simpler model, unless the other is better by more than the standard error of that.
+    gain = np.array(
+        [_left([one]) - _left([two]) for one, two in zip(folds, sloped[1], strict=True)]
+    )
+    if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
+        smoothness, folds = sloped
+    weight = _settled_weights(seen, grid)
+    field = solve(seen, basis[: len(smoothness)], weight, grid, smoothness)
+    # What smoothing costs shows in a field that is less smooth.
+    less = [value / _STEP for value in smoothness]
+    rough = solve(seen, basis[: len(smoothness)], weight, grid, less, field)
+    known, flat = views > 0, field[0].reshape(grid)
+    each = [fold.field[0].reshape(grid) for fold in folds]
+    deviation = _deviation(each, rough[0].reshape(grid) - flat, known)
+    pixels = _in_pixels(known, shape)
     slope = None
-    if len(learned.field) > 1:
-        slope = np.where(known, _smooth_in_pixels(learned.field[1], shape), 0)
+    if len(field) > 1:
+        slope = np.where(pixels, _smooth_in_pixels(field[1].reshape(grid) / spread, shape), 0)
         # One slope everywhere scales all planes, and leaves them planes.
-        slope -= known * slope[known].mean()
-        slope = slope.astype(np.float32)
-    offset = without_plane(offset, known)
-    deviation = np.where(known, _smooth_in_pixels(learned.deviation, shape), 0)
+        slope = (slope - pixels * slope[pixels].mean()).astype(np.float32)
     distortion = DistortionMap(
-        offset.astype(np.float32),
-        deviation.astype(np.float32),
+        without_plane(_smooth_in_pixels(flat, shape), pixels).astype(np.float32),
+        np.where(pixels, _smooth_in_pixels(deviation, shape), 0).astype(np.float32),
         slope,
         camera,
-        0.0 if slope is None else learned.reference,
+        0.0 if slope is None else reference,
     )
-    kept = learned.profile, learned.gain, learned.smoothness, learned.folds
-    return Calibration(distortion, views, *kept)
+    return Calibration(distortion, views, folds)
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -128,7 +178,7 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
     frames = len(np.unique(seen.frame))
     if frames < _FEWEST_FRAMES:
         raise CalibrationError(
-            f'too few planes: {frames} of {len(seen.jumps)} frames show one that is large enough, '
+            f'too few planes: {frames} of {seen.frames} frames show one that is large enough, '
             f'{_FEWEST_FRAMES} are needed; {ADVICE}'
         )
     covered = float((views > 0).mean())
@@ -145,17 +195,100 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
         )
 
 
+class _Split(NamedTuple):
+    """A block of frames, and all others.
+
+    Attributes
+    ----------
+    block : (first, last) int
+    train, test : Sightings
+        The others, and the block.
+    out : (N,) bool
+        Cells of the others.
+    weight, counts : float64
+        Weights of the cells of the others for the solution, and of the block in sums of squares.
+    """
+
+    block: tuple[int, int]
+    train: Sightings
+    test: Sightings
+    out: NDArray[np.bool_]
+    weight: NDArray[np.float64]
+    counts: NDArray[np.float64]
+
+
+def _splits(seen: Sightings, grid: tuple[int, int]) -> list[_Split]:
+    """Each block of frames, and the others with weights that know nothing of the block."""
+    splits = []
+    for block in np.array_split(np.unique(seen.frame), BLOCKS):
+        inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
+        train, test = seen.of_planes(~inside), seen.of_planes(inside)
+        ends, counts = (int(block[0]), int(block[-1])), robust_weights(test, 0.0)
+        out = ~inside[seen.plane()]
+        splits.append(_Split(ends, train, test, out, _settled_weights(train, grid), counts))
+    return splits
+
+
+def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float64]:
+    """Weights (N,) by what a field leaves whose own weights know of none."""
+    weight = robust_weights(seen, 0.0)
+    (field,) = solve(seen, np.ones((1, len(weight))), weight, grid, _SMOOTHNESS[1])
+    return robust_weights(seen, field[seen.cell])
+
+
+def _folds(
+    split: _Split,
+    basis: NDArray[np.float64],
+    grid: tuple[int, int],
+    tried: Sequence[tuple[float, ...]],
+) -> list[Fold]:
+    """A `Fold` for each smoothness."""
+    block, train, test, out, weight, counts = split
+    before, total = residuals(test, test.inverse), float(counts.sum())
+    field, found = None, []
+    for smoothness in tried:
+        own = basis[: len(smoothness)]
+        field = solve(train, own[:, out], weight, grid, smoothness, field)
+        share = residuals(test, (own[:, ~out] * field[:, test.cell]).sum(axis=0))
+        rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
+        found.append(Fold(block, field, rms[0], rms[1], total))
+    return found
+
+
+def _left(folds: list[Fold]) -> float:
+    """Sum of the squares of what the fields leave of the residuals of all blocks."""
+    return sum(fold.weight * fold.after**2 for fold in folds)
+
+
+def _deviation(
+    fields: Sequence[NDArray[np.float64]], bias: NDArray[np.float64], known: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Standard deviation of a field from those without one block each, and from its bias."""
+    each = np.stack([without_plane(field, known) for field in fields])
+    variance = (len(fields) - 1) * each.var(axis=0) + without_plane(bias, known) ** 2
+    weight = known.astype(np.float64)
+    smooth = cv2.GaussianBlur(variance * weight, (0, 0), _AVERAGED)
+    smooth = smooth / np.maximum(cv2.GaussianBlur(weight, (0, 0), _AVERAGED), 1e-6)
+    return np.asarray(np.sqrt(smooth) * known)
+
+
+def without_plane(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Field (H, W) less its least-squares plane a u + b v + c where it is known; 0 elsewhere."""
+    v, u = np.nonzero(known)
+    terms = np.stack([u, v, np.ones(len(u))], axis=1)
+    plane, *_ = np.linalg.lstsq(terms, field[v, u], rcond=None)
+    result = np.zeros_like(field)
+    result[v, u] = field[v, u] - terms @ plane
+    return result
+
+
 def _in_pixels(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
     size = cell_size(shape)
     return np.kron(cells, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
 
 
 def _smooth_in_pixels(cells: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Values of cells (G,), linear between their middles."""
-    size, (rows, columns) = cell_size(shape), cell_grid(shape)
-    whole = cv2.resize(
-        cells.reshape(rows, columns),
-        (columns * size, rows * size),
-        interpolation=cv2.INTER_LINEAR,
-    )
+    """Values of cells, linear between their middles."""
+    rows, columns = (n * cell_size(shape) for n in cells.shape)
+    whole = cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR)
     return np.asarray(whole, np.float64)[: shape[0], : shape[1]]

@@ -27,7 +27,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from rangeseg_ros.core.calibration.sightings import Sightings
 
@@ -80,28 +80,15 @@ def solve(
         [strength * _roughness(grid, place) for place, strength in enumerate(smoothness)]
     )
     own = (weighted @ cells + smoothing + _RIDGE * sparse.eye(count * size)).tocsc()
-    alone = splu(own)
 
     def product(vector: NDArray[np.float64]) -> NDArray[np.float64]:
         planes = (inverses @ (coupling.T @ vector).reshape(-1, 3, 1)).ravel()
         return np.asarray(own @ vector - coupling @ planes)
 
-    field = np.zeros(count * size) if start is None else start.ravel().copy()
-    rest = target - product(field)
-    step = alone.solve(rest)
-    direction, rest_size = step.copy(), float(rest @ step)
-    enough = _TOLERANCE**2 * float(target @ alone.solve(target))
-    for _ in range(_ITERATIONS):
-        if rest_size <= enough:
-            break
-        image = product(direction)
-        length = rest_size / float(direction @ image)
-        field += length * direction
-        rest -= length * image
-        step = alone.solve(rest)
-        before, rest_size = rest_size, float(rest @ step)
-        direction = step + rest_size / before * direction
-    return field.reshape(count, size)
+    matrix, alone = (LinearOperator(own.shape, f) for f in (product, splu(own).solve))
+    start = None if start is None else start.ravel()
+    field, _ = cg(matrix, target, start, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=alone)
+    return np.asarray(field).reshape(count, size)
 
 
 def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
@@ -125,7 +112,7 @@ def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
     return (rows.T @ rows).tocsr()
 
 
-def robust_weights(seen: Sightings, error: NDArray[np.float64]) -> NDArray[np.float64]:
+def robust_weights(seen: Sightings, error: NDArray[np.float64] | float) -> NDArray[np.float64]:
     """Weights (N,), at most 1, of cells whose inverse depth is wrong by `error` (N,)."""
     residual = residuals(seen, seen.inverse - error)
     size = np.abs(residual)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -36,9 +36,8 @@ class Sightings(NamedTuple):
         Mean inverse depth 1/z, 1/m.
     ray : (N, 3) float64
         Mean ray, scaled to z = 1.
-    jumps : (F, 2, W - 1) float64
-        Of each frame and pair of neighbouring columns: the sum over the rows of the change of the
-        residual from the left to the right column, 1/m, and the number of rows.
+    frames : int
+        Number of frames, with those that show no plane.
     """
 
     frame: NDArray[np.intp]
@@ -46,7 +45,7 @@ class Sightings(NamedTuple):
     cell: NDArray[np.intp]
     inverse: NDArray[np.float64]
     ray: NDArray[np.float64]
-    jumps: NDArray[np.float64]
+    frames: int
 
     def plane(self) -> NDArray[np.intp]:
         """Plane (N,) that each cell belongs to."""
@@ -59,19 +58,12 @@ class Sightings(NamedTuple):
         shape = len(self.cell), 3 * len(self.frame)
         return sparse.csr_array((self.ray.ravel(), columns.ravel(), pointers), shape)
 
-    def of_frames(self, chosen: NDArray[np.bool_]) -> Sightings:
-        """Those of the frames that are chosen, (F,); the frames keep their numbers."""
-        plane = chosen[self.frame]
-        cells = plane[self.plane()]
-        counts = np.diff(self.start)[plane]
-        return Sightings(
-            self.frame[plane],
-            np.concatenate([[0], np.cumsum(counts)]),
-            self.cell[cells],
-            self.inverse[cells],
-            self.ray[cells],
-            self.jumps * chosen[:, None, None],
-        )
+    def of_planes(self, chosen: NDArray[np.bool_]) -> Sightings:
+        """Those of the planes that are chosen, (P,)."""
+        cells = chosen[self.plane()]
+        start = np.concatenate([[0], np.cumsum(np.diff(self.start)[chosen])])
+        parts = self.cell[cells], self.inverse[cells], self.ray[cells]
+        return Sightings(self.frame[chosen], start, *parts, self.frames)
 
 
 def cell_size(shape: tuple[int, int]) -> int:
@@ -98,83 +90,43 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
     size, (rows, columns) = cell_size(labels.shape), cell_grid(labels.shape)
     height, width = labels.shape
     cells = np.arange(height)[:, None] // size * columns + np.arange(width) // size
-    residual = np.full(labels.shape, np.nan)
-    found = []
-    for mask, y, ray, error in plane_pixels(labels, image, SAMPLES * size * size):
-        residual[mask] = error
-        own = cells[mask]
-        count = np.bincount(own, minlength=rows * columns)
-        # Where half of a cell is the plane's, its mean stands for the cell.
-        kept = np.flatnonzero(2 * count >= size * size)
-        if len(kept) < SAMPLES:
-            continue
-        sums = [np.bincount(own, part, len(count))[kept] for part in (y, *ray.T)]
-        found.append((kept, np.stack(sums, axis=1) / count[kept, None]))
-    step = np.where(labels[:, 1:] == labels[:, :-1], np.diff(residual, axis=1), np.nan)
-    jumps = np.stack([np.nansum(step, axis=0), np.isfinite(step).sum(axis=0)])
-    means = np.concatenate([np.empty((0, 4)), *(part for _, part in found)])
-    return Sightings(
-        np.zeros(len(found), np.intp),
-        np.concatenate([[0], np.cumsum([len(kept) for kept, _ in found])]).astype(np.intp),
-        np.concatenate([np.empty(0, np.intp), *(kept for kept, _ in found)]),
-        means[:, 0],
-        means[:, 1:],
-        jumps[None].astype(np.float64),
-    )
-
-
-class PlanePixels(NamedTuple):
-    """Pixels of a plane without its rim and without outliers, n of them.
-
-    Attributes
-    ----------
-    mask : (H, W) bool
-    inverse, ray : (n,) and (n, 3) float64
-        Inverse depth, 1/m, and ray at depth 1.
-    residual : (n,) float64
-        What the least-squares plane leaves of the inverse depth, 1/m.
-    """
-
-    mask: NDArray[np.bool_]
-    inverse: NDArray[np.float64]
-    ray: NDArray[np.float64]
-    residual: NDArray[np.float64]
-
-
-def plane_pixels(
-    labels: NDArray[np.uint16], image: RangeImage, fewest: int
-) -> Iterator[PlanePixels]:
-    """Pixels of each plane that has so many."""
     kernel = np.ones((2 * _RIM + 1, 2 * _RIM + 1), np.uint8)
     inner = (labels > 0) & image.valid & (image.along > 0)
     inner &= cv2.erode(labels, kernel) == cv2.dilate(labels, kernel)
     along = np.where(inner, image.along, 1).astype(np.float64)
-    inverse = image.inverse.astype(np.float64) / along
-    rays = image.rays.astype(np.float64) / along[..., None]
+    inverse, rays = image.inverse / along, image.rays / along[..., None]
+    kept, means = [np.zeros(0, np.intp)], [np.zeros((0, 4))]
     for label in range(1, int(labels.max(initial=0)) + 1):
         mask = inner & (labels == label)
-        if np.count_nonzero(mask) < fewest:
+        if np.count_nonzero(mask) < SAMPLES * size * size:
             continue
-        error = np.abs(_residual(rays[mask], inverse[mask]))
-        mask[mask] = error <= _OUTLIER * 1.4826 * np.median(error)
-        yield PlanePixels(mask, inverse[mask], rays[mask], _residual(rays[mask], inverse[mask]))
-
-
-def _residual(rays: NDArray[np.float64], inverse: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What the least-squares plane theta . ray = inverse depth leaves (n,)."""
-    theta, *_ = np.linalg.lstsq(rays.T @ rays, rays.T @ inverse, rcond=None)
-    return np.asarray(inverse - rays @ theta)
+        ray, y = rays[mask], inverse[mask]
+        error = np.abs(y - ray @ np.linalg.lstsq(ray.T @ ray, ray.T @ y, rcond=None)[0])
+        explained = error <= _OUTLIER * 1.4826 * np.median(error)
+        own = cells[mask][explained]
+        count = np.bincount(own, minlength=rows * columns)
+        # Where half of a cell is the plane's, its mean stands for the cell.
+        some = np.flatnonzero(2 * count >= size * size)
+        if len(some) >= SAMPLES:
+            values = (part[explained] for part in (y, *ray.T))
+            sums = [np.bincount(own, part, len(count))[some] for part in values]
+            kept.append(some)
+            means.append(np.stack(sums, axis=1) / count[some, None])
+    start = np.cumsum([len(part) for part in kept])
+    found = np.concatenate(means)
+    planes = np.zeros(len(start) - 1, np.intp)
+    return Sightings(planes, start, np.concatenate(kept), found[:, 0], found[:, 1:], 1)
 
 
 def concatenate(frames: Sequence[Sightings]) -> Sightings:
     """Sightings of several frames, numbered one after the other."""
-    first = np.cumsum([0, *(len(part.jumps) for part in frames)])
+    first = np.cumsum([0, *(part.frames for part in frames)]).tolist()
     counts = np.concatenate([np.diff(part.start) for part in frames])
     return Sightings(
-        np.concatenate([part.frame + at for part, at in zip(frames, first, strict=False)]),
+        np.concatenate([part.frame + at for part, at in zip(frames, first[:-1], strict=True)]),
         np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
         np.concatenate([part.cell for part in frames]),
         np.concatenate([part.inverse for part in frames]),
         np.concatenate([part.ray for part in frames]),
-        np.concatenate([part.jumps for part in frames]),
+        first[-1],
     )

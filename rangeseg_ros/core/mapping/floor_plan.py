@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_outlines import valid
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, occupancy
@@ -19,6 +20,7 @@ from rangeseg_ros.core.mapping.right_angles import Squared, square_up
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 _ROUNDS = 5  # until the direction of up settles
 
@@ -161,10 +163,10 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
 
 
 def make_plan(
-    planes: Sequence[MapPlane],
+    solution: Solution,
     frame: str,
     up: Up,
-    voxels: tuple[NDArray[np.float64], NDArray[np.int64]],
+    points: Iterable[NDArray[np.float64]],
     config: Config,
     headroom: float,
     resolution: float,
@@ -173,12 +175,13 @@ def make_plan(
 
     Parameters
     ----------
-    planes : sequence of MapPlane
+    solution : Solution
+        Its planes.
     frame : str
         Their frame.
     up : Up
-    voxels : ((N, 3) float64, (N,) int64)
-        Points of the frames and their numbers, in that frame, see `VoxelCounts`.
+    points : iterable of (N, 3) float64
+        Of each frame, in that frame.
     config : Config
         `role_tolerance`, `role_area`, `role_height`, `obstacle_height`.
     headroom : float
@@ -188,16 +191,17 @@ def make_plan(
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)
-    squared = square_up(moved_planes(planes, motion), tolerance)
+    turned = np.kron(np.eye(len(solution.planes)), moved_plane(*motion))
+    covariance = turned @ solution.covariance @ turned.T
+    squared = square_up(moved_planes(solution.planes, motion), covariance, tolerance)
     roles, ground = _roles([s.plane for s in squared], config)
     squared = [
         s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
     ]
-    points, counts = voxels
-    points = points @ motion.rotation.T + motion.shift
-    # Ground that errs by half a voxel is ground.
+    # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
-    grid = occupancy(points, counts, ground, band, resolution)
+    upright = (some @ motion.rotation.T + motion.shift for some in points)
+    grid = occupancy(upright, ground, band, resolution)
     reach = ground + band[0], ground + headroom
     walls = [
         wall

@@ -71,7 +71,6 @@ class Record:
     looks: int = 0
     evidence: Evidence = field(default_factory=Evidence)
     followed: bool = False
-    way: float = 0.0
 
     @property
     def confirmed(self) -> bool:
@@ -106,7 +105,6 @@ class Record:
         self.seen = max(self.seen, other.seen)
         self.observations += other.observations
         self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
-        self.way += other.way
         self.pixels += other.pixels
         self.squares += other.squares
         self.confidence += other.confidence

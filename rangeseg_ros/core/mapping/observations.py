@@ -41,6 +41,27 @@ class PoseNoise(NamedTuple):
     turn: float
 
 
+class Sighting(NamedTuple):
+    """What a frame shows of the planes of a map.
+
+    Attributes
+    ----------
+    pose : Transform
+        Fixed frame from the frame of the image.
+    planes : sequence of Plane
+        M of them, in the frame of the image.
+    ids : (M,) int
+        Of the planes of the map that they are.
+    view : (M, C) float64
+        See `views`.
+    """
+
+    pose: Transform
+    planes: Sequence[Plane]
+    ids: NDArray[np.int64]
+    view: NDArray[np.float64]
+
+
 class Observations(NamedTuple):
     """M planes of a frame in the fixed frame.
 
@@ -70,6 +91,10 @@ class Observations(NamedTuple):
         """Some of them, by their numbers."""
         index = np.array(chosen, np.intp)
         return Observations(*(part[index] for part in self))
+
+    def covariance(self) -> NDArray[np.float64]:
+        """(M, 4, 4) of all of the error."""
+        return self.fresh + congruent(self.lasting, np.eye(3))
 
     def tangent_frame(self) -> tuple[NDArray[np.float64], ...]:
         """Normals (M, 3), their tangents (M, 2, 3), and points (M, 3) on the planes."""

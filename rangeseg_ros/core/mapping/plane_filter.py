@@ -1,14 +1,10 @@
-"""Planes estimated from many observations: a Kalman filter per plane, all of them at once.
+"""Planes estimated from many observations: an information filter per plane, all of them at once.
 
-An observation differs from the plane by z = x + B beta + v: x is the error of the plane, three
-numbers (`plane_errors`); beta, of unit variance, stands for what lasts of the sensor's error
-(`observations`); v is what is new in every frame, that of the camera's pose too. The plane's error
-is kept as x = C beta + e, its covariance C C^T + Q.
-
-beta is considered, not estimated (Schmidt, "Application of state-space methods to navigation
-problems", 1966): two looks from one place differ by (B' - B) beta, but also by which pixels they
-have of a ragged border, and a filter that explains all of that by beta goes on in the same
-direction, beyond both. Without lasting errors this is the information filter of a constant.
+An observation differs from the plane by z = x + v, x the error of the plane, three numbers
+(`plane_errors`). The part of v that lasts (`observations`) is the same in all frames of a run in
+which the plane is seen by the same pixels: the first k of them tell as much as their mean, whose
+covariance is F / k + L, with F of what is new in every frame and L of what lasts. The k-th adds
+what that information has grown by.
 """
 
 from __future__ import annotations
@@ -35,16 +31,16 @@ _IDENTITY = np.eye(3)
 
 
 class Step(NamedTuple):
-    """Observations and what is known of their planes when they come.
+    """Observations and what they tell of their planes when they come.
 
     Attributes
     ----------
     plane, observation : (K,) int
         Their numbers.
-    own, before : (K, 3, 3) float64
-        Q and C by this beta.
-    lasting, fresh : (K, 3, 3) float64
-        B and the covariance of v.
+    looks : (K,) int
+        Frames of the run, this one included.
+    information : (K, 3, 3) float64
+        What they add.
     spread : (K, 3, 3) float64
         Covariance of z.
     gap : (K, 3) float64
@@ -53,10 +49,8 @@ class Step(NamedTuple):
 
     plane: NDArray[np.intp]
     observation: NDArray[np.intp]
-    own: NDArray[np.float64]
-    before: NDArray[np.float64]
-    lasting: NDArray[np.float64]
-    fresh: NDArray[np.float64]
+    looks: NDArray[np.intp]
+    information: NDArray[np.float64]
     spread: NDArray[np.float64]
     gap: NDArray[np.float64]
 
@@ -75,38 +69,32 @@ class PlaneFilters:
         The plane.
     axes : (N, 2, 3) float64
         Tangents e1, e2.
-    own : (N, 3, 3) float64
-        Q, the covariance of what x has beside the lasting error.
-    lasting : (N, 3, 3) float64
-        C, the derivative of x by beta.
+    covariance : (N, 3, 3) float64
+        Of x.
     view : (N, C) float64
-        Of the last observation.
+        Of the first observation of this run.
+    looks : (N,) int
+        Observations of this run.
     """
 
     normal: NDArray[np.float64]
     point: NDArray[np.float64]
     axes: NDArray[np.float64]
-    own: NDArray[np.float64]
-    lasting: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     view: NDArray[np.float64]
+    looks: NDArray[np.intp]
 
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
         """Planes seen for the first time."""
         normal, axes, point = seen.tangent_frame()
-        local = to_errors(axes, point)
-        own = congruent(local, seen.fresh)
-        return cls(normal, point, axes, own, -local @ seen.lasting, seen.view)
+        covariance = congruent(to_errors(axes, point), seen.covariance())
+        return cls(normal, point, axes, covariance, seen.view, np.ones(len(normal), np.intp))
 
     @property
     def distance(self) -> NDArray[np.float64]:
         """(N,) distance of the planes in normal . p + distance = 0, metres."""
         return -(self.normal * self.point).sum(axis=1)
-
-    @property
-    def covariance(self) -> NDArray[np.float64]:
-        """(N, 3, 3) of x."""
-        return self.own + congruent(self.lasting, _IDENTITY)
 
     @property
     def plane_covariance(self) -> NDArray[np.float64]:
@@ -139,18 +127,17 @@ class PlaneFilters:
         self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
     ) -> Step:
         """What observations, of the numbers `which` (K,), are to planes `index` (K,)."""
-        same = continuity(self.view[index], seen.view[which])
-        other = (1 - same**2)[:, None, None]
-        before = self.lasting[index]
-        # What beta loses of what it was is on its own from now on.
-        own = self.own[index] + other * congruent(before, _IDENTITY)
-        before = same[:, None, None] * before
+        same = continuity(self.view[index], seen.view[which]) == 1
+        looks = np.where(same, self.looks[index] + 1, 1)
         local = to_errors(self.axes[index], self.point[index])
-        lasting = local @ seen.lasting[which]
-        fresh = congruent(local, seen.fresh[which]) + other * congruent(lasting, _IDENTITY)
-        spread = own + congruent(before + lasting, _IDENTITY) + fresh
+        fresh = congruent(local, seen.fresh[which])
+        lasting = congruent(local @ seen.lasting[which], _IDENTITY)
+        k = looks[:, None, None]
+        before = np.linalg.inv(fresh / np.maximum(k - 1, 1) + lasting) * (k > 1)
+        information = np.linalg.inv(fresh / k + lasting) - before
         gap = (local @ seen.plane[which][..., None])[..., 0]
-        return Step(index, which, own, before, lasting, fresh, spread, gap)
+        spread = self.covariance[index] + fresh + lasting
+        return Step(index, which, looks, information, spread, gap)
 
     def gate(self, step: Step, seen: Observations) -> NDArray[np.float64]:
         """Chi-squared (K,), of three degrees of freedom, of observations being of planes."""
@@ -160,16 +147,12 @@ class PlaneFilters:
 
     def update(self, step: Step, seen: Observations) -> None:
         """Take in observations, each plane at most one, that are `expected` as it is now."""
-        index, which = step.plane, step.observation
-        state = step.own + step.before @ (step.before + step.lasting).transpose(0, 2, 1)
-        solved = np.linalg.solve(step.spread, state.transpose(0, 2, 1))
-        gain = np.asarray(solved.transpose(0, 2, 1), np.float64)
-        rest = _IDENTITY - gain
-        self.own[index] = congruent(rest, step.own) + congruent(gain, step.fresh)
-        self.lasting[index] = rest @ step.before - gain @ step.lasting
-        other = continuity(self.view[index], seen.view[which]) < 1
-        self.view[index[other]] = seen.view[which[other]]
-        self._shift(index, (gain @ step.gap[..., None])[..., 0])
+        index, gain = step.plane, step.information
+        covariance = np.linalg.inv(np.linalg.inv(self.covariance[index]) + gain)
+        self.covariance[index], self.looks[index] = covariance, step.looks
+        first = step.looks == 1
+        self.view[index[first]] = seen.view[step.observation[first]]
+        self._shift(index, (covariance @ gain @ step.gap[..., None])[..., 0])
 
     def alike(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> list[tuple[int, int]]:
         """Pairs of one of `some` planes (K,) and another that may be it by what is known of both.
@@ -202,9 +185,9 @@ class PlaneFilters:
         sizes = np.cbrt([np.linalg.det(other), np.linalg.det(own)])
         weight = sizes / sizes.sum()
         information = [w * np.linalg.inv(c) for w, c in zip(weight, (own, other), strict=True)]
-        self.own[k] = np.linalg.inv(information[0] + information[1])
-        self.lasting[k] = self.view[k] = 0
-        self._shift(index, (self.own[k] @ information[1] @ gap[0])[None])
+        self.covariance[k] = np.linalg.inv(information[0] + information[1])
+        self.view[k] = 0
+        self._shift(index, (self.covariance[k] @ information[1] @ gap[0])[None])
 
     def variances(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances (K,), across the planes `index` (K,), at coordinates (K, 2)."""

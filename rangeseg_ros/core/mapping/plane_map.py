@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.drift import DriftEstimate
-from rangeseg_ros.core.mapping.evidence import see
+from rangeseg_ros.core.mapping.evidence import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.map_outlines import (
     polygon_of,
     simplify,
@@ -24,11 +23,11 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import (
     Observations,
     PoseNoise,
+    Sighting,
     observations,
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
-from rangeseg_ros.core.mapping.sightings import THERE, find_sightings, may_be_in_sight
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -53,10 +52,14 @@ class PlaneMap:
         How often it was begun, the first time included.
     planes_before : list of MapPlane
         What was known when it was begun anew.
+    successors_before : dict of int
+        `successors` then.
     jumps : list of (int, Jump)
         Stamps of frames whose poses the planes contradict, and by how much.
-    drift : DriftEstimate
-        Of the poses, since the map was begun.
+    sighting : Sighting or None
+        What the last frame shows of it.
+    successors : dict of int
+        Ids of planes that turned out to be another one -> the id of that one.
 
     Examples
     --------
@@ -76,8 +79,10 @@ class PlaneMap:
         """Begin anew; ids are not given twice."""
         self.begun_anew = why
         self.planes_before = self.planes if self.epoch else []
+        self.successors_before = self.successors if self.epoch else {}
         self.epoch += 1
-        self.drift = DriftEstimate(self.config.pose_noise)
+        self.sighting: Sighting | None = None
+        self.successors: dict[int, int] = {}
         self._records: list[Record] = []
         self._filters: PlaneFilters | None = None
         self._stamp = self._time = 0
@@ -115,7 +120,7 @@ class PlaneMap:
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
         self._stamp = stamp
-        self.drift.move(pose.shift)
+        self.sighting = Sighting(pose, [], np.zeros(0, np.int64), np.zeros((0, 0)))
         if planes:
             view = views(labels, planes, config.distortion_length)
             known = self._filters
@@ -133,20 +138,20 @@ class PlaneMap:
                     self._stamp, self._time = now
                     match, step = np.full(len(planes), -1), None
             if step:
-                self._update(planes, seen, step, pose.shift)
-            for k in match[match >= 0].tolist():
-                self._records[k].way += self.drift.way
+                self._update(planes, seen, step)
             self._fuse(planes, seen, match, pose, stamp)
+            ids = np.array([self._records[k].id for k in match.tolist()])
+            self.sighting = Sighting(pose, planes, ids, view)
             self._merge(pose.shift)
         self._contradict(image, pose, noise)
 
     @property
     def doubts(self) -> list[str]:
-        """What is to be said of the poses: jumps by the stamps of their frames, and drift."""
+        """What the planes say against the poses: jumps, by the stamps of their frames."""
         found = [f'{stamp * 1e-9:.3f} s: {jump}' for stamp, jump in self.jumps[:_TOLD]]
         if (more := len(self.jumps) - _TOLD) > 0:
             found.append(f'{more} more frames whose poses the planes contradict')
-        return found + ([str(self.drift)] if self.drift.significant else [])
+        return found
 
     @property
     def planes(self) -> list[MapPlane]:
@@ -207,24 +212,13 @@ class PlaneMap:
                 taken.append(n)
         return match, step.where(fits[taken]) if taken else None
 
-    def _update(
-        self,
-        planes: Sequence[Plane],
-        seen: Observations,
-        step: Step,
-        place: NDArray[np.float64],
-    ) -> None:
+    def _update(self, planes: Sequence[Plane], seen: Observations, step: Step) -> None:
         """Take in planes that are known: of parts of one plane, the largest decides on it."""
         assert self._filters is not None
         count = np.array([planes[m].count for m in step.observation.tolist()])
         order = np.lexsort([step.observation, -count, step.plane])
         largest = order[np.unique(step.plane[order], return_index=True)[1]]
-        step = step.where(largest)
-        records = [self._records[k] for k in step.plane.tolist()]
-        since = np.array([record.way / record.observations for record in records])
-        noise = np.radians(self.config.pose_turn_noise)
-        self.drift.add(self._filters, step, since, place, noise)
-        self._filters.update(step, seen)
+        self._filters.update(step.where(largest), seen)
 
     def _fuse(
         self,
@@ -243,7 +237,7 @@ class PlaneMap:
             first = PlaneFilters.of(seen.where(new))
             self._filters = self._filters.joined(first) if self._filters else first
             for _ in new:
-                self._records.append(Record(self._next, stamp, stamp, way=self.drift.way))
+                self._records.append(Record(self._next, stamp, stamp))
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp, self._time)
@@ -278,6 +272,8 @@ class PlaneMap:
                 continue
             kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
             filters.absorb(kept, lost)
+            first, second = sorted(self._records[n].id for n in (kept, lost))
+            self.successors[second] = first
             self._records[kept].absorb(self._records[lost])
             self._grow(kept, self._across(lost, kept))
             gone.append(lost)
@@ -335,8 +331,8 @@ class PlaneMap:
             if not record.followed and record.frames > 1:
                 record.evidence.follow(record.outline)
                 record.followed = True
-        middles = np.array([record.evidence.middle for record in self._records])
-        reaches = np.array([record.evidence.reach for record in self._records])
+        circles = [record.evidence.circle() for record in self._records]
+        middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
         middles = filters.points(np.arange(len(middles)), middles)
         middles = (middles - pose.shift) @ pose.rotation
         shown = np.flatnonzero(may_be_in_sight(middles, reaches, image))
@@ -368,11 +364,11 @@ class PlaneMap:
             image,
             SensorModel.from_config(self.config),
         )
-        there = np.bincount(which[found == THERE], minlength=len(evidence))
-        for k in np.flatnonzero(2 * there > np.bincount(which, minlength=len(evidence))).tolist():
-            records[k].looks += 1
-        for k in see(evidence, which, found).tolist():
-            records[k].reshape(records[k].evidence.remaining(records[k].outline))
+        for number, record in enumerate(records):
+            part = found[which == number]
+            record.looks += int(2 * np.count_nonzero(part == THERE) > len(part))
+            if record.evidence.see(part):
+                record.reshape(record.evidence.remaining(record.outline))
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, those not confirmed, and what is too much."""

@@ -1,23 +1,21 @@
 """Planes made level, plumb and square, where their covariances allow it.
 
-A constraint that a plane keeps within its errors (chi-squared, 0.999) is imposed on it as an exact
-observation: the most likely plane that keeps it. So a plane turns about where it is known best.
+A constraint that planes keep within their errors (chi-squared, 0.999) is imposed on all planes
+together as an exact observation: they become the most likely planes that keep it. So a plane turns
+about where it is known best, and two that become parallel share what they turn by.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
+from rangeseg_ros.core.mapping.adjustment import moved_onto
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.significance import chi2_quantile
-
-_ROUNDS = 3  # until the azimuth of a group settles
 
 
 class Squared(NamedTuple):
@@ -40,13 +38,17 @@ class Squared(NamedTuple):
     turned: float
 
 
-def square_up(planes: Sequence[MapPlane], tolerance: float) -> list[Squared]:
+def square_up(
+    planes: Sequence[MapPlane], covariance: NDArray[np.float64], tolerance: float
+) -> list[Squared]:
     """Make planes level or plumb, and walls parallel or at right angles to each other.
 
     Parameters
     ----------
     planes : sequence of MapPlane
-        In a frame whose z is up.
+        P of them, in a frame whose z is up.
+    covariance : (4 P, 4 P) float64
+        Of the normals and distances of all of them.
     tolerance : float
         Largest angle to the horizontal or vertical of a plane that may be meant so, radians.
 
@@ -55,85 +57,64 @@ def square_up(planes: Sequence[MapPlane], tolerance: float) -> list[Squared]:
     list of Squared
         In the order of the planes. Outlines are moved onto their planes.
     """
-    equations = [np.append(plane.normal, plane.distance) for plane in planes]
-    covariances = [plane.covariance for plane in planes]
-    exact = [''] * len(planes)
+    known = _Conditions(planes, covariance)
+    exact, group = [''] * len(planes), [0] * len(planes)
     for k, plane in enumerate(planes):
         level = abs(plane.normal[2]) > np.cos(tolerance)
-        if level or abs(plane.normal[2]) < np.sin(tolerance):
-            rows = np.eye(4)[:2] if level else np.eye(4)[2:3]
-            done = _imposed(equations[k], covariances[k], rows, -rows @ equations[k])
-            if done is not None:
-                equations[k], covariances[k] = done
-                exact[k] = 'level' if level else 'plumb'
-    group = [0] * len(planes)
-    plumb = [k for k, kind in enumerate(exact) if kind == 'plumb']
-    for number, (azimuth, members) in enumerate(_groups(planes, equations, covariances, plumb), 1):
-        for k in members:
-            row, gap = _to_azimuth(equations[k], azimuth)
-            done = _imposed(equations[k], covariances[k], row, gap)
-            if done is not None:
-                equations[k], covariances[k] = _at_azimuth(*done, plane=planes[k], azimuth=azimuth)
-                exact[k], group[k] = 'square', number
-    found = []
-    for k, plane in enumerate(planes):
-        cosine = np.clip(plane.normal @ equations[k][:3], -1, 1)
-        moved = _moved(plane, equations[k], covariances[k]) if exact[k] else plane
-        found.append(Squared(moved, group[k], exact[k], float(np.arccos(cosine))))
-    return found
-
-
-def _groups(
-    planes: Sequence[MapPlane],
-    equations: list[NDArray[np.float64]],
-    covariances: list[NDArray[np.float64]],
-    plumb: list[int],
-) -> list[tuple[float, list[int]]]:
-    """Azimuths, modulo a right angle, that two walls or more share, those of large ones first."""
-    rest = sorted(plumb, key=lambda k: -planes[k].area)
-    angle = {k: np.arctan2(equations[k][1], equations[k][0]) for k in rest}
-    variance = {}
-    for k in rest:
-        row, _ = _to_azimuth(equations[k], 0.0)
-        variance[k] = float((row @ covariances[k] @ row.T)[0, 0])
-    found = []
+        axes = [0, 1] if level else [2] if abs(plane.normal[2]) < np.sin(tolerance) else []
+        rows = np.eye(4 * len(planes))[4 * k + np.array(axes, np.intp)]
+        if axes and known.impose(rows, -rows @ known.values):
+            exact[k] = 'level' if level else 'plumb'
+    seeds: dict[int, int] = {}
+    order = np.argsort([-plane.area for plane in planes], kind='stable').tolist()
+    rest = [k for k in order if exact[k] == 'plumb']
     while rest:
-        azimuth, spread, members = angle[rest[0]], variance[rest[0]], [rest[0]]
-        for _ in range(_ROUNDS):
-            gap = {k: _modulo(angle[k] - azimuth) for k in rest}
-            # The seed is a member: its own error is that of the azimuth at first.
-            members = [k for k in rest if gap[k] ** 2 < chi2_quantile(1) * (variance[k] + spread)]
-            weight = np.array([1 / max(variance[k], 1e-12) for k in members])
-            azimuth += float(weight @ [gap[k] for k in members] / weight.sum())
-            spread = 1 / weight.sum()
+        seed, *others = rest
+        members = [seed, *(k for k in others if known.impose(*known.out_of_square(k, seed)))]
+        rest = [k for k in others if k not in members]
         if len(members) > 1:
-            found.append((azimuth, members))
-        rest = [k for k in rest if k not in members and k != rest[0]]
-    return found
+            number = len(set(seeds.values())) + 1
+            for k in members:
+                exact[k], group[k], seeds[k] = 'square', number, seed
+    equations = known.values.reshape(-1, 4).copy()
+    for k, plane in enumerate(planes):
+        if exact[k]:
+            # Without what the first order has left.
+            normal = _exact(exact[k], equations[k], equations[seeds.get(k, k)])
+            equations[k, 3] += (equations[k, :3] - normal) @ plane.centroid
+            equations[k, :3] = normal
+    moved = moved_onto(planes, equations, known.covariance)
+    cosines = [a.normal @ b.normal for a, b in zip(planes, moved, strict=True)]
+    turned = np.arccos(np.clip(cosines, -1, 1)).tolist()
+    return list(map(Squared, moved, group, exact, turned))
 
 
-def _to_azimuth(
-    equation: NDArray[np.float64], azimuth: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivative (1, 4) of a normal's azimuth, and what is missing to `azimuth` mod 90 degrees."""
-    x, y = equation[:2]
-    row = np.array([[-y, x, 0, 0]]) / (x * x + y * y)
-    return row, np.array([-_modulo(np.arctan2(y, x) - azimuth)])
+class _Conditions:
+    """Planes under the conditions that were imposed on them: `values` (4 P,), `covariance`."""
 
+    def __init__(self, planes: Sequence[MapPlane], covariance: NDArray[np.float64]) -> None:
+        self.values = np.array([[*plane.normal, plane.distance] for plane in planes]).ravel()
+        self.covariance = covariance
 
-def _at_azimuth(
-    equation: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    plane: MapPlane,
-    azimuth: float,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """A plumb plane at an azimuth, mod 90 degrees, without what the first order has left."""
-    azimuth = np.arctan2(equation[1], equation[0]) - _modulo(
-        np.arctan2(equation[1], equation[0]) - azimuth
-    )
-    normal = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    distance = (equation[:3] - normal) @ plane.centroid + equation[3]
-    return np.append(normal, distance), covariance
+    def impose(self, rows: NDArray[np.float64], gap: NDArray[np.float64]) -> bool:
+        """Have `rows` of the values change by `gap`, unless that is too far."""
+        spread = rows @ self.covariance @ rows.T
+        inverse = np.linalg.pinv(spread)
+        if gap @ inverse @ gap > chi2_quantile(len(gap)):
+            return False
+        gain = self.covariance @ rows.T @ inverse
+        self.values = self.values + gain @ gap
+        self.covariance = self.covariance - gain @ rows @ self.covariance
+        return True
+
+    def out_of_square(self, k: int, m: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Derivative (1, 4 P) of the difference of two azimuths, and what it lacks (1,)."""
+        row, azimuth = np.zeros((1, len(self.values))), []
+        for sign, plane in ((1, k), (-1, m)):
+            x, y = self.values[4 * plane : 4 * plane + 2]
+            row[0, 4 * plane : 4 * plane + 2] += sign * np.array([-y, x]) / (x * x + y * y)
+            azimuth.append(np.arctan2(y, x))
+        return row, np.array([-_modulo(azimuth[0] - azimuth[1])])
 
 
 def _modulo(angle: float) -> float:
@@ -141,35 +122,10 @@ def _modulo(angle: float) -> float:
     return float(angle - np.pi / 2 * np.round(angle / (np.pi / 2)))
 
 
-def _imposed(
-    equation: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    gap: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """A plane and its covariance once `rows` of it have changed by `gap`; None when too far."""
-    spread = rows @ covariance @ rows.T
-    if gap @ np.linalg.pinv(spread) @ gap > chi2_quantile(len(rows)):
-        return None
-    gain = covariance @ rows.T @ np.linalg.pinv(spread)
-    changed = equation + gain @ gap
-    return changed / np.linalg.norm(changed[:3]), covariance - gain @ rows @ covariance
-
-
-def _moved(
-    plane: MapPlane, equation: NDArray[np.float64], covariance: NDArray[np.float64]
-) -> MapPlane:
-    """A plane with another equation, its outline on it."""
-    normal, distance = equation[:3], float(equation[3])
-
-    def onto(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return points - (points @ normal + distance)[..., None] * normal
-
-    return replace(
-        plane,
-        normal=normal,
-        distance=distance,
-        covariance=covariance,
-        centroid=onto(plane.centroid),
-        outline=MapOutline([[onto(ring) for ring in part] for part in plane.outline.parts]),
-    )
+def _exact(kind: str, own: NDArray[np.float64], seed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A normal that is level, plumb, or square to that of the seed."""
+    if kind == 'level':
+        return np.array([0.0, 0.0, np.sign(own[2])])
+    azimuth, wanted = np.arctan2(own[1], own[0]), np.arctan2(seed[1], seed[0])
+    azimuth -= _modulo(azimuth - wanted)
+    return np.array([np.cos(azimuth), np.sin(azimuth), 0.0])

@@ -1,0 +1,336 @@
+r"""Planes and poses of a recording, solved together by least squares.
+
+A bundle adjustment with planes instead of points (Kaess, "Simultaneous localization and mapping
+with infinite planes", ICRA 2015). What a frame f shows of plane p differs from the plane as it is
+estimated by the three numbers (`plane_errors`)
+
+    z = x_p + D s_f + v,
+
+x_p the error of the plane, s_f that of the pose (a turn about the camera and a shift), and v that
+of the sensor. The part of v that lasts (`observations`) is the same in the n frames of a run in
+which the plane is seen by the same pixels: it counts n times, so that the mean of the run has it
+once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f.
+The errors of an odometry add up: e_f - e_(f-1) is its noise, and it has no other drift. A drift
+that is not significant is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.linalg import block_diag
+from scipy.sparse.linalg import SuperLU, splu
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.mapping.map_outlines import MapOutline
+from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.observations import (
+    Observations,
+    PoseNoise,
+    Sighting,
+    continuity,
+    observations,
+)
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
+from rangeseg_ros.core.tracking.plane_errors import (
+    GATE,
+    by_motion,
+    congruent,
+    from_errors,
+    shifted,
+    tangents,
+    to_errors,
+)
+
+_ROUNDS = 6  # until weights settle
+_SYMMETRIC = {'SymmetricMode': True}
+# Columns of the inverse that are worked out at a time.
+_COLUMNS = 64
+# Poses without stated errors err by so much, metres and radians, so that equations are finite.
+_LEAST = 1e-5
+
+
+class Solution(NamedTuple):
+    """Planes and poses as they were most probably.
+
+    Attributes
+    ----------
+    planes : list of MapPlane
+        Their outlines are moved onto them.
+    covariance : (4 P, 4 P) float64
+        Of normal and distance of all planes in turn.
+    poses : list of Transform
+        Of the frames in turn.
+    drift : (3,) float64
+        Of the poses as they were told, metres per metre of the way.
+    drift_covariance : (3, 3) float64
+    way : float
+        Of the camera, metres.
+    drifts : bool
+        Whether the drift is larger than chance makes it (chi-squared, 0.999), and taken off.
+    """
+
+    planes: list[MapPlane]
+    covariance: NDArray[np.float64]
+    poses: list[Transform]
+    drift: NDArray[np.float64]
+    drift_covariance: NDArray[np.float64]
+    way: float
+    drifts: bool
+
+    def drift_text(self) -> str:
+        """The drift in words."""
+        size = float(np.linalg.norm(self.drift))
+        along = self.drift / max(size, 1e-12)
+        deviation = float(np.sqrt(along @ self.drift_covariance @ along))
+        return (
+            f'the poses drift by {100 * size:.1f} +- {100 * deviation:.1f} % of the way '
+            f'({self.way:.1f} m)'
+        )
+
+
+class Adjustment:
+    """Collects what the frames of a recording show of the planes of its map.
+
+    Parameters
+    ----------
+    noise : PoseNoise
+        Of the poses that are told, or of their changes from frame to frame.
+    odometry : bool
+        Whether the errors of the poses add up.
+
+    Examples
+    --------
+    >>> adjustment.add(plane_map.sighting)
+    >>> solution = adjustment.solve(plane_map.planes, plane_map.successors)
+    """
+
+    def __init__(self, noise: PoseNoise, odometry: bool = False) -> None:
+        self._noise = np.repeat(np.maximum([noise.turn, noise.shift], _LEAST), 3)
+        self._odometry = odometry
+        self._poses: list[Transform] = []
+        self._seen: list[Observations] = []
+        # Number of its frame, id of its plane and number of its run, for each observation.
+        self._index: list[tuple[int, int, int]] = []
+        self._last: dict[int, tuple[NDArray[np.float64], int]] = {}
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def add(self, frame: Sighting) -> None:
+        """Take in a frame. Of parts of one plane the largest counts."""
+        self._poses.append(frame.pose)
+        if not len(frame.ids):
+            return
+        size = np.array([plane.count for plane in frame.planes])
+        order = np.lexsort([-size, frame.ids])
+        chosen = order[np.unique(frame.ids[order], return_index=True)[1]]
+        view = frame.view[chosen]
+        planes = [frame.planes[k] for k in chosen.tolist()]
+        still = Transform.identity(), PoseNoise(0.0, 0.0)
+        self._seen.append(observations(planes, view, *still)._replace(view=view[:, :0]))
+        for number, own in zip(frame.ids[chosen].tolist(), view, strict=True):
+            before, run = self._last.get(number, (own[:0], 0))
+            if before.shape != own.shape or continuity(before[None], own[None])[0] < 1:
+                before, run = own, len(self._index)
+                self._last[number] = before, run
+            self._index.append((len(self._poses) - 1, number, run))
+
+    def solve(self, planes: Sequence[MapPlane], successors: Mapping[int, int]) -> Solution:
+        """Planes and poses of all frames.
+
+        Parameters
+        ----------
+        planes : sequence of MapPlane
+            Of the map; observations of others do not count.
+        successors : mapping of int
+            Ids that planes have now, by those that they had when they were observed.
+        """
+        number = {plane.id: k for k, plane in enumerate(planes)}
+        used, index = [], []
+        for i, (at, own, run) in enumerate(self._index):
+            while own in successors:
+                own = successors[own]
+            if own in number:
+                used.append(i)
+                index.append((at, number[own], run))
+        seen = Observations(
+            *(np.concatenate(part)[used] for part in zip(*self._seen, strict=True))
+        )
+        frame, plane, times = np.array(index, np.intp).reshape(-1, 3).T
+        times = np.bincount(times)[times][:, None, None]
+        error = seen.fresh + times * congruent(seen.lasting, np.eye(3))
+        sightings = frame, plane, seen.plane, error
+        told = _State.of(planes, self._poses)
+        state, drift, covariance = self._solved(told, sightings, drifts=not self._odometry)
+        drift_covariance = covariance[-3:, -3:]
+        drifts = drift @ np.linalg.solve(drift_covariance, drift) > chi2_quantile(3)
+        if not drifts:
+            state, _, covariance = self._solved(told, sightings, drifts=False)
+        jacobian = block_diag(*from_errors(state.axes, state.point))
+        joint = jacobian @ covariance[:-3, :-3] @ jacobian.T
+        equations = np.column_stack([state.normal, -(state.normal * state.point).sum(axis=1)])
+        return Solution(
+            moved_onto(planes, equations, joint),
+            joint,
+            [Transform(*pose) for pose in zip(state.turn, state.shift, strict=True)],
+            drift,
+            drift_covariance,
+            float(self._way()[-1]),
+            bool(drifts),
+        )
+
+    def _solved(
+        self,
+        told: _State,
+        sightings: tuple[NDArray, NDArray, NDArray, NDArray],
+        drifts: bool,
+    ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
+        """The most probable state and drift, and the covariance of all planes and the drift."""
+        state, drift, weight = told, np.zeros(3), np.ones(len(sightings[0]))
+        first, last = 3 * len(told.normal), 3 * len(told.normal) + 6 * len(told.turn)
+        prior = self._prior(first, drifts)
+        for _ in range(_ROUNDS):
+            design, gap = _equations(state, *sightings)
+            known = np.concatenate([np.zeros(first), state.pose_errors(told), drift])
+            scale = np.repeat(np.sqrt(weight), 3)
+            rows = sparse.vstack([sparse.diags_array(scale) @ design, prior]).tocsr()
+            factors = splu((rows.T @ rows).tocsc(), 'MMD_AT_PLUS_A', 0.0, options=_SYMMETRIC)
+            step = factors.solve(rows.T @ np.concatenate([scale * gap, -prior @ known]))
+            # Huber's weights: things that move by themselves are not to move the camera.
+            left = ((gap - design @ step).reshape(-1, 3) ** 2).sum(axis=1)
+            weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(left, 1e-12)))
+            state, drift = state.corrected(step[:first], step[first:last]), drift + step[last:]
+        covariance = _part_of_inverse(factors, np.r_[:first, last : last + 3])
+        # What planes disagree by, each with all of its errors: a cluster-robust variance (Liang
+        # and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+        of_drift = factors.solve(np.eye(last + 3, 3, -last))
+        part = scale[:, None] * (design @ of_drift) * (scale * (gap - design @ step))[:, None]
+        each = np.zeros((len(told.normal), 3))
+        np.add.at(each, np.repeat(sightings[1], 3), part)
+        covariance[-3:, -3:] += each.T @ each
+        return state, drift, covariance
+
+    def _way(self) -> NDArray[np.float64]:
+        """(F,) way of the camera up to each frame; less than the noise of poses is no way."""
+        way, total, place = [], 0.0, self._poses[0].shift
+        for pose in self._poses:
+            step = float(np.linalg.norm(pose.shift - place))
+            if step > OUTLIER * self._noise[-1]:
+                total, place = total + step, pose.shift
+            way.append(total)
+        return np.array(way)
+
+    def _prior(self, planes: int, drifts: bool) -> sparse.csr_array:
+        """What is known beforehand of the poses and the drift, as equations of unit variance."""
+        frames, way = len(self._poses), self._way()
+        change = sparse.eye_array(frames)
+        if self._odometry:
+            change -= sparse.eye_array(frames, k=-1)
+        poses = sparse.kron(change, sparse.diags_array(1 / self._noise))
+        shift = np.vstack([np.zeros((3, 3)), np.eye(3)])
+        drift = -poses @ sparse.csr_array(np.kron(way[:, None], shift))
+        # No drift is longer than the way.
+        least = sparse.eye_array(3) / (1.0 if drifts else _LEAST)
+        rows = sparse.block_array([[poses, drift], [None, least]])
+        return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()
+
+
+class _State(NamedTuple):
+    """Planes and poses as they are estimated."""
+
+    normal: NDArray[np.float64]
+    point: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    turn: NDArray[np.float64]
+    shift: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, planes: Sequence[MapPlane], poses: Sequence[Transform]) -> _State:
+        normal = np.array([plane.normal for plane in planes]).reshape(-1, 3)
+        point = np.array([plane.centroid for plane in planes]).reshape(-1, 3)
+        turn, shift = (np.array(part) for part in zip(*poses, strict=True))
+        return cls(normal, point, tangents(normal), turn, shift)
+
+    def pose_errors(self, told: _State) -> NDArray[np.float64]:
+        """(6 F,) what poses that were told err by."""
+        turn = Rotation.from_matrix(told.turn @ self.turn.transpose(0, 2, 1)).as_rotvec()
+        return np.column_stack([turn, told.shift - self.shift]).ravel()
+
+    def corrected(self, planes: NDArray[np.float64], poses: NDArray[np.float64]) -> _State:
+        """Without these errors, (3 P,) and (6 F,)."""
+        turn, shift = np.split(poses.reshape(-1, 6), 2, axis=1)
+        moved = shifted(self.normal, self.point, self.axes, planes.reshape(-1, 3))
+        back = Rotation.from_rotvec(-turn).as_matrix()
+        return _State(*moved, back @ self.turn, self.shift - shift)
+
+
+def _equations(
+    state: _State,
+    frame: NDArray[np.intp],
+    plane: NDArray[np.intp],
+    seen: NDArray[np.float64],
+    error: NDArray[np.float64],
+) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+    """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened."""
+    turn, shift = state.turn[frame], state.shift[frame]
+    normal, point, axes = (part[plane] for part in state[:3])
+    to_world = np.zeros((len(turn), 4, 4))
+    to_world[:, :3, :3], to_world[:, 3, 3] = turn, 1
+    to_world[:, 3, :3] = -np.einsum('ni,nij->nj', shift, turn)
+    local = to_errors(axes, point) @ to_world
+    whiten = np.linalg.inv(np.linalg.cholesky(congruent(local, error)))
+    motion = -by_motion(normal, axes, point - shift)
+    values = np.concatenate([whiten, whiten @ motion], axis=2)
+    first = 3 * len(state.normal)
+    places = [3 * plane[:, None] + np.arange(3), first + 6 * frame[:, None] + np.arange(6)]
+    columns = np.repeat(np.concatenate(places, axis=1), 3, axis=0)
+    begin = np.arange(0, columns.size + 1, columns.shape[1])
+    shape = len(columns), first + 6 * len(state.turn) + 3
+    design = sparse.csr_array((values.ravel(), columns.ravel(), begin), shape)
+    return design, (whiten @ local @ seen[..., None]).ravel()
+
+
+def _part_of_inverse(factors: SuperLU, chosen: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Rows and columns `chosen` of the inverse of a factored matrix."""
+    parts = []
+    for some in np.split(chosen, range(_COLUMNS, len(chosen), _COLUMNS)):
+        unit = np.zeros((factors.shape[0], len(some)))
+        unit[some, np.arange(len(some))] = 1
+        parts.append(factors.solve(unit)[chosen])
+    return np.concatenate(parts, axis=1)
+
+
+def moved_onto(
+    planes: Sequence[MapPlane],
+    equations: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> list[MapPlane]:
+    """Planes with other equations (P, 4) and their joint covariance (4 P, 4 P).
+
+    Their outlines are moved onto them.
+    """
+    found = []
+    for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
+        normal, distance = equation[:3], float(equation[3])
+        on = [
+            [ring - (ring @ normal + distance)[:, None] * normal for ring in part]
+            for part in plane.outline.parts
+        ]
+        found.append(
+            replace(
+                plane,
+                normal=normal,
+                distance=distance,
+                covariance=covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4],
+                centroid=plane.centroid - (plane.centroid @ normal + distance) * normal,
+                outline=MapOutline(on),
+            )
+        )
+    return found

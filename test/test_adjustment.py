@@ -1,0 +1,147 @@
+"""Planes and poses solved together: errors against truth, drift, jumps of single planes."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from map_squares import plane as map_plane
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros.core.fitting.coplanar import RESIDUE
+from rangeseg_ros.core.mapping.adjustment import Adjustment
+from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, Sighting
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
+
+FACES = np.array(
+    [(0, 0, 1, 0), (0, 0, -1, 2.5), (-1, 0, 0, 3), (1, 0, 0, 3), (0, 1, 0, 2), (0, -1, 0, 2)]
+)
+NOISE = PoseNoise(0.005, np.radians(0.3))
+# Of planes as a sensor shows them: direction about two axes, and offset.
+SIGMA = np.array([0.004, 0.004, 0.003])
+
+
+def seen(random, face, pose, lasting):
+    """A plane in the frame of a camera, with an error that lasts and one that is new."""
+    normal = pose.rotation.T @ face[:3]
+    distance = face[3] + face[:3] @ pose.shift
+    centroid = -normal * distance
+    jacobian = from_errors(tangents(normal[None]), centroid[None])[0]
+    error = np.sqrt(LASTING) * lasting + np.sqrt(1 - LASTING) * random.standard_normal(3)
+    off = np.append(normal, distance) + jacobian @ (SIGMA * error)
+    off /= np.linalg.norm(off[:3])
+    return SimpleNamespace(
+        normal=off[:3],
+        distance=off[3],
+        covariance=jacobian @ np.diag(SIGMA**2) @ jacobian.T / RESIDUE,
+        centroid=-off[:3] * off[3],
+        confidence=1.0,
+        rms=0.0,
+        area=1.0,
+        count=1000,
+    )
+
+
+def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
+    """Solution for a camera that walks 4 m along a room, and its true poses."""
+    random = np.random.default_rng(seed)
+    adjustment, truths, way = Adjustment(NOISE, odometry), [], 0.0
+    told_off = np.zeros(3)
+    for k in range(frames):
+        turn = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
+        truth = Transform(turn, np.array([-2 + 4 * k / frames, 0.3 * np.sin(k / 5), 1.2]))
+        way += np.linalg.norm(truth.shift - truths[-1].shift) if truths else 0
+        off = Rotation.from_rotvec(random.normal(0, NOISE.turn, 3)).as_matrix()
+        fresh = random.normal(0, NOISE.shift, 3)
+        told_off = told_off + fresh if odometry else fresh
+        turned = truth.rotation if odometry else off @ truth.rotation
+        told = Transform(turned, truth.shift + told_off + np.array(drift) * way)
+        # All pixels are others after four frames.
+        lasting = np.random.default_rng([seed, k // 4]).standard_normal((len(FACES), 3))
+        view = np.eye(len(FACES) * frames)[(k // 4) * len(FACES) + np.arange(len(FACES))]
+        faces = FACES + np.outer(np.arange(len(FACES)) == 5, (0, 0, 0, moving * (k > frames / 2)))
+        planes = [seen(random, f, truth, own) for f, own in zip(faces, lasting, strict=True)]
+        adjustment.add(Sighting(told, planes, np.arange(1, len(FACES) + 1), view))
+        truths.append(truth)
+    start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
+    return adjustment.solve(start, {}), truths
+
+
+def errors_of(solution, truths):
+    """Equations of the planes and shifts of the poses, less the true ones."""
+    found = np.array([[*plane.normal, plane.distance] for plane in solution.planes])
+    shifts = [a.shift - b.shift for a, b in zip(solution.poses, truths, strict=True)]
+    return found - FACES, np.array(shifts)
+
+
+def test_errors_are_as_small_as_stated_and_poses_better_than_told():
+    nees, shifts, turns = [], [], []
+    for seed in range(20):
+        solution, truths = solved(seed)
+        error, shift = errors_of(solution, truths)
+        for k, own in enumerate(error):
+            covariance = solution.covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4]
+            nees.append(own @ np.linalg.pinv(covariance, 1e-9) @ own / 3)
+        shifts.append(shift)
+        turns += [
+            Rotation.from_matrix(a.rotation @ b.rotation.T).magnitude()
+            for a, b in zip(solution.poses, truths, strict=True)
+        ]
+        assert not solution.drifts
+    assert 0.7 < np.mean(nees) < 1.5
+    assert np.sqrt(np.mean(np.square(shifts))) < 0.75 * NOISE.shift
+    assert np.sqrt(np.mean(np.square(turns)) / 3) < 0.75 * NOISE.turn
+
+
+def test_drift_is_found_and_taken_off():
+    told = np.array([0.006, 0.008, 0.0])
+    for seed in range(5):
+        solution, truths = solved(seed, told)
+        assert solution.drifts and 'the poses drift by' in solution.drift_text()
+        gap = solution.drift - told
+        assert gap @ np.linalg.solve(solution.drift_covariance, gap) < 16.3
+        assert np.linalg.norm(gap) < 0.003
+        _, shift = errors_of(solution, truths)
+        assert np.sqrt(np.mean(np.square(shift))) < 0.01
+
+
+def test_a_plane_that_moves_does_not_move_the_camera():
+    solution, truths = solved(3, moving=0.3)
+    _, shift = errors_of(solution, truths)
+    assert np.sqrt(np.mean(np.square(shift))) < 0.01
+
+
+def test_errors_of_an_odometry_add_up_and_planes_take_them_off():
+    told, left = [], []
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        told.append(np.cumsum(random.normal(0, NOISE.shift, (40, 3)), axis=0))
+        left.append(errors_of(*solved(seed, odometry=True))[1])
+    # Where all of it is, nothing tells.
+    told, left = (np.std(part, axis=1).mean() for part in (told, left))
+    assert left < 0.3 * told
+
+
+def test_observations_count_for_what_their_planes_became():
+    random = np.random.default_rng(0)
+    adjustment = Adjustment(NOISE)
+    pose = Transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    for number in (1, 7, 9):
+        planes = [seen(random, FACES[0], pose, np.zeros(3))]
+        adjustment.add(Sighting(pose, planes, np.array([number]), np.eye(9)[[number - 1]]))
+    adjustment.add(Sighting(pose, [], np.zeros(0, int), np.zeros((0, 0))))
+    start = [map_plane(1, (0, 0, 1), (0, 0, 0), 0.01)]
+    with_one = adjustment.solve(start, {}).covariance
+    with_two = adjustment.solve(start, {9: 7, 7: 1}).covariance
+    assert np.trace(with_two) < 0.7 * np.trace(with_one)
+    assert len(adjustment.solve(start, {}).poses) == 4
+
+
+@pytest.mark.parametrize('kind', ['outline', 'same'])
+def test_planes_are_moved_with_their_outlines_and_the_same_each_time(kind):
+    one, two = solved(1)[0], solved(1)[0]
+    for a, b in zip(one.planes, two.planes, strict=True):
+        if kind == 'same':
+            assert np.array_equal(a.covariance, b.covariance) and a.distance == b.distance
+        else:
+            np.testing.assert_allclose(a.hull @ a.normal + a.distance, 0, atol=1e-9)
