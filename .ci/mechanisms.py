@@ -165,28 +165,15 @@ MECHANISMS = (
     # The ground.
     Mechanism('ground reached by a chain', 'ground/reach.py',
               {'ground.terrain.reach': _near_first_plane}, 'terrain'),
-    Mechanism('first plane fitted', 'ground/estimate.py:first_plane',
-              {'ground.terrain.first_plane': _returning((0.0, 0.0, 0.0))}, 'terrain'),
     Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
               {'ground.terrain.ground_field':
                lambda original: lambda cells, ground, *rest: original(
                    cells, np.zeros_like(ground), *rest)}, 'terrain'),
-    Mechanism('noisy heights are medians', 'ground/terrain.py:_smoothed',
-              {'ground.terrain._smoothed': _given(3, 1e9)}, 'terrain'),
     Mechanism('confidence decides', 'ground/estimate.py:no_step',
               {'ground.terrain.SURE': 0.0}, 'terrain'),
-    Mechanism('farther surfaces tried', 'ground/estimate.py:Continuation',
-              {'ground.terrain._TRIALS': 1}, 'terrain'),
-    Mechanism('floor of the robot before a step', 'ground/estimate.py:Continuation',
-              {'ground.estimate.Continuation.behind_step': _returning(False)}, 'terrain'),
-    Mechanism('distortion in the height', 'ground/terrain.py:_smooth_variance',
-              {'ground.terrain._smooth_variance':
-               lambda _: lambda place, *rest: np.zeros(place.shape[1])}, 'terrain'),
     Mechanism('steep faces are obstacles', 'ground/terrain.py:_faces',
               {'ground.terrain._faces':
                lambda _: lambda cells, limits: np.zeros(cells.inverse.shape, bool)}, 'terrain'),
-    Mechanism('bounds apart from the ground', 'ground/terrain.py:_with_ground',
-              {'ground.terrain._APART': 0.8}, 'terrain'),
     # Ids.
     Mechanism('camera motion by the planes', 'tracking/tracker.py:_camera_motion',
               {'tracking.tracker._camera_motion': _returning((np.eye(3), np.zeros(3)))}, 'tracks'),
