@@ -80,10 +80,9 @@ def _without_distortion_length(original: Any) -> Any:
     )
 
 
-def _near_first_plane(original: Any) -> Any:
-    def near(place: Any, variance: Any, nearest: Any, plane: Any, least: float, *rest: Any) -> Any:
-        off = place[0] - plane[0] - plane[1] * place[1] - plane[2] * place[2]
-        return (variance > 0) & (np.abs(off) < least / 2)
+def _near_height_zero(_: Any) -> Any:
+    def near(place: Any, variance: Any, highest: float, least: float, *rest: Any) -> Any:
+        return (variance > 0) & (np.abs(place[0]) < least / 2)
 
     return near
 
@@ -164,7 +163,7 @@ MECHANISMS = (
                lambda _: lambda fits, covariance: np.arange(len(fits.theta))}),
     # The ground.
     Mechanism('ground reached by a chain', 'ground/reach.py',
-              {'ground.terrain.reach': _near_first_plane}, 'terrain'),
+              {'ground.terrain.reach': _near_height_zero}, 'terrain'),
     Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
               {'ground.terrain.ground_field':
                lambda original: lambda cells, ground, *rest: original(
