@@ -126,8 +126,8 @@ MECHANISMS = (
     Mechanism('steps follow the noise', 'fitting/steps.py', {'edge_step': 0.0065}),
     Mechanism('holes bridged', 'sensing/bridges.py',
               {'segmenter.find_holes': _returning(np.empty(0, np.int32))}),
-    Mechanism('enlarged images found', 'sensing/verdict.py:Cells,replication,_period',
-              {'segmenter.replication': _returning(None)}),
+    Mechanism('enlarged images found', 'sensing/verdict.py:Cells,enlargement,replication,interpolation',
+              {'segmenter.enlargement': _returning(None)}),
     Mechanism('weights by distance', 'sensing/grid.py:weights', {'weighting': 'distance'},
               option=True),
     # Regions.

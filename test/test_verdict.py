@@ -89,6 +89,14 @@ def test_linear_enlargement_is_found(seen, factor):
     assert interpolation(RangeImage.from_depth(*frame)).factor == factor
 
 
+def test_a_linear_enlargement_gives_what_the_original_gives(seen):
+    """With an odd factor every third pixel is one of the original."""
+    depth = seen.depth.astype(np.float32) / 1000
+    frame = enlarged(depth, seen.camera, 3, (0, 0, 0, 0), cv2.INTER_LINEAR)
+    small = segment(depth, seen.camera).labels
+    np.testing.assert_array_equal(segment(*frame).labels[1::3, 1::3], small)
+
+
 def test_levels_of_exact_scenes_are_not_replication():
     for left, right, top, bottom in ((200, 440, 120, 360), (160, 480, 160, 320)):
         depth = np.full((480, 640), 2.1)

@@ -30,7 +30,7 @@ from rangeseg_ros.core.sensing.grid import GridEdges, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.verdict import Cells, replication
+from rangeseg_ros.core.sensing.verdict import Cells, enlargement
 from rangeseg_ros.core.sensing.view import View
 
 
@@ -79,7 +79,7 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        cells = replication(image)
+        cells = enlargement(image)
         if cells is None and work.step > 1:
             cells, config = Cells(work.step, 0, 0), _for_every(work.step, config)
         if cells is None:

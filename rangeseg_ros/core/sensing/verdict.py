@@ -24,8 +24,8 @@ _SPREAD = 0.2
 """By which the bends of real planes differ, of that of a plane whose range is taken for depth."""
 _FEWEST = 40
 """Pixels that tell the bend of a plane."""
-_LINES, _SAMPLE = 60, 5000
-"""Rows or columns, and pixels, that stand for an image."""
+_LINES, _FEW, _SAMPLE = 60, 24, 5000
+"""Rows or columns, those whose spectrum is looked at, and pixels, that stand for an image."""
 _LARGEST = 16
 """Enlargement that is looked for."""
 _KINECT_STEP = 1 / (8 * 580 * 0.075)
@@ -80,7 +80,7 @@ def judge(
         Label -> theta, theta . ray = inverse.
     """
     found: dict[str, str] = {}
-    if (cells := replication(image)) or (cells := interpolation(image)):
+    if cells := enlargement(image):
         found[f'enlarged x {cells.factor}'] = (
             f'Each measurement fills {cells.factor} x {cells.factor} pixels: the image was '
             'enlarged; use the original.'
@@ -159,6 +159,11 @@ def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
     )
 
 
+def enlargement(image: RangeImage) -> Cells | None:
+    """Cells of one measurement each, where an image was enlarged; None where it was not."""
+    return replication(image) or interpolation(image)
+
+
 def replication(image: RangeImage) -> Cells | None:
     """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
 
@@ -195,17 +200,14 @@ def interpolation(image: RangeImage) -> Cells | None:
     Second differences along a line vanish but beside the centres, at every k-th pixel: their
     mean size per column has a line in its spectrum (Fisher, Tests of significance in harmonic
     analysis, 1929). For k = 2, third differences have one. Which pixels are the centres does not
-    matter.
+    matter: one of every k x k pixels is as good as another.
     """
     for order, least in ((2, 3), (3, 2)):
-        powers = [
-            _spectrum(lines, order)
-            for lines in (
-                image.inverse[:: max(len(image.inverse) // _LINES, 1)],
-                image.inverse[:, :: max(image.inverse.shape[1] // _LINES, 1)].T,
-            )
-        ]
-        both = np.minimum(*powers)
+        both = np.full(_LARGEST + 1, np.inf)
+        for lines in (image.inverse, image.inverse.T):
+            some = lines[:: max(len(lines) // _FEW, 1)]
+            if (both[least:] > _SIGNIFICANT).any():
+                both = np.minimum(both, _spectrum(some, order))
         periods = [k for k in range(least, _LARGEST + 1) if both[k] > _SIGNIFICANT]
         if periods and (order == 2 or 2 in periods):
             # Of a period all divisors show.
