@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.runtime.pace import Pace
-from rangeseg_ros.core.runtime.work import STEPS, Work
+from rangeseg_ros.core.runtime.work import STEPS, step_within
 
 PERIOD = 1 / 30
 
@@ -30,9 +30,9 @@ def changes(told):
 
 
 def test_steps_differ_in_what_is_done():
-    works = [Work.within(step) for step in STEPS]
+    works = [step_within(budget) for budget in STEPS]
     assert len(set(works)) == len(STEPS) and list(STEPS) == sorted(STEPS, reverse=True)
-    assert works[0] == (1, 1.0) and works[-1] == (4, 0.0)
+    assert works == [1, 2, 4]
 
 
 @pytest.mark.parametrize('full', [0.01, 0.02, 0.025])
@@ -72,7 +72,7 @@ def test_what_cannot_be_held_gets_the_least_and_recovers_at_once():
 
 
 def test_what_else_takes_time_counts():
-    assert budgets(Pace(30, 1.0), 300, 0.02, other=0.014)[-1][0] == 0.7
+    assert budgets(Pace(30, 1.0), 300, 0.02, other=0.014)[-1][0] == STEPS[1]
     assert budgets(Pace(30, 1.0), 300, 0.02, other=1.0)[-1][0] == STEPS[-1]
 
 
@@ -87,7 +87,7 @@ def test_work_budget_is_the_most(most):
     assert {budget for budget, _ in fast} == {most}
     slow = budgets(Pace(30, most), 300, 1.0)
     assert slow[-1][0] == min(most, STEPS[-1])
-    assert all(Work.within(a[0]) != Work.within(b[0]) for a, b in pairwise(slow) if a[0] != b[0])
+    assert all(step_within(a[0]) != step_within(b[0]) for a, b in pairwise(slow) if a[0] != b[0])
 
 
 def test_the_same_times_give_the_same_budgets():

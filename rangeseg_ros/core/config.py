@@ -101,9 +101,8 @@ class Config:
     )
     work_budget: float = option(
         1.0,
-        'method planes: share of the full work that a frame may take; below 1 fewer boundaries '
-        'are refined, below 0.95 every second row and column is looked at, below 0.65 every '
-        'fourth',
+        'method planes: share of the full work that a frame may take; below 1 every second row '
+        'and column is looked at, below 0.55 every fourth',
         0.0,
         1.0,
     )

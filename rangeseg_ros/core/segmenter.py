@@ -22,7 +22,7 @@ from rangeseg_ros.core.runtime.loading import load_lazily
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
 from rangeseg_ros.core.runtime.stopwatch import Stopwatch
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.runtime.work import Work
+from rangeseg_ros.core.runtime.work import step_within
 from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
@@ -72,7 +72,7 @@ class Segmenter:
         return with_kernels(lambda: self._segment(image), self.config, image.camera is None)
 
     def _segment(self, image: RangeImage) -> Segmentation:
-        config, work = self.config, Work.within(self.config.work_budget)
+        config, step = self.config, step_within(self.config.work_budget)
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
                 'distortion_map is not subtracted yet: segment corrected(image, config)'
@@ -80,24 +80,24 @@ class Segmenter:
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         cells = enlargement(image)
-        if cells is None and work.step > 1:
-            cells, config = Cells(work.step, 0, 0), _for_every(work.step, config)
+        if cells is None and step > 1:
+            cells, config = Cells(step, 0, 0), _for_every(step, config)
         if cells is None:
-            return self._find_planes(image, config, work.cuts)
-        result = self._find_planes(cells.reduced(image), config, work.cuts)
+            return self._find_planes(image, config)
+        result = self._find_planes(cells.reduced(image), config)
         labels = cells.enlarged(result.labels, image.shape) * image.valid
         counts = np.bincount(labels.ravel(), minlength=len(result.planes) + 1).tolist()
         planes = [plane.named(count=counts[plane.label]) for plane in result.planes]
         return replace(result, labels=labels, planes=planes, image=image, cells=cells)
 
-    def _find_planes(self, image: RangeImage, config: Config, cuts: float) -> Segmentation:
+    def _find_planes(self, image: RangeImage, config: Config) -> Segmentation:
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
         watch = Stopwatch()
         view, jumps = _preprocessed(image, config, watch)
         labelling: Labelling
         if config.method == 'planes':
-            labelling = by_planes.segment(view, config, cuts, watch.lap)
+            labelling = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
             regions, probability, fits = by_planes.flat_regions(

@@ -31,7 +31,6 @@ def refine(
     blocks: NDArray[np.float64],
     moments: NDArray[np.float64],
     sensor: SensorModel,
-    cuts: float = 1.0,
 ) -> tuple[NDArray[np.int32], Models]:
     """Label the pixels with the planes of surfaces.
 
@@ -46,8 +45,6 @@ def refine(
         Of the surfaces.
     sensor : SensorModel
         Errors of the image that the blocks are of.
-    cuts : float
-        Share of the pixels near boundaries that labels are expanded to.
 
     Returns
     -------
@@ -67,7 +64,7 @@ def refine(
     unknown = np.full(len(labels), np.nan, np.float32)
     labelling = GridLabelling.of(labels, unknown, problem.links, problem.width)
     height = len(labels) // problem.width
-    run_halves(_expand_near, height, labelling, problem, models, cuts)
+    run_halves(_expand_near, height, labelling, problem, models)
     return labels, models
 
 
@@ -85,20 +82,16 @@ def _expand_near(
     labelling: GridLabelling,
     problem: Problem,
     models: Models,
-    cuts: float,
 ) -> None:
     """Expand every label once in some rows, near its boundaries; in place.
 
-    In the order of the labels, until the share `cuts` of the pixels at boundaries is used up.
     Label 0 is not expanded: what no plane explains costs it little more, and it gains nothing.
     """
     count = len(models.theta)
     start, sites = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
-    most, alpha = cuts * len(sites), 1
-    while alpha < count and start[alpha + 1] <= most:
+    for alpha in range(1, count):
         front = sites[start[alpha] : start[alpha + 1]]
         _expand(alpha, front, rows, _BAND, labelling, problem, models)
-        alpha += 1
 
 
 @njit(cache=True, nogil=True)

@@ -42,7 +42,7 @@ class Labelling:
         """None: regions have planes, and these their normals."""
 
 
-def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None]) -> Labelling:
+def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling:
     """Label pixels with planes.
 
     Parameters
@@ -50,8 +50,6 @@ def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None])
     view : View
     config : Config
         `plane_smoothness` is read.
-    cuts : float
-        Share of the pixels near boundaries whose labels graph cuts decide.
     lap : callable
         Told the name of every stage that ends.
     """
@@ -71,7 +69,7 @@ def segment(view: View, config: Config, cuts: float, lap: Callable[[str], None])
     surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, view.least)
     problem = pending.result()
     lap('surfaces')
-    labels, models = refine(problem, surface, nodes.moments, moments, sensor, cuts)
+    labels, models = refine(problem, surface, nodes.moments, moments, sensor)
     lap('labels')
     return Labelling(labels.reshape(whole.shape), problem, models)
 

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from statistics import median
 
-from rangeseg_ros.core.runtime.work import STEPS, Work
+from rangeseg_ros.core.runtime.work import STEPS, step_within
 
 # Seconds over which times are smoothed: a single slow frame is not followed, and a change of scene
 # is (95 % after three times as long) within the five seconds over which rates are counted.
@@ -14,7 +14,7 @@ _TIME_CONSTANT = 1.0
 # The 95th percentile of the times of frames, to their median (docs/benchmark.md): so many are in
 # time where the median frame takes this much less than it may.
 _HEADROOM = 1.15
-# What more work will take is foreseen no better than this: of the shares that `Work` states and
+# What more work will take is foreseen no better than this: of the shares that are stated and
 # those measured (docs/benchmark.md), and of the times of frames after one time constant.
 _DOUBT = 1.1
 # Seconds for which more work must seem possible before it is done: then 95 % of what is known is
@@ -41,7 +41,7 @@ class Pace:
 
     def __init__(self, rate: float, most: float) -> None:
         self.rate, self.most = rate, most
-        less = [step for step in STEPS if step < most and Work.within(step) != Work.within(most)]
+        less = [b for b in STEPS if b < most and step_within(b) != step_within(most)]
         self._steps = [most, *less]
         self._step = 0
         self._period = 1 / (_HEADROOM * rate) if rate else math.inf
@@ -78,5 +78,5 @@ class Pace:
 
 
 def _share(budget: float) -> float:
-    """What `budget` leaves of the work: less than the smallest of `STEPS` leaves no less."""
-    return max(budget, STEPS[-1])
+    """What `budget` leaves of the work: the largest of the `STEPS` within it, or the smallest."""
+    return next((step for step in STEPS if step <= budget), STEPS[-1])
