@@ -28,9 +28,13 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
+from scipy.stats import binom
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'rangeseg_ros'
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
+# Probability below which a share of dead mutants is no chance.
+CHANCE = 0.01
 _SWAPS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -273,7 +277,8 @@ def main() -> int:
     print(
         f'{dead} of {count} mutants die (seed {chosen.seed}, {len(drawn)} drawn of {len(every)})'
     )
-    return dead < chosen.least * count
+    # Few of them tell little: it fails where so few are no chance.
+    return bool(binom.cdf(dead, count, chosen.least) < CHANCE)
 
 
 if __name__ == '__main__':
