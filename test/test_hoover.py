@@ -6,6 +6,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rangeseg_ros.evaluation.hoover import RegionClass, classify
+from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import ComparisonError, Overlap, overlap_figures
 from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
@@ -191,3 +192,13 @@ def test_plane_errors():
     errors = plane_errors(truth, found, {1: 7, 2: 8, 3: 9, 4: 7})
     assert errors == pytest.approx(np.array([[3.0, 0.01], [0.0, 0.5]]))
     assert plane_errors(truth, found, {}).shape == (0, 2)
+
+
+def test_what_is_not_judged_does_not_count():
+    """0 means so where a truth says elsewhere what is judged not to be planar."""
+    labels = np.zeros((4, 6), np.uint16)
+    labels[:, :3], labels[:, 5] = 1, 65535
+    truth = as_truth(labels, 1)
+    np.testing.assert_array_equal(truth.judged, labels > 0)
+    np.testing.assert_array_equal(truth.labels, labels == 1)
+    assert as_truth(labels[:, :5], 1).judged is None
