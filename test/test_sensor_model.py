@@ -328,3 +328,11 @@ def test_what_is_said_of_the_errors():
     assert str(stereo._replace(quantum=0.001)) == f'{stereo}, steps of 0.001 1/m'
     laser = SensorModel(0.0, 0.012, 1.0, 0.0, 0.0, 0.0, 35.0, range_quantum=0.001)
     assert str(laser) == 'range noise 0.012 m, steps of 0.001 m'
+
+
+def test_what_every_second_pixel_does_not_tell_all_pixels_do():
+    """Strips of eight pixels beside such as were not measured: no block of 16 is whole."""
+    field = smooth_field(CAMERA.shape, (2.0, 2.0), np.random.default_rng(8))
+    measured = np.arange(640) // 8 % 2 == 0
+    sensor = sensor_of(np.where(measured, three_planes() + 0.02 * field, 0))
+    assert sensor.correlation >= 1 and sensor.noise == pytest.approx(0.02, rel=0.4)

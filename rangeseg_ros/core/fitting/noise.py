@@ -62,24 +62,25 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
     prior : SensorModel
         Taken as far as the image says too little.
     """
-    found = _measured(image, blocks, prior)
+    found = _measured(image, blocks, prior) or prior
     few = image.inverse.size < ENOUGH * (2 * BLOCK) ** 2
     if found.white > 0.5 or found.correlation < 1 or few:
         return found
     # What is correlated over more than a pixel hides from blocks of four: every second pixel then.
     reduced = Cells(2, 0, 0).reduced(image)
-    return _measured(reduced, Blocks.of(reduced), prior.every(2)).every(0.5)
+    wider = _measured(reduced, Blocks.of(reduced), prior.every(2))
+    return wider.every(0.5) if wider else found
 
 
-def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
-    """The errors that blocks of an image show, or the prior where these are too few."""
+def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel | None:
+    """The errors that blocks of an image show; None where these are too few."""
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
     coarse = blocks.merged(image.rays, 2 * BLOCK)
     quanta = submit(quantisation, image.inverse)
     used, place, squared, across, down = _telling(coarse)
     if used < SAMPLES:
-        return prior
+        return None
     turns = submit(by_turn, squared, across, down)
     scale, ratio = _scale_and_ratio(coarse, place)
     variance = ratio.values / share(ratio.freedom)
@@ -93,7 +94,7 @@ def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorMo
     noise = noise._replace(tilt=tilt)
     level, flat = _flat_blocks(blocks, coarse, noise, way)
     if not flat.any():
-        return prior
+        return None
     smallest = submit(_within, blocks, flat, way, level)
     quantile, freedom = smallest.result()
     # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
@@ -103,11 +104,10 @@ def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorMo
     ways = way, noise.quartic > 0
     nested = over_scales(flat, blocks.residual, level, coarse, image.rays, *ways, shown)
     if not len(nested.within):
-        return prior
+        return None
     shares = [share(freedom), *(share(freedom) for freedom in nested.freedom)]
     within = list(np.array([quantile, *nested.within]) / shares)
     total, white, width = _random(within, nested.between, nested.filled)
-    distortion = nested.distortion
     # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
     # blocks hide nothing of it.
     turned = np.sqrt(noise.tilt * (total if way == BOTH else 1.0)) * np.array(way)
@@ -119,8 +119,8 @@ def _measured(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorMo
         row_noise=float(turned[1]),
         white=white,
         correlation=width,
-        distortion=max(float(np.sqrt(distortion.constant)), rounding),
-        range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
+        distortion=max(float(np.sqrt(nested.distortion.constant)), rounding),
+        range_distortion=max(float(np.sqrt(nested.distortion.quartic)), range_rounding),
         quantum=quantum,
         range_quantum=range_quantum,
     )
