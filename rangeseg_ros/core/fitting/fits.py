@@ -38,8 +38,6 @@ class Fits(NamedTuple):
         Number of measured pixels.
     theta : (M + 1, 3) float64
     sensor : SensorModel
-    step : int
-        Columns and rows of the image from one pixel that was looked at to the next.
     """
 
     sums: RegionSums
@@ -47,7 +45,6 @@ class Fits(NamedTuple):
     pixels: NDArray[np.intp]
     theta: NDArray[np.float64]
     sensor: SensorModel
-    step: int = 1
 
     @classmethod
     def of(
@@ -91,20 +88,9 @@ class Fits(NamedTuple):
             theta=self.theta[kept],
         )
 
-    def magnified(self, step: int, pixels: NDArray[np.intp]) -> Fits:
-        """The same planes, of regions of an image of which every `step`-th pixel was looked at.
-
-        Parameters
-        ----------
-        step : int
-        pixels : (M + 1,) int
-            Number of measured pixels of each region.
-        """
-        return self._replace(pixels=pixels, step=step)
-
     def boxes(self) -> NDArray[np.intp]:
         """First row and column of each region, and the ones after its last, (M + 1, 4)."""
-        return self.step * self.sums.box
+        return self.sums.box
 
     def outlier_share(self) -> NDArray[np.float64]:
         """Share of the pixels (M + 1,) beyond four standard deviations of the sensor's errors."""
