@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
+    NO_PLANE,
     Models,
     Problem,
     data_cost,
@@ -15,7 +16,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import expand
 from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts
-from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -59,21 +60,61 @@ def refine(
     around = int(sensor.distortion_length / problem.block - 1) // 2
     local = shifts(surfaces, blocks, models.theta, _DOMAIN, around, sensor.agreement)
     models = models._replace(shifts=local)
-    labels = _of_blocks(surfaces, problem)
+    labels = np.empty(len(problem.inverse), np.int32)
     # What labels cost is worked out where it is asked for.
-    unknown = np.full(len(labels), np.nan, np.float32)
-    labelling = GridLabelling.of(labels, unknown, problem.links, problem.width)
+    data = np.full(len(labels), np.nan, np.float32)
+    run_rows(_label_block_row, len(surfaces), surfaces, labels, data, problem, models)
+    labelling = GridLabelling.of(labels, data, problem.links, problem.width)
     height = len(labels) // problem.width
     run_halves(_expand_near, height, labelling, problem, models)
     return labels, models
 
 
-def _of_blocks(surfaces: NDArray[np.int32], problem: Problem) -> NDArray[np.int32]:
-    """Labels (n,) of the blocks (rows, columns) for their pixels that were measured."""
+@njit(cache=True, nogil=True)
+def _label_block_row(
+    first: int,
+    after: int,
+    surfaces: NDArray[np.int32],
+    labels: NDArray[np.int32],
+    data: NDArray[np.float32],
+    problem: Problem,
+    models: Models,
+) -> None:
+    """Label the pixels of some rows of blocks (rows, columns) with the surfaces of these.
+
+    The pixels of a block without a surface, most of which a border crosses, get the label of the
+    lowest cost among those of the blocks around it. Expansions that begin with these have less to
+    change than those that begin with no plane, and end with a lower energy.
+    """
     size, width = problem.block, problem.width
-    pixels = surfaces.repeat(size, axis=0)[: len(problem.inverse) // width]
-    pixels = pixels.repeat(size, axis=1)[:, :width]
-    return pixels.ravel() * (problem.weight > 0)
+    around = np.empty(9, np.int32)
+    for bi in range(first, after):
+        for bj in range(surfaces.shape[1]):
+            own = surfaces[bi, bj]
+            count = 0 if own > 0 else _labels_around(bi, bj, surfaces, around)
+            for i in range(bi * size, min((bi + 1) * size, len(labels) // width)):
+                for p in range(i * width + bj * size, i * width + min((bj + 1) * size, width)):
+                    labels[p] = own if problem.weight[p] > 0 else 0
+                    if count == 0 or problem.weight[p] == 0:
+                        continue
+                    data[p] = NO_PLANE
+                    for label in around[:count]:
+                        cost = data_cost(label, p, problem, models)
+                        if cost < data[p]:
+                            labels[p], data[p] = label, cost
+
+
+@njit(cache=True, nogil=True)
+def _labels_around(
+    bi: int, bj: int, surfaces: NDArray[np.int32], around: NDArray[np.int32]
+) -> int:
+    """How many labels the blocks around a block have; `around` receives them."""
+    count = 0
+    for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
+        if label > 0 and label not in around[:count]:
+            around[count] = label
+            count += 1
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -40,8 +40,6 @@ class _Flow(NamedTuple):
     ----------
     neighbour : (n, 4) int32
         Node on each side, -1 for none.
-    back : (n, 4) uint8
-        Side of that node which this one is on.
     residual : (n, 4) float64
         What the edge to that side can still take.
     terminal : (n,) float64
@@ -59,7 +57,6 @@ class _Flow(NamedTuple):
     """
 
     neighbour: NDArray[np.int32]
-    back: NDArray[np.uint8]
     residual: NDArray[np.float64]
     terminal: NDArray[np.float64]
     parent: NDArray[np.int8]
@@ -83,8 +80,8 @@ def minimum_cut(
     excess : (n,) float64
         Cost of choosing a node, of either sign.
     neighbour : (n, 4) int32
-        Node on each of four sides, -1 for none, none twice; for that node, this one is on one of
-        its sides.
+        Node on each side of a grid, -1 for none: that node has this one on the opposite side,
+        k ^ 2 for side k.
     link : (n, 4) float64
         Cost of the edge to that side if its ends are not chosen alike, not negative; the same
         seen from either end.
@@ -92,7 +89,6 @@ def minimum_cut(
     count = len(excess)
     flow = _Flow(
         neighbour,
-        _sides(neighbour),
         link.copy(),
         excess.copy(),
         np.full(count, _FREE, np.int8),
@@ -121,7 +117,7 @@ def minimum_cut(
                 q = neighbour[p, k]
                 if q < 0:
                     continue
-                opposite = flow.back[p, k]
+                opposite = k ^ 2
                 free = flow.residual[q, opposite] if flow.sink[p] else flow.residual[p, k]
                 if free <= 0:
                     continue
@@ -159,7 +155,7 @@ def minimum_cut(
                 r = neighbour[q, k]
                 if r < 0 or flow.parent[r] == _FREE or flow.sink[r] != flow.sink[q]:
                     continue
-                opposite = flow.back[q, k]
+                opposite = k ^ 2
                 free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
                 if free > 0 and not flow.queued[r]:
                     flow.queue[last] = r
@@ -178,20 +174,6 @@ def minimum_cut(
     return chosen
 
 
-@njit(cache=True, nogil=True)
-def _sides(neighbour: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Side of each neighbour (n, 4) that the node itself is on."""
-    back = np.zeros(neighbour.shape, np.uint8)
-    for p in range(len(neighbour)):
-        for k in range(4):
-            q, side = neighbour[p, k], (k + 2) % 4
-            # In a grid it is that one.
-            while q >= 0 and neighbour[q, side] != p:
-                side = (side + 1) % 4
-            back[p, k] = side
-    return back
-
-
 @njit(cache=True, nogil=True, inline='always')
 def _next(place: int, count: int) -> int:
     """Place after another in a ring."""
@@ -201,17 +183,17 @@ def _next(place: int, count: int) -> int:
 @njit(cache=True, nogil=True)
 def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
-    neighbour, back, residual = flow.neighbour, flow.back, flow.residual
+    neighbour, residual = flow.neighbour, flow.residual
     terminal, parent = flow.terminal, flow.parent
     if flow.sink[p]:
-        p, side = neighbour[p, side], back[p, side]
+        p, side = neighbour[p, side], side ^ 2
     pushed = residual[p, side]
     # From p up to the source, against the flow, and from its neighbour on to the sink.
     a = p
     while parent[a] != _TERMINAL:
         k = parent[a]
         above = neighbour[a, k]
-        pushed = min(pushed, residual[above, back[a, k]])
+        pushed = min(pushed, residual[above, k ^ 2])
         a = above
     pushed = min(pushed, terminal[a])
     b = neighbour[p, side]
@@ -224,14 +206,14 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     found = 0
     residual[p, side] -= pushed
     b = neighbour[p, side]
-    residual[b, back[p, side]] += pushed
+    residual[b, side ^ 2] += pushed
     a = p
     while parent[a] != _TERMINAL:
         k = parent[a]
         above = neighbour[a, k]
         residual[a, k] += pushed
-        residual[above, back[a, k]] -= pushed
-        if residual[above, back[a, k]] <= 0:
+        residual[above, k ^ 2] -= pushed
+        if residual[above, k ^ 2] <= 0:
             parent[a] = _ORPHAN
             orphans[found] = a
             found += 1
@@ -244,7 +226,7 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     while parent[b] != _TERMINAL:
         k = parent[b]
         above = neighbour[b, k]
-        residual[above, back[b, k]] += pushed
+        residual[above, k ^ 2] += pushed
         residual[b, k] -= pushed
         if residual[b, k] <= 0:
             parent[b] = _ORPHAN
@@ -269,7 +251,7 @@ def _adopt(flow: _Flow, p: int, time: int) -> bool:
         q = neighbour[p, k]
         if q < 0 or parent[q] == _FREE or flow.sink[q] != flow.sink[p]:
             continue
-        free = flow.residual[p, k] if flow.sink[p] else flow.residual[q, flow.back[p, k]]
+        free = flow.residual[p, k] if flow.sink[p] else flow.residual[q, k ^ 2]
         if free <= 0:
             continue
         steps, r = np.int32(0), q
