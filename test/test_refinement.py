@@ -218,7 +218,9 @@ def small_room(seed=900):
     blocks = Blocks.of(image)
     blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
     nodes = Nodes.of(image.inverse, edges, blocks, sensor, BLOCK)
-    found = join_surfaces(Patches.of(nodes, BLOCK, sensor), nodes, BLOCK, sensor, LAMBDA)
+    found = join_surfaces(
+        Patches.of(nodes, BLOCK, sensor), nodes, BLOCK, sensor, LAMBDA, image.rays
+    )
     problem = Problem.of(image, sensor, edges, BLOCK, LAMBDA)
     return problem, (found[0], nodes.moments, found[1]), sensor
 

@@ -66,7 +66,9 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
     pending = submit(Problem.of, whole, sensor, grid, size, smoothness)
     patches = Patches.of(nodes, size, sensor)
     # Surfaces as large as regions: smaller ones are clutter.
-    surface, moments = join_surfaces(patches, nodes, size, sensor, smoothness, view.least)
+    surface, moments = join_surfaces(
+        patches, nodes, size, sensor, smoothness, whole.rays, view.least
+    )
     problem = pending.result()
     lap('surfaces')
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)

@@ -38,7 +38,8 @@ from rangeseg_ros.core.sensing.sensor import (
 # root mean square; and the deviation of the distortion's share. The curved ones are wider spread
 # than those of the frames, which were cut in pieces (0.013, 0.5): whole curved objects of
 # simulated scenes bend by up to 0.1.
-_PLANE, _CURVED, _SPREAD = (0.0023, 0.5), (0.02, 0.9), 0.32
+PLANE_BEND = 0.0023
+_PLANE, _CURVED, _SPREAD = (PLANE_BEND, 0.5), (0.02, 0.9), 0.32
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 

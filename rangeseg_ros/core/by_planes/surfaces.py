@@ -7,9 +7,9 @@ agrees. Hence two steps: blocks merge to patches over which the distortion is ne
 patches to surfaces.
 
 Two parts are one surface for either of two reasons. They agree: one plane explains both as well as
-noise and distortion let expect, and so it does the patches along their border. Or one plane costs
-their pixels less than their common border does in the energy that is minimised afterwards (thesis
-eq. 5.3).
+noise, distortion and the bend that planes have themselves let expect, and so it does the patches
+along their border. Or one plane costs their pixels less than their common border does in the
+energy that is minimised afterwards (thesis eq. 5.3).
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches
 from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
+from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
 from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.runtime.threads import map_halves
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit_all
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, common_residual, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share
 from rangeseg_ros.core.significance import chi2_quantile
@@ -55,6 +57,9 @@ class Expected(NamedTuple):
         Pixels of a unit of the length of borders.
     border : float
         What a unit of a border costs in the energy.
+    bend : float
+        Mean square by which planes bend, in squares of their inverse range, for each pixel that
+        they are large.
     """
 
     smooth: float
@@ -62,14 +67,29 @@ class Expected(NamedTuple):
     patch: float
     unit: float
     border: float
+    bend: float
 
     @classmethod
-    def of(cls, sensor: SensorModel, unit: int, smoothness: float) -> Expected:
-        """Of parts whose borders are counted in units of so many pixels."""
-        border = smoothness * sensor.patch * unit
+    def of(
+        cls, sensor: SensorModel, unit: int, smoothness: float, rays: NDArray[np.float32]
+    ) -> Expected:
+        """Of parts of an image with `rays`, their borders counted in units of so many pixels."""
         return cls(
-            sensor.distortion_pixels, sensor.agreement, sensor.patch, float(unit), float(border)
+            sensor.distortion_pixels,
+            sensor.agreement,
+            sensor.patch,
+            float(unit),
+            float(smoothness * sensor.patch * unit),
+            PLANE_BEND**2 * _pixel_area(rays),
         )
+
+
+def _pixel_area(rays: NDArray[np.float32]) -> float:
+    """Median area of a pixel at inverse range 1 of an image with `rays` (H, W, 3), m^2."""
+    here = rays[::BLOCK, ::BLOCK].astype(np.float64)
+    across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
+    area = np.linalg.norm(np.cross(across, down), axis=2) / BLOCK**2
+    return float(np.median(area)) if area.size else 0.0
 
 
 class Patches(NamedTuple):
@@ -115,6 +135,7 @@ def join_surfaces(
     block: int,
     sensor: SensorModel,
     smoothness: float,
+    rays: NDArray[np.float32],
     least: int = 1,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
@@ -131,6 +152,8 @@ def join_surfaces(
         Its `agreement`, `patch` and `distortion_pixels` are read.
     smoothness : float
         Of the energy's prior, see `Problem.of`.
+    rays : (H, W, 3) float32
+        Of the image.
     least : int
         Pixels of the smallest surface.
 
@@ -141,7 +164,7 @@ def join_surfaces(
     moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
-    expected = Expected.of(sensor, block, smoothness)
+    expected = Expected.of(sensor, block, smoothness, rays)
     return _surfaces(patches, nodes.right, nodes.below, expected, float(least))
 
 
@@ -172,7 +195,7 @@ def unite_regions(
     weight = pixel_weights(image.inverse, sensor)
     moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
     touching = grid.right > 0, grid.below > 0
-    expected = Expected.of(sensor, 1, prior)
+    expected = Expected.of(sensor, 1, prior, image.rays)
     roots = _roots(regions.astype(np.int32), *touching, moments, expected)
     pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
     return relabel(regions, by_falling_size(pixels)[roots])
@@ -328,9 +351,11 @@ def _apart(
     extra = common_residual(moments, a, b) - residual[a] - residual[b]
     own = (common_residual(strips, h, h) + common_residual(strips, h + 1, h + 1)) / 2
     crease = common_residual(strips, h, h + 1) - own
-    fits = _misfit(extra, moments, a, b, expected)
-    fits = max(fits, _misfit(crease, strips, h, h + 1, expected))
     pixels = moments[a, COUNT] + moments[b, COUNT]
+    # What bends evenly over the parts bends by the square of a length over a strip.
+    near = expected.bend * (strips[h, COUNT] + strips[h + 1, COUNT]) / pixels
+    fits = _misfit(extra, moments, a, b, expected.bend, expected)
+    fits = max(fits, _misfit(crease, strips, h, h + 1, near, expected))
     ratio = (moments[a, RATIO] + moments[b, RATIO]) / pixels
     granted = 1 + ratio * distortion_share(pixels, expected.smooth)
     change = (0.5 * extra / granted - expected.border * length) / expected.patch
@@ -339,7 +364,12 @@ def _apart(
 
 @njit(cache=True)
 def _misfit(
-    extra: float, moments: NDArray[np.float64], k: int, m: int, expected: Expected
+    extra: float,
+    moments: NDArray[np.float64],
+    k: int,
+    m: int,
+    bend: float,
+    expected: Expected,
 ) -> float:
     """What two parts leave of a common plane beyond their own, in what that may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]
@@ -347,4 +377,7 @@ def _misfit(
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
     smoothly = pixels * distortion_share(pixels, smooth)
     smoothly -= first * distortion_share(first, smooth) + second * distortion_share(second, smooth)
-    return extra / (_NOISE * expected.agreement + _WITHIN * ratio * smoothly)
+    # A bend grows with the width of a plane, its mean square with the area: N (N) - n (n) - m (m).
+    squares = moments[k, CHI2] + moments[m, CHI2]
+    bent = bend * squares * 2 * first * second / pixels
+    return extra / (_NOISE * expected.agreement + _WITHIN * (ratio * smoothly + bent))
