@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
-from rangeseg_ros.core.sensing.verdict import filled_share, interpolation, replication
+from rangeseg_ros.core.sensing.verdict import filled_share, interpolation, judge, replication
 from rangeseg_ros.simulation.render import simulate
-from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 
 SENSOR_NAMES = ['kinect', 'realsense', 'tof']
@@ -155,3 +155,27 @@ def test_a_pickled_result_keeps_its_verdict(seen):
     again = pickle.loads(pickle.dumps(result))
     assert again.image is None and again.verdict == result.verdict
     assert replace(again, reason='x').verdict.ok  # what is not known is not doubted
+
+
+def test_curved_surfaces_keep_their_pixels():
+    """In a room with barrels and balls, seen by a Kinect."""
+    frame = simulate(curved_scene(3), SENSORS['kinect'](3), seed=3)
+    result = segment(frame.depth, frame.camera)
+    curved = result.curved > 0
+    assert curved.any() and not (curved & (result.labels > 0)).any()
+    assert (frame.labels[curved] == 65535).mean() > 0.9
+
+
+def test_a_curved_scene_is_said(seen):
+    image = RangeImage.from_depth(seen.depth, seen.camera)
+    labels = np.zeros(image.shape, np.uint16)
+    labels[:200], curved = 1, 2 * (labels == 0).astype(np.uint16)
+    assert 'curved scene' not in judge(image, labels, {}).reasons
+    assert 'curved scene' in judge(image, labels, {}, curved[:, ::-1] * (labels == 0)).reasons
+    assert 'curved scene' not in judge(image, labels, {}, curved * 0).reasons
+
+
+def test_errors_that_an_image_cannot_tell_are_said():
+    depth = np.random.default_rng(0).uniform(1, 3, (20, 30)).astype(np.float32)
+    result = segment(depth, Camera(30, 20, 26.0, 26.0, 14.5, 9.5))
+    assert 'distortion not identifiable' in result.verdict.reasons

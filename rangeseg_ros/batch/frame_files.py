@@ -48,6 +48,7 @@ def _stairs(path: Path, image: RangeImage, result: Segmentation) -> None:
 
 FRAME_FILES = {
     'labels': _image('_labels.png', lambda image, result: result.labels),
+    'curved': _image('_curved.png', lambda image, result: result.curved),
     'overlay': _image(
         '_overlay.png',
         lambda image, result: overlay(image.inverse, result.labels, result.planes),

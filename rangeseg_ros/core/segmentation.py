@@ -90,6 +90,10 @@ class Segmentation:
         budget small; lengths of `sensor` are in such squares.
     work_budget : float
         Share of the full work that the image was given: with the same, its labels are the same.
+    curved_regions : array of uint16 or None
+        See `curved`, of the squares of `cells`; None where none were looked for.
+    identified : bool
+        False where `sensor` was to be measured and the image says too little: it is as stated.
     """
 
     labels: NDArray[np.uint16]
@@ -104,6 +108,8 @@ class Segmentation:
     work_budget: float = 1.0
     image: RangeImage | None = None
     cells: Cells | None = field(default=None, repr=False)
+    curved_regions: NDArray[np.uint16] | None = field(default=None, repr=False)
+    identified: bool = True
 
     def __repr__(self) -> str:
         height, width = self.labels.shape
@@ -165,11 +171,21 @@ class Segmentation:
             plane.label: -plane.normal / (plane.distance + plane.normal @ place)
             for plane in self.planes
         }
-        return judge(self.image, self.labels, thetas)
+        return judge(self.image, self.labels, thetas, self.curved, self.identified)
 
     def _at_full_size(self, array: NDArray[Any]) -> NDArray[Any]:
         """Values of all pixels."""
         return array if self.cells is None else self.cells.enlarged(array, self.labels.shape)
+
+    @property
+    def curved(self) -> NDArray[np.uint16]:
+        """(H, W) 1, 2, ... on smooth regions that are less probably planes than
+        `plane_probability` asks for, by falling size; 0 elsewhere.
+        """
+        if self.curved_regions is None:
+            return np.zeros_like(self.labels)
+        curved = self._at_full_size(self.curved_regions)
+        return curved if self.image is None else curved * self.image.valid
 
     @cached_property
     def tilt(self) -> Tilt | None:

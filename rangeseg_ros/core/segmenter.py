@@ -96,11 +96,12 @@ class Segmenter:
         watch = Stopwatch()
         view, jumps = _preprocessed(image, config, watch)
         labelling: Labelling
+        curved: NDArray[np.uint16] | None
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            regions, probability, fits = by_planes.flat_regions(
+            regions, curved, probability, fits = by_planes.flat_regions(
                 regions,
                 view,
                 config.plane_smoothness,
@@ -110,6 +111,7 @@ class Segmenter:
             watch.lap('regions')
         else:
             regions, labelling = self._by_normals(view, config, watch)
+            curved = None
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, view.image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
@@ -126,7 +128,16 @@ class Segmenter:
         upright = config.role_tolerance, config.role_area, config.ground_slope
         others = jumps, survey, upright, config.work_budget
         return Segmentation(
-            labels, planes, watch.laps, reason, view.sensor, labelling, *others, image
+            labels,
+            planes,
+            watch.laps,
+            reason,
+            view.sensor,
+            labelling,
+            *others,
+            image,
+            curved_regions=curved,
+            identified=view.identified,
         )
 
     def _by_normals(
@@ -159,9 +170,10 @@ def _preprocessed(
     blocks = Blocks.of(image)
     # Much of what tells the noise runs on one thread: on another one meanwhile.
     holes = submit(find_holes, image.inverse)
-    sensor = SensorModel.from_config(config, image.shape)
+    sensor = stated = SensorModel.from_config(config, image.shape)
     if config.sensor_model == 'measured':
-        sensor = measured_sensor(image, blocks, sensor)
+        sensor = measured_sensor(image, blocks, stated)
+    identified = config.sensor_model != 'measured' or sensor is not stated
     watch.lap('noise')
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
     # a surface seen at a grazing angle costs it less than one too few.
@@ -178,7 +190,7 @@ def _preprocessed(
     grid = weights(whole, jumps, config.weighting)
     watch.lap('edges')
     least = least_pixels(config.min_pixels, image.shape)
-    return View(image, whole, blocks, grid, sensor, least), jumps
+    return View(image, whole, blocks, grid, sensor, least, identified), jumps
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -78,15 +78,16 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
 
 def flat_regions(
     regions: NDArray[np.uint16], view: View, smoothness: float, least: float, prior: float
-) -> tuple[NDArray[np.uint16], NDArray[np.float64], Fits]:
-    """Regions (H, W) whose probability to be a plane is not below the `least`, numbered anew.
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.float64], Fits]:
+    """Regions (H, W) whose probability to be a plane is not below the `least`, and the others.
 
-    With these probabilities (M + 1,), and their fits. `prior` is the share of planes among
-    regions.
+    Numbered anew, with the probabilities (M + 1,) and the fits of the first. `prior` is the share
+    of planes among regions.
     """
     regions = unite_regions(regions, view.whole, view.grid, view.sensor, smoothness)
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
     probability = plane_probabilities(fits, prior)
     curved = probability < least
     curved[0] = False
-    return drop_regions(regions, curved), probability[~curved], fits.without(curved)
+    kept = drop_regions(regions, curved), drop_regions(regions, ~curved)
+    return *kept, probability[~curved], fits.without(curved)

@@ -41,7 +41,8 @@ class Verdict(NamedTuple):
     ----------
     reasons : tuple of str
         Such as `enlarged x 4`, `filled 12 %`, `range instead of z`, `scale improbable`,
-        `millimetres in floats`; empty where nothing is.
+        `millimetres in floats`, `curved scene`, `distortion not identifiable`; empty where
+        nothing is.
     details : tuple of str
         A sentence for each.
     """
@@ -67,7 +68,11 @@ _INVALID = ('range instead of z', 'scale improbable', 'millimetres in floats')
 
 
 def judge(
-    image: RangeImage, labels: NDArray[np.uint16], planes: Mapping[int, NDArray[np.float64]]
+    image: RangeImage,
+    labels: NDArray[np.uint16],
+    planes: Mapping[int, NDArray[np.float64]],
+    curved: NDArray[np.uint16] | None = None,
+    identified: bool = True,
 ) -> Verdict:
     """Look for what makes an image doubtful.
 
@@ -78,6 +83,10 @@ def judge(
         Of what was found in it.
     planes : mapping of int to (3,) float64
         Label -> theta, theta . ray = inverse.
+    curved : (H, W) uint16, optional
+        Not 0 on surfaces that are smooth and no planes.
+    identified : bool
+        False where the image was to tell the errors of the sensor and does not.
     """
     found: dict[str, str] = {}
     if cells := enlargement(image):
@@ -103,6 +112,16 @@ def judge(
         found['scale improbable'] = (
             f'The steps of the depth are those of a Kinect whose image is read {times}: '
             'check the depth scale (TUM: 0.0002).'
+        )
+    if curved is not None and np.count_nonzero(curved) > np.count_nonzero(labels):
+        found['curved scene'] = (
+            'More pixels are on curved surfaces than on planes: a part of the planes may be '
+            'curved, too.'
+        )
+    if not identified and image.valid.any():
+        found['distortion not identifiable'] = (
+            'Too little of the image is flat to measure noise and distortion: those of the '
+            'parameters are used.'
         )
     return Verdict(tuple(found), tuple(found.values()))
 

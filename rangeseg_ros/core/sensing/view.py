@@ -27,6 +27,8 @@ class View(NamedTuple):
         Errors of the image.
     least : int
         Pixels of the smallest plane.
+    identified : bool
+        False where the errors were to be measured and the image says too little.
     """
 
     image: RangeImage
@@ -35,3 +37,4 @@ class View(NamedTuple):
     grid: Grid
     sensor: SensorModel
     least: int
+    identified: bool
