@@ -39,6 +39,11 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
     'are x, y and z towards the sensor, NaN where there is no plane.',
 )
 @click.option(
+    '--curved',
+    is_flag=True,
+    help='Also write <stem>_curved.png: smooth regions that are no planes, 16 bits, 0 = none.',
+)
+@click.option(
     '--sensor',
     is_flag=True,
     help='Also print the errors of the sensor as every image shows them.',
@@ -58,6 +63,7 @@ def command(
     overwrite: bool,
     exact: bool,
     normals: bool,
+    curved: bool,
     sensor: bool,
 ) -> None:
     """Segment DEPTH images or organised clouds into planes.
@@ -76,7 +82,8 @@ def command(
         raise click.UsageError(f'{count} images named {name} would write the same results')
     intrinsics = options.read_intrinsics(camera_file, raw, (fx, fy, cx, cy), fov)
     segmenter = Segmenter(options.read_parameters(params_file, exact=exact))
-    files = [name for name in FRAME_FILES if name != 'normals' or normals]
+    asked = {'normals': normals, 'curved': curved}
+    files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
     inputs = [path for path, _ in frames] + [*filter(None, [camera_file, params_file])]
     options.check_new(outputs, inputs, overwrite)
