@@ -1,19 +1,16 @@
-"""Writers of rosbag2: any messages, with checksums of chunks, and depth images."""
+"""Writers of rosbag2: any messages, and depth images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag2
 from rosbags.interfaces import Connection
-from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
@@ -31,21 +28,6 @@ from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.cameras import camera_info_message
 from rangeseg_ros.messages.images import image_message
 
-# Of the checksum in the record of a chunk: opcode, length, two times and the size come first.
-_CRC_OFFSET = 1 + 8 + 8 + 8 + 8
-
-
-class _CheckedMcapWriter(McapWriter):
-    """Writes the checksum of every chunk, for which rosbags leaves a 0."""
-
-    def close_chunk(self) -> None:
-        crc, start = crc32(self.chunk.bio.getbuffer()), self.bio.tell()
-        super().close_chunk()
-        end = self.bio.tell()
-        self.bio.seek(start + _CRC_OFFSET)
-        self.bio.write(crc.to_bytes(4, 'little'))
-        self.bio.seek(end)
-
 
 class BagWriter(rosbag2.Writer):
     """Writer of a rosbag2 (mcap, version 9).
@@ -57,10 +39,6 @@ class BagWriter(rosbag2.Writer):
     compressed : bool
         Compress the chunks with zstd.
     """
-
-    STORAGE_PLUGINS: Mapping[rosbag2.StoragePlugin, Any] = {
-        rosbag2.StoragePlugin.MCAP: _CheckedMcapWriter
-    }
 
     def __init__(self, path: Path, compressed: bool = False) -> None:
         super().__init__(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)

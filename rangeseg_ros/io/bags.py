@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
-from rangeseg_ros.io.recordings import BagError, Recording, RecordingError
+from rangeseg_ros.io.recordings import BagError, Lost, Recording, RecordingError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.images import PIXEL_TYPES
@@ -230,7 +229,7 @@ class DepthBag:
     def _topics_there_are(self) -> str:
         topics = sorted(self._recording.types.items())
         listed = ', '.join(f'{name} [{kind}]' for name, kind in topics) or 'none'
-        damage = self._recording.damage
+        damage = self._recording.cut
         return f'topics: {listed}' + (f' (damaged: {damage})' if damage else '')
 
 

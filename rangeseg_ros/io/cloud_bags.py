@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.message_types import CLOUD, COMPRESSED_IMAGE, IMAGE
-from rangeseg_ros.io.recordings import BagError, Recording, RecordingError
+from rangeseg_ros.io.recordings import BagError, Lost, Recording, RecordingError
 from rangeseg_ros.messages.frames import DepthFrame
 
 
