@@ -25,7 +25,6 @@ from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meaning import GROUND, STAIRS, ground_row, stairs_row, write_table
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
@@ -143,11 +142,10 @@ class Replay:
             return Outcome(**record['outcome'], already_done=True)
         self.check()
         with (
-            results_folder.begun(),
-            replacing(results_folder.bag) as partial,
-            PlaneTable(self.folder / 'planes.csv', LEADING) as table,
+            results_folder.replacing() as made,
+            PlaneTable(made.path / 'planes.csv', LEADING) as table,
             self._open() as source,
-            ResultBag(partial, self.topics, self.config.odometry) as bag,
+            ResultBag(made.bag, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
             report = ReplayReport(str(self.recording.name), self.config)
@@ -166,7 +164,7 @@ class Replay:
                 for index, frame, image, result in found:
                     stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
                     stem = f'{index:06d}_{stamp}'
-                    files = write_frame(self.folder, stem, image, result, kinds)
+                    files = write_frame(made.path, stem, image, result, kinds)
                     table.write(result.planes, index, stamp)
                     report.add(frame.stamp, result, files['overlay'])
                     doubts.update(result.verdict.details)
@@ -188,15 +186,15 @@ class Replay:
                 streams.append(bag.copies(originals))
             bag.write(*streams)
             if self.terrain:
-                write_table(self.folder / 'ground.csv', [*LEADING, *GROUND], ground)
-                write_table(self.folder / 'stairs.csv', [*LEADING, *STAIRS], stairs)
+                write_table(made.path / 'ground.csv', [*LEADING, *GROUND], ground)
+                write_table(made.path / 'stairs.csv', [*LEADING, *STAIRS], stairs)
             planes = sequence.map.planes
             if self.config.odometry:
-                write_trajectory(self.folder / 'trajectory.txt', trajectory)
+                write_trajectory(made.path / 'trajectory.txt', trajectory)
             if self.config.map_frame:
-                write_map(self.folder / 'map.csv', planes)
+                write_map(made.path / 'map.csv', planes)
                 shades = colours([plane.id for plane in planes])
-                write_mesh(self.folder / 'map.ply', planes, shades)
+                write_mesh(made.path / 'map.ply', planes, shades)
             damage = [source.damage, source.loss()]
             if bag.lost:
                 reason, count = bag.lost.most_common(1)[0]
@@ -213,11 +211,11 @@ class Replay:
                 doubts=dict(doubts),
                 contradicted=sequence.map.doubts if self.config.map_frame else [],
             )
-            report.write(self.folder / 'report.html', outcome.damage, outcome.contradicted)
+            report.write(made.path / 'report.html', outcome.damage, outcome.contradicted)
             kept = {
                 name: value for name, value in asdict(outcome).items() if name != 'already_done'
             }
-            files = results_folder.digest()
+            files = made.digest()
             bag.record({'key': key, 'outcome': kept, 'files': files})
         return outcome
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import click
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import scratch_folder
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -54,11 +54,11 @@ def command(
     if bool(depth) != bool(camera_file):
         raise click.UsageError('DEPTH images and --camera belong together')
     config = options.read_parameters(params_file, method=method)
-    with scratch_folder('rangeseg_bench') as folder:
+    with TemporaryDirectory(prefix='rangeseg-') as folder:
         if camera_file:
             frames = benchmark.Frames(depth, read_camera(camera_file), depth_scale)
         else:
-            frames = _simulated(folder, size, scenes)
+            frames = _simulated(Path(folder), size, scenes)
         progress = partial(options.progress, unit='frame')
         figures = benchmark.measure(frames, config, rounds, progress, threads)
     click.echo(

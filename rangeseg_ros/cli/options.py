@@ -20,7 +20,6 @@ from rangeseg_ros.io.depth_files import Intrinsics
 from rangeseg_ros.io.files import (
     NotReplacedError,
     check_regular,
-    clear_abandoned,
     replacing,
     resolved,
 )
@@ -245,7 +244,6 @@ def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder that appears under its name once it is complete."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise click.ClickException(f'{path}: exists already, not overwritten')
-    clear_abandoned(path)
     with replacing(path) as partial:
         partial.mkdir()
         yield partial

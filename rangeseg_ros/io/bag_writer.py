@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.io.files import clear_abandoned, replacing
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.message_types import (
     CAMERA_INFO,
     IMAGE,
@@ -88,7 +88,6 @@ class DepthBagWriter:
     def __enter__(self) -> DepthBagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
-        clear_abandoned(self.path)
         with ExitStack() as stack:
             partial = stack.enter_context(replacing(self.path))
             self._writer = stack.enter_context(BagWriter(partial))
