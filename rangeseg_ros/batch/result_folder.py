@@ -72,8 +72,8 @@ class ResultFolder:
             made = unfinished._own()
             for path in made:
                 os.replace(path, self.path / path.name)
-            for path in {p.name for p in self._own()} - {p.name for p in made}:
-                (self.path / path).unlink()
+            for name in {path.name for path in self._own()} - {path.name for path in made}:
+                (self.path / name).unlink()
             # The bag last: its record says that all else is there.
             if self.bag.exists():
                 os.replace(self.bag, unfinished.path / 'before')

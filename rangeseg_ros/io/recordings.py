@@ -157,6 +157,9 @@ class Recording:
         self.counts: Counter[str] = Counter()
         self._readers: list[Any] = []
         path.stat()
+        for part in path.iterdir() if path.is_dir() else [path]:
+            if part.exists() and not (part.is_file() or part.is_dir()):
+                raise RecordingError(f'{part.name}: not a regular file')
         try:
             for reader in _readers(path):
                 reader.open()
