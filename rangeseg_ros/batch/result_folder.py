@@ -30,7 +30,6 @@ _OWN = re.compile(
     rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|(planes|stairs|ground)\.csv|map\.(csv|ply)|'
     r'report\.html|trajectory\.txt'
 )
-_UNFINISHED = f'{TEMPORARY}replay'
 
 
 @dataclass(frozen=True)
@@ -64,8 +63,9 @@ class ResultFolder:
     @contextmanager
     def replacing(self) -> Iterator[ResultFolder]:
         """Give a folder for results, which take the place of earlier ones once all are there."""
-        unfinished = ResultFolder(self.path / _UNFINISHED)
-        shutil.rmtree(unfinished.path, ignore_errors=True)  # of a process that was killed
+        for left in self.path.glob(f'{TEMPORARY}*'):  # of a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        unfinished = ResultFolder(self.path / f'{TEMPORARY}{os.getpid()}')
         unfinished.path.mkdir(parents=True)
         try:
             yield unfinished

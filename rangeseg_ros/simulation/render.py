@@ -59,7 +59,7 @@ def simulate(
     pose = scene.poses[frame]
     rays = camera.rays.astype(np.float64) @ pose.rotation.T
     depth, face = cast(scene.solids, pose.position, rays)
-    random = np.random.default_rng([seed, frame, 9])
+    random = np.random.default_rng([seed, frame, 4])
     image = sensor.measure(depth, camera, random)
     # Exact depth, in metres, is that of renderings, which need no light.
     if image.dtype == np.uint16 and len(scene.dark):
