@@ -96,7 +96,7 @@ with suppress(ImportError):
 
 
 # What only some commands and functions need; rangeseg_ros/extras.py names them where missing.
-bags = ['lz4', 'rosbags>=0.11,<0.12', 'zstandard>=0.15']
+bags = ['rosbags>=0.11.9,<0.12']
 report = ['jinja2>=3.0', 'matplotlib>=3.6']
 
 setup(

@@ -7,8 +7,6 @@ from types import ModuleType
 
 EXTRAS = {
     'rosbags': 'bags',
-    'lz4': 'bags',
-    'zstandard': 'bags',
     'jinja2': 'report',
     'matplotlib': 'report',
     'pandas': 'notebook',

@@ -16,18 +16,11 @@ from rangeseg_ros.io.params import read_config
 from rangeseg_ros.io.pcd import PcdError, read_pcd
 from rangeseg_ros.io.yaml_files import YamlError, read_yaml
 
-BOMB = 'a: &a [1,1,1,1,1,1,1,1,1,1]\n' + ''.join(
-    f'{new}: &{new} [{",".join([f"*{old}"] * 10)}]\n'
-    for old, new in zip('abcdefg', 'bcdefgh', strict=True)
-)
-
 
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
-        ('data: &d [*d, *d]', 'nested too deeply'),
         ('[' * 20000, 'nested too deeply'),
-        (BOMB, 'too large'),
         ('a: ' + 'x' * 2**21, 'too large'),
         ('a: 2001-99-99', 'not a YAML file'),
         ('a: \x00', 'not a YAML file'),
@@ -39,11 +32,6 @@ def test_yaml_that_would_take_for_ever(tmp_path, content, message):
     with pytest.raises(YamlError, match=message) as caught:
         read_yaml(path)
     assert str(path) in str(caught.value) and '\n' not in str(caught.value)
-
-
-def test_aliases_may_be_used(tmp_path):
-    (tmp_path / 'file.yaml').write_text('a: &a [1, 2]\nb: *a')
-    assert read_yaml(tmp_path / 'file.yaml') == {'a': [1, 2], 'b': [1, 2]}
 
 
 def test_pipes_are_not_waited_for(tmp_path, monkeypatch, run):
@@ -120,10 +108,10 @@ def png(width, height, data, bits=16):
 
 
 def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):
-    (tmp_path / 'large.png').write_bytes(png(20000, 20000, zlib.compress(bytes(8 * 10**6))))
+    (tmp_path / 'large.png').write_bytes(png(9000, 9000, zlib.compress(bytes(10**6))))
     cv2.imwrite(str(tmp_path / 'large.tiff'), np.zeros((300, 400), np.uint16))
     monkeypatch.setattr(cv2, 'imdecode', None)
-    for name, size in (('large.png', '20000x20000'), ('large.tiff', '400x300')):
+    for name, size in (('large.png', '9000x9000'), ('large.tiff', '400x300')):
         with pytest.raises(ImageFileError, match=f'is {size}, its camera 64x48'):
             read_depth(tmp_path / name, (48, 64))
 

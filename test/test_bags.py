@@ -39,12 +39,11 @@ def test_every_format_gives_the_frames(tmp_path, storage, compressed):
         np.testing.assert_array_equal([frame.depth for frame in frames], images)
 
 
-@pytest.mark.parametrize('storage', STORAGES)
 @pytest.mark.parametrize('share', [0.3, 0.5, 0.9])
-def test_a_truncated_recording_gives_the_frames_before_the_damage(tmp_path, storage, share):
+def test_a_recording_without_its_end_gives_the_frames_before(tmp_path, share):
     images = depth_images(40, 240, 320)
-    path = tmp_path / f'bag{SUFFIXES[storage]}'
-    file = record(path, storage, images)
+    path = tmp_path / 'bag'
+    file = record(path, 'mcap', images)
     size = file.stat().st_size
     with file.open('r+b') as stream:
         stream.truncate(int(size * share))

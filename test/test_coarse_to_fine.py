@@ -15,8 +15,9 @@ from rangeseg_ros.core.by_normals.angles import degrees
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.method import minimise_exactly
 from rangeseg_ros.core.sensing.grid import Grid
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 DIRECTIONS = directions('platonic', 73)
 

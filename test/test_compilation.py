@@ -20,8 +20,9 @@ from rangeseg_ros.core.runtime.first_use import nothing_compiled
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import kinect_camera, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 
 def silent(progress):

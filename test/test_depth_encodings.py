@@ -1,6 +1,7 @@
 """Bytes of messages to depth images: exact small cases, and malformed input of any kind."""
 
 import struct
+from types import SimpleNamespace
 from unittest import mock
 
 import cv2
@@ -9,7 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rangeseg_ros.messages.images import EncodingError, decode_compressed, decode_image
+from rangeseg_ros.messages.images import EncodingError, depth_from_message
+
+
+def decode_image(*fields):
+    names = 'height', 'width', 'encoding', 'is_bigendian', 'step', 'data'
+    return depth_from_message(SimpleNamespace(**dict(zip(names, fields, strict=True))))
+
+
+def decode_compressed(format, data):
+    return depth_from_message(SimpleNamespace(format=format, data=data))
 
 
 @pytest.mark.parametrize('bigendian', [False, True])

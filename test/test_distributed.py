@@ -49,12 +49,12 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
             text=True,
         )
         try:
-            # Each process has its name on the bag that it has begun.
+            # Each process has its name on the folder that it has begun.
             deadline = time.monotonic() + 120
-            half_way = f'out/*/.{victim}.bag'
+            half_way = f'out/*/.rangeseg-{victim}'
             while not (
                 any(
-                    len(list(folder.parent.glob('*_labels.png'))) > 5
+                    len(list(folder.glob('*_labels.png'))) > 5
                     for folder in tmp_path.glob(half_way)
                 )
             ):

@@ -2,7 +2,6 @@
 
 import csv
 import resource
-import struct
 from dataclasses import fields
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +23,6 @@ from rangeseg_ros.io.images import (
     ImageFileError,
     read_depth,
     read_labels,
-    tiff_shape,
     write_image,
 )
 from rangeseg_ros.io.message_types import message_types
@@ -254,17 +252,6 @@ def test_plane_table(tmp_path):
     assert all(None not in row and None not in row.values() for row in rows)
     # No array is written as numpy prints it.
     assert not any('[' in value for row in rows for value in row.values())
-
-
-@pytest.mark.parametrize('order', ['<', '>'])
-def test_the_size_of_a_tiff_is_told_by_its_front(order):
-    entries = [(256, 3, 1, 5), (257, 3, 1, 4)]
-    data = {'<': b'II', '>': b'MM'}[order] + struct.pack(f'{order}HI', 42, 8)
-    data += struct.pack(f'{order}H', len(entries))
-    for tag, kind, count, value in entries:
-        data += struct.pack(f'{order}HHIHH', tag, kind, count, value, 0)
-    assert tiff_shape(data + bytes(4)) == ((4, 5), 1)
-    assert tiff_shape(b'\x89PNG\r\n\x1a\n' + bytes(40)) == (None, 0)
 
 
 def test_bags_of_ros_1_may_have_transforms_of_either_time():

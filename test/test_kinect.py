@@ -6,9 +6,15 @@ import pytest
 
 from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
-from rangeseg_ros.simulation.sensors.kinect import BASELINE, QUANTUM, kinect_camera, sensor_pattern
+from rangeseg_ros.simulation.sensors.kinect import (
+    BASELINE,
+    NOISES,
+    QUANTUM,
+    kinect_camera,
+    sensor_pattern,
+)
 from rangeseg_ros.simulation.solids import box, half_space
 
 
@@ -36,7 +42,8 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
     # Real sensors leave three quarters of it blank.
     share = 0.75 if noise == 'measured' else 1.0
     width = share * 585 * BASELINE * (1 / near - 1 / far)
-    assert abs(len(hole) - width) <= 1
+    # Pixels less than a half behind what is before them are one surface at a grazing angle.
+    assert abs(len(hole) + 0.5 - width) <= 1
     assert (frame.labels[240, hole] == 0).all()
 
 

@@ -3,11 +3,7 @@
 import json
 import os
 import shutil
-import signal
 import stat
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +12,8 @@ from recordings import depth_images
 from replays import record_walls, results
 
 from rangeseg_ros import Camera
-from rangeseg_ros.batch.result_folder import MARK
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.files import NotReplacedError, clear_abandoned, replacing, scratch_folder
+from rangeseg_ros.io.files import NotReplacedError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
 
@@ -51,60 +46,6 @@ def test_pipes_and_devices_stay(tmp_path):
             write(path)
         assert path.stat().st_mode == mode
     assert [path.name for path in tmp_path.iterdir()] == ['pipe']
-
-
-def test_folders_of_killed_processes_are_cleared_and_those_in_use_are_not(tmp_path):
-    program = (
-        'import os, sys; from pathlib import Path; from rangeseg_ros.io.files import replacing\n'
-        'with replacing(Path(sys.argv[1])) as partial: os.kill(os.getpid(), 9)'
-    )
-    subprocess.run([sys.executable, '-c', program, tmp_path / 'bag'], check=False)
-    (left,) = tmp_path.iterdir()
-    with replacing(tmp_path / 'bag') as partial:
-        partial.write_text('')
-        clear_abandoned(tmp_path / 'bag')
-        assert not left.exists() and partial.exists()
-
-
-@pytest.mark.parametrize('moment', ['mkdir', 'rmtree'])
-@pytest.mark.parametrize('error', ['KeyboardInterrupt', 'SystemExit(143)'])
-def test_a_signal_while_a_folder_is_made_or_removed_leaves_nothing(tmp_path, moment, error):
-    program = f"""
-import pathlib, shutil
-from rangeseg_ros.io.files import replacing
-
-def interrupted(*arguments, **options):
-    place.{moment} = original
-    if {moment!r} == 'mkdir':
-        original(*arguments, **options)
-    raise {error}
-
-place = {{'mkdir': pathlib.Path, 'rmtree': shutil}}[{moment!r}]
-original = place.{moment}
-place.{moment} = interrupted
-with replacing(pathlib.Path('labels.png')) as partial:
-    partial.write_text('labels')
-"""
-    ended = subprocess.run([sys.executable, '-c', program], cwd=tmp_path, stderr=subprocess.PIPE)
-    assert ended.returncode == (143 if '143' in error else -signal.SIGINT)
-    assert [path.name for path in tmp_path.iterdir()] in ([], ['labels.png'])
-
-
-def test_scratch_folders_of_killed_processes_are_cleared(tmp_path, monkeypatch):
-    monkeypatch.setattr(tempfile, 'tempdir', os.fspath(tmp_path))
-    program = (
-        'import os; from rangeseg_ros.io.files import scratch_folder\n'
-        'with scratch_folder("frames") as folder:\n'
-        '    (folder / "frame").touch()\n'
-        '    os.kill(os.getpid(), 9)'
-    )
-    environment = {**os.environ, 'TMPDIR': os.fspath(tmp_path)}
-    subprocess.run([sys.executable, '-c', program], check=False, env=environment)
-    (left,) = tmp_path.iterdir()
-    assert (left / 'frame').exists()
-    with scratch_folder('frames') as folder:
-        assert list(tmp_path.iterdir()) == [folder]
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.fixture
@@ -162,7 +103,7 @@ def test_replay_leaves_what_no_replay_has_written(walls, run, name):
     assert code == 2 and f'{name}: exists already' in error and error.count('\n') == 1
     assert [path.name for path in out.iterdir()] == [name]
     assert run('replay', recording, '--output', out, '--overwrite')[0] == 0
-    assert (out / 'bag').exists() and not (out / MARK).exists()
+    assert (out / 'bag').exists() and not list(out.glob('.*'))
 
 
 def test_replay_leaves_the_overview_of_somebody_else(walls, run):
@@ -203,45 +144,6 @@ def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
         code, _, error = run('replay', out / 'bag', '--output', out, *more)
         assert code == 2 and 'it is the recording' in error
     assert list((out / 'bag').glob('*.mcap'))
-
-
-KILLED = """
-import os, shutil, sys
-from rangeseg_ros.cli.main import main
-rmtree = shutil.rmtree
-def killed(path, *rest, **more):
-    if str(path).endswith('.bag'):
-        os.remove(path / 'metadata.yaml')
-        os.kill(os.getpid(), 9)
-    rmtree(path, *rest, **more)
-shutil.rmtree = killed
-sys.argv[0] = 'rangeseg'
-main()
-"""
-
-
-def test_a_kill_while_old_results_are_cleared_is_repaired(walls, run):
-    recording, out = walls
-    run('replay', recording, '--output', out)
-    expected = results(out)
-    options = ('replay', recording, '--output', out)
-    (out.parent / 'other.yaml').write_text('min_pixels: 50')
-    command = [sys.executable, '-c', KILLED, *options, '--params', out.parent / 'other.yaml']
-    assert subprocess.run(command, check=False).returncode == -9
-    assert run(*options)[0] == 0
-    assert results(out) == expected
-
-
-def test_two_replays_do_not_write_into_one_folder(walls, run):
-    import fcntl
-
-    recording, out = walls
-    out.mkdir()
-    with (out / MARK).open('a') as mark:
-        fcntl.flock(mark, fcntl.LOCK_EX)
-        code, _, error = run('replay', recording, '--output', out)
-    assert code == 2 and 'another replay writes there' in error
-    assert run('replay', recording, '--output', out)[0] == 0
 
 
 def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run):

@@ -158,7 +158,7 @@ def test_a_killed_replay_is_started_again(done, tmp_path):
     )
     try:
         deadline = time.monotonic() + 120
-        while len(list(tmp_path.glob('out/*_labels.png'))) < 3:
+        while len(list(tmp_path.glob('out/.*/*_labels.png'))) < 3:
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.01)

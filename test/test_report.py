@@ -57,7 +57,7 @@ def report(tmp_path):
 
 def test_a_page_is_self_contained(report):
     page = Page(report)
-    assert len(page.sources) == 4 + 4 + 2  # overlays, normals, charts
+    assert len(page.sources) == 4 + 2  # overlays, charts
     assert all(source.startswith('data:image/') for source in page.sources)
     assert not re.search(r'url\(|@import|<link', report.read_text())
 

@@ -15,7 +15,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.simulation.solids import box, cast, half_space, lit
+from rangeseg_ros.simulation.solids import box, cast, half_space
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 WALL = 2.0
@@ -40,7 +40,8 @@ def board(step, shadow, side, roll=0.0, turn=0.0):
     rays = CAMERA.rays.astype(float)
     distance, face = cast(solids, np.zeros(3), rays)
     projector = np.array(SIDES[side]) * shadow / (CAMERA.fx * (1 / depth - 1 / WALL))
-    bright = lit(solids, projector, distance[..., None] * rays)
+    # Light ends at parameter 1 on the very surface, give or take rounding.
+    bright = cast(solids, projector, distance[..., None] * rays - projector)[0] > 1 - 1e-7
     return np.where(bright, distance, 0).astype(np.float32), bright & (face > 0)
 
 

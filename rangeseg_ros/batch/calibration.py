@@ -22,8 +22,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.digest import code_digest
-from rangeseg_ros.io.bags import DepthBag
-from rangeseg_ros.io.cloud_bags import CloudBag, open_frames
+from rangeseg_ros.io.bags import CloudBag, DepthBag, open_frames
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.files import natural_order, replacing
 from rangeseg_ros.io.images import read_depth

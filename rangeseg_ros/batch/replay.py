@@ -25,7 +25,6 @@ from rangeseg_ros.digest import code_digest
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meaning import GROUND, STAIRS, ground_row, stairs_row, write_table
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.planes import PlaneTable, write_map
@@ -143,82 +142,23 @@ class Replay:
             return Outcome(**record['outcome'], already_done=True)
         self.check()
         with (
-            results_folder.begun(),
-            replacing(results_folder.bag) as partial,
-            PlaneTable(self.folder / 'planes.csv', LEADING) as table,
+            results_folder.replacing() as made,
             self._open() as source,
-            ResultBag(partial, self.topics, self.config.odometry) as bag,
+            Locator(self.recording, self.config) as located,
+            PlaneTable(made.path / 'planes.csv', LEADING) as table,
+            ResultBag(made.bag, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
-            report = ReplayReport(str(self.recording.name), self.config)
-            sequence = SequenceSegmenter(self.config)
-            trajectory: list[tuple[int, Transform]] = []
-            located = stack.enter_context(Locator(self.recording, self.config))
-
-            kinds = PICTURES + TERRAIN if self.terrain else PICTURES
-            ground: list[list[str]] = []
-            stairs: list[list[str]] = []
-            tilts: list[Tilt] = []
-            doubts: Counter[str] = Counter()
-
-            def results() -> Iterator[Timed]:
-                found = segment_frames(source, sequence, located.place, progress)
-                for index, frame, image, result in found:
-                    stamp = '{}.{:09d}'.format(*divmod(frame.stamp, 10**9))
-                    stem = f'{index:06d}_{stamp}'
-                    files = write_frame(self.folder, stem, image, result, kinds)
-                    table.write(result.planes, index, stamp)
-                    report.add(frame.stamp, result, files['overlay'])
-                    doubts.update(result.verdict.details)
-                    if result.tilt:
-                        tilts.append(result.tilt)
-                    if self.terrain:
-                        leading = [str(index), stamp]
-                        ground.append([*leading, *ground_row(result)])
-                        stairs.extend([*leading, *stairs_row(seen)] for seen in result.stairs)
-                    motion = located.last.target
-                    target = (self.config.target_frame, motion) if motion else None
-                    if sequence.motion:
-                        trajectory.append((frame.stamp, sequence.motion.pose))
-                    yield from bag.messages(frame, image, result, target, sequence.motion)
-
-            streams = [results()]
+            results = _Results(self, made.path, table, bag, located)
+            streams = [results.messages(source, progress)]
             if self.copy:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
             bag.write(*streams)
-            if self.terrain:
-                write_table(self.folder / 'ground.csv', [*LEADING, *GROUND], ground)
-                write_table(self.folder / 'stairs.csv', [*LEADING, *STAIRS], stairs)
-            planes = sequence.map.planes
-            if self.config.odometry:
-                write_trajectory(self.folder / 'trajectory.txt', trajectory)
-            if self.config.map_frame:
-                write_map(self.folder / 'map.csv', planes)
-                shades = colours([plane.id for plane in planes])
-                write_mesh(self.folder / 'map.ply', planes, shades)
-            damage = [source.damage, source.loss()]
-            if bag.lost:
-                reason, count = bag.lost.most_common(1)[0]
-                damage.append(f'{bag.lost.total()} messages not copied, {count} of {reason}')
-            outcome = Outcome(
-                report.frames,
-                dict(report.reasons),
-                report.figures(),
-                '; '.join(filter(None, damage)),
-                mapped=len(planes),
-                unlocated=dict(located.problems),
-                tilted=len(tilts),
-                tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
-                doubts=dict(doubts),
-                contradicted=sequence.map.doubts if self.config.map_frame else [],
-            )
-            report.write(self.folder / 'report.html', outcome.damage, outcome.contradicted)
-            kept = {
-                name: value for name, value in asdict(outcome).items() if name != 'already_done'
-            }
-            files = results_folder.digest()
-            bag.record({'key': key, 'outcome': kept, 'files': files})
+            outcome = results.finish(source)
+            kept = asdict(outcome)
+            del kept['already_done']
+            bag.record({'key': key, 'outcome': kept, 'files': made.digest()})
         return outcome
 
     def _open(self) -> DepthBag:
@@ -238,6 +178,82 @@ class Replay:
             state = path.stat()
             digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())
         return digest.hexdigest()[:16]
+
+
+class _Results:
+    """Writes what a replay leaves of every frame, and of all of them."""
+
+    def __init__(
+        self, replay: Replay, folder: Path, table: PlaneTable, bag: ResultBag, located: Locator
+    ) -> None:
+        self._terrain, self._config = replay.terrain, replay.config
+        self._folder, self._table, self._bag, self._located = folder, table, bag, located
+        self._report = ReplayReport(replay.recording.name, replay.config)
+        self._sequence = SequenceSegmenter(replay.config)
+        self._trajectory: list[tuple[int, Transform]] = []
+        self._ground: list[list[str]] = []
+        self._stairs: list[list[str]] = []
+        self._tilts: list[Tilt] = []
+        self._doubts: Counter[str] = Counter()
+
+    def messages(self, source: DepthBag, progress: Progress | None) -> Iterator[Timed]:
+        """Segment the frames and write their files; the messages for the bag."""
+        sequence, target_frame = self._sequence, self._config.target_frame
+        for index, frame, image, result in segment_frames(
+            source, sequence, self._located.place, progress
+        ):
+            self._write(index, frame.stamp, image, result)
+            to_target = self._located.last.target
+            target = (target_frame, to_target) if to_target else None
+            yield from self._bag.messages(frame, image, result, target, sequence.motion)
+
+    def _write(self, index: int, stamp: int, image: RangeImage, result: Segmentation) -> None:
+        leading = [str(index), '{}.{:09d}'.format(*divmod(stamp, 10**9))]
+        kinds = PICTURES + TERRAIN if self._terrain else PICTURES
+        stem = f'{index:06d}_{leading[1]}'
+        files = write_frame(self._folder, stem, image, result, kinds)
+        self._table.write(result.planes, *leading)
+        self._report.add(stamp, result, files['overlay'])
+        self._doubts.update(result.verdict.details)
+        if result.tilt:
+            self._tilts.append(result.tilt)
+        if self._terrain:
+            self._ground.append([*leading, *ground_row(result)])
+            self._stairs += [[*leading, *stairs_row(seen)] for seen in result.stairs]
+        if self._sequence.motion:
+            self._trajectory.append((stamp, self._sequence.motion.pose))
+
+    def finish(self, source: DepthBag) -> Outcome:
+        """Write what is of all frames."""
+        folder, config, mapped = self._folder, self._config, self._sequence.map
+        if self._terrain:
+            write_table(folder / 'ground.csv', [*LEADING, *GROUND], self._ground)
+            write_table(folder / 'stairs.csv', [*LEADING, *STAIRS], self._stairs)
+        if config.odometry:
+            write_trajectory(folder / 'trajectory.txt', self._trajectory)
+        if config.map_frame:
+            write_map(folder / 'map.csv', mapped.planes)
+            shades = colours([plane.id for plane in mapped.planes])
+            write_mesh(folder / 'map.ply', mapped.planes, shades)
+        damage = [source.damage, source.loss()]
+        if lost := self._bag.lost:
+            reason, count = lost.most_common(1)[0]
+            damage.append(f'{lost.total()} messages not copied, {count} of {reason}')
+        tilts = self._tilts
+        outcome = Outcome(
+            self._report.frames,
+            dict(self._report.reasons),
+            self._report.figures(),
+            '; '.join(filter(None, damage)),
+            mapped=len(mapped.planes),
+            unlocated=dict(self._located.problems),
+            tilted=len(tilts),
+            tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
+            doubts=dict(self._doubts),
+            contradicted=mapped.doubts if config.map_frame else [],
+        )
+        self._report.write(folder / 'report.html', outcome.damage, outcome.contradicted)
+        return outcome
 
 
 def segment_frames(

@@ -18,10 +18,9 @@ from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.bag_writer import BagWriter
 from rangeseg_ros.io.message_types import is_rosbag1, make_rosbags, message_types
-from rangeseg_ros.io.recordings import BagError, Recording
+from rangeseg_ros.io.recordings import BagError, Lost, Recording
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.motion import ODOMETRY, odometry_message
 from rangeseg_ros.messages.outputs import IN_TARGET, OUTPUTS, in_target
@@ -167,8 +166,8 @@ def open_source(path: Path) -> Recording:
         if is_rosbag1(path):
             raise BagError('ROS 1')
         source = Recording(path)
-        if not source.connections:
-            raise BagError(source.damage or 'no index')
+        if source.cut:
+            raise BagError(source.cut)
         return source
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:

@@ -1,21 +1,19 @@
-"""The folder of a replay: what in it is the replay's own, whole, or left by an interruption."""
+"""The folder of a replay: what in it is the replay's own, and whether it is whole."""
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
 from rangeseg_ros.batch.frame_files import FRAME_FILES
 from rangeseg_ros.batch.result_bag import read_record
-from rangeseg_ros.io.files import resolved
-from rangeseg_ros.io.planes import columns
+from rangeseg_ros.io.files import TEMPORARY, resolved
 from rangeseg_ros.io.recordings import BagError, Recording
 
 BAG = 'bag'
@@ -24,9 +22,6 @@ PICTURES = ('labels', 'overlay')
 """Which of `FRAME_FILES` every frame has."""
 TERRAIN = ('terrain', 'height')
 """Which of them every frame has where terrain is asked for."""
-MARK = '.rangeseg_replay'
-"""Name of a file that is there, and locked, while a replay is at work."""
-
 LEADING = ('frame', 'stamp')
 """First columns of the table of planes."""
 
@@ -35,7 +30,6 @@ _OWN = re.compile(
     rf'\d{{6,}}_-?\d+\.\d{{9}}({_ENDINGS})|(planes|stairs|ground)\.csv|map\.(csv|ply)|'
     r'report\.html|trajectory\.txt'
 )
-_PARTIAL = re.compile(rf'\.\d+\.({_OWN.pattern}|{BAG})')
 
 
 @dataclass(frozen=True)
@@ -60,34 +54,32 @@ class ResultFolder:
         source = resolved(recording)
         if resolved(self.bag) in (source, *source.parents):
             raise BagError(f'{self.bag}: exists already, not overwritten: it is the recording')
-        ours = read_record(self.bag) or self._interrupted()
-        if overwrite or ours:
+        if overwrite or read_record(self.bag):
             return
         for path in [self.bag, *self._own()]:
             if path.exists():
                 raise BagError(f'{path}: exists already, not overwritten')
 
     @contextmanager
-    def begun(self) -> Iterator[None]:
-        """Clear the folder, and mark it while a replay is at work.
-
-        Raises
-        ------
-        BagError
-            Another replay is at work there.
-        """
-        self.path.mkdir(parents=True, exist_ok=True)
-        mark = self.path / MARK
-        with mark.open('a') as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                raise BagError(f'{self.path}: another replay writes there') from None
-            try:
-                self._clear()
-                yield
-            finally:
-                mark.unlink()
+    def replacing(self) -> Iterator[ResultFolder]:
+        """Give a folder for results, which take the place of earlier ones once all are there."""
+        for left in self.path.glob(f'{TEMPORARY}*'):  # of a process that was killed
+            shutil.rmtree(left, ignore_errors=True)
+        unfinished = ResultFolder(self.path / f'{TEMPORARY}{os.getpid()}')
+        unfinished.path.mkdir(parents=True)
+        try:
+            yield unfinished
+            made = unfinished._own()
+            for path in made:
+                os.replace(path, self.path / path.name)
+            for name in {path.name for path in self._own()} - {path.name for path in made}:
+                (self.path / name).unlink()
+            # The bag last: its record says that all else is there.
+            if self.bag.exists():
+                os.replace(self.bag, unfinished.path / 'before')
+            os.replace(unfinished.bag, self.bag)
+        finally:
+            shutil.rmtree(unfinished.path, ignore_errors=True)
 
     def digest(self) -> str:
         """Of the names and contents of all results but the bag; of the report, its name alone.
@@ -105,9 +97,7 @@ class ResultFolder:
         try:
             recording = Recording(self.bag)
             recording.close()
-            return bool(
-                recording.connections and read_record(self.bag).get('files') == self.digest()
-            )
+            return not recording.cut and read_record(self.bag).get('files') == self.digest()
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception:
             return False
@@ -117,26 +107,3 @@ class ResultFolder:
         if not self.path.is_dir():
             return []
         return [path for path in self.path.iterdir() if _OWN.fullmatch(path.name)]
-
-    def _interrupted(self) -> bool:
-        if not self.path.is_dir():
-            return False
-        # The table is begun before anything else.
-        with suppress(OSError), (self.path / 'planes.csv').open('rb') as table:
-            header = ','.join([*LEADING, *columns()]).encode()
-            if table.read(len(header) + 1) == header + b'\n':
-                return True
-        return any(p.name == MARK or _PARTIAL.fullmatch(p.name) for p in self.path.iterdir())
-
-    def _clear(self) -> None:
-        """Remove what other or interrupted runs have left."""
-        for path in self.path.iterdir():
-            if _PARTIAL.fullmatch(path.name):
-                shutil.rmtree(path, ignore_errors=True)
-        if self.bag.exists():
-            # In one step: half of a bag could not be distinguished from a foreign one.
-            aside = self.path / f'.{os.getpid()}.{BAG}'
-            os.replace(self.bag, aside)
-            shutil.rmtree(aside)
-        for path in self._own():
-            path.unlink()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import click
 
 from rangeseg_ros.cli import options
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import scratch_folder
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -21,8 +22,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 @click.argument('depth', nargs=-1, type=options.FILE)
 @options.camera
 @options.depth_scale
-@options.params
-@options.method
+@options.config('method')
 @options.count('--scenes', default=5, help='How many simulated rooms, where no DEPTH is given.')
 @click.option(
     '--size',
@@ -39,8 +39,7 @@ def command(
     depth: tuple[Path, ...],
     camera_file: Path | None,
     depth_scale: float | None,
-    params_file: Path | None,
-    method: str | None,
+    config: Config,
     scenes: int,
     size: tuple[int, int],
     rounds: int,
@@ -53,12 +52,11 @@ def command(
     """
     if bool(depth) != bool(camera_file):
         raise click.UsageError('DEPTH images and --camera belong together')
-    config = options.read_parameters(params_file, method=method)
-    with scratch_folder('rangeseg_bench') as folder:
+    with TemporaryDirectory(prefix='rangeseg-') as folder:
         if camera_file:
             frames = benchmark.Frames(depth, read_camera(camera_file), depth_scale)
         else:
-            frames = _simulated(folder, size, scenes)
+            frames = _simulated(Path(folder), size, scenes)
         progress = partial(options.progress, unit='frame')
         figures = benchmark.measure(frames, config, rounds, progress, threads)
     click.echo(

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from rangeseg_ros.cli import options
-from rangeseg_ros.evaluation.figures import TOLERANCES, Compared, comparison_figures, table
+from rangeseg_ros.evaluation.figures import TOLERANCES, evaluation_figures, table
 from rangeseg_ros.evaluation.label_files import (
     as_truth,
     pair_files,
@@ -17,6 +17,7 @@ from rangeseg_ros.evaluation.label_files import (
     read_label_image,
     read_normals_beside,
 )
+from rangeseg_ros.evaluation.measure import Measurement
 from rangeseg_ros.evaluation.overlap import ComparisonError, check_tolerance
 
 
@@ -86,7 +87,7 @@ def command(
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`
     (mean_iou and pixel_accuracy over all regions and pixels), and each image in `per_image`.
     """
-    images = {}
+    images = []
     pairs = pair_files(truth, labels)
     for name, (truth_file, labels_file) in options.progress(pairs.items(), len(pairs), 'image'):
         known = as_truth(read_label_image(truth_file), min_pixels)
@@ -95,7 +96,7 @@ def command(
         except ComparisonError as error:
             raise ComparisonError(f'{labels_file}: {error}') from None
         angles, normals = read_angles_beside(truth_file), read_normals_beside(labels_file)
-        images[name] = Compared(overlap, angles, normals)
-    figures = comparison_figures(images, tolerances)
+        images.append(Measurement(name, overlap, angles, {}, normals, {}))
+    figures = evaluation_figures(images, tolerances)
     click.echo(table(figures))
     options.write_json(json_file, figures)

@@ -8,6 +8,7 @@ import click
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli.compare import ToleranceCommand, tolerance
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.evaluation.detection import detection_table, detections
 from rangeseg_ros.evaluation.figures import evaluation_figures, table
@@ -18,8 +19,7 @@ from rangeseg_ros.tasks import run_all
 
 @click.command(cls=ToleranceCommand)
 @click.argument('folder', metavar='DIR', type=options.FOLDER)
-@options.params
-@options.method
+@options.config('method')
 @tolerance
 @options.count(
     '--min-pixels', help='Smaller regions of true depth images do not count.  [default: 1000]'
@@ -42,8 +42,7 @@ from rangeseg_ros.tasks import run_all
 @options.json_file
 def command(
     folder: Path,
-    params_file: Path | None,
-    method: str | None,
+    config: Config,
     tolerances: tuple[float, ...],
     min_pixels: int | None,
     split: str | None,
@@ -66,7 +65,6 @@ def command(
     Prints the averages per image. The JSON file has the sums over the images in `tolerances`,
     with errors of angles and planes where the truth knows them, and each image in `per_image`.
     """
-    config = options.read_parameters(params_file, method=method)
     if (folder / 'terrain.csv').exists():
         terrains = terrain_tasks(folder, config, not unknown_height, output)
         measured = list(options.progress(run_all(terrains, jobs), len(terrains), 'image'))

@@ -10,6 +10,7 @@ import numpy as np
 
 from rangeseg_ros.batch.replay import segment_frames
 from rangeseg_ros.cli import options
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.mount import Mount, mount_of
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -20,12 +21,9 @@ from rangeseg_ros.io.bags import DepthBag
 @click.command()
 @click.argument('recording', type=click.Path(path_type=Path))
 @click.option('--base', default='base_footprint', show_default=True, help='Frame on the floor.')
-@options.params
-@options.exact
+@options.config('exact')
 @click.pass_context
-def command(
-    ctx: click.Context, recording: Path, base: str, params_file: Path | None, exact: bool
-) -> None:
+def command(ctx: click.Context, recording: Path, base: str, config: Config) -> None:
     """Find roll, pitch and height of a camera above the floor.
 
     The camera stays where it is on its robot, which may drive: the floor is the largest plane
@@ -33,7 +31,6 @@ def command(
     a static_transform_publisher and the origin of a URDF joint. Yaw and the position over the
     floor cannot be estimated from the floor. If the floor is uncertain, says why; exit code 1.
     """
-    config = options.read_parameters(params_file, exact=exact)
     # The frame is the camera's own, and its place in that has no error.
     sequence = SequenceSegmenter(replace(config, pose_noise=0.0, pose_turn_noise=0.0))
     still = Placement(pose=Transform.identity())

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -20,7 +20,6 @@ from rangeseg_ros.io.depth_files import Intrinsics
 from rangeseg_ros.io.files import (
     NotReplacedError,
     check_regular,
-    clear_abandoned,
     replacing,
     resolved,
 )
@@ -87,32 +86,13 @@ camera: Decorator = click.option(
     type=FILE,
     help='Intrinsics: a ROS camera-calibration YAML file, or the JSON of Open3D.',
 )
-intrinsics = together(
-    camera,
-    *(
-        click.option(name, type=Finite(), help=text)
-        for name, text in (
-            ('--fx', 'Focal length in x, pixels, in place of a file.'),
-            ('--fy', 'Focal length in y.  [default: as in x]'),
-            ('--cx', 'Column of the principal point.  [default: the middle]'),
-            ('--cy', 'Row of the principal point.  [default: the middle]'),
-            ('--fov', 'Horizontal field of view, degrees, in place of focal lengths.'),
-        )
-    ),
-)
-
-
-def read_intrinsics(
-    camera_file: Path | None, raw: bool, numbers: Sequence[float | None], fov: float | None
-) -> Intrinsics:
-    """Intrinsics of the options `intrinsics`; `numbers` are fx, fy, cx, cy."""
-    given = any(number is not None for number in numbers)
-    if (camera_file is not None) + given + (fov is not None) > 1:
-        raise click.UsageError('give one of --camera, --fx ... --cy and --fov')
-    if given and not (numbers[0] or numbers[1]):
-        raise click.UsageError('--cx and --cy need --fx')
-    camera = read_camera(camera_file, raw) if camera_file else None
-    return Intrinsics(camera, numbers if given else (), fov)
+_NUMBERS = {
+    '--fx': 'Focal length in x, pixels, in place of a file.',
+    '--fy': 'Focal length in y.  [default: as in x]',
+    '--cx': 'Column of the principal point.  [default: the middle]',
+    '--cy': 'Row of the principal point.  [default: the middle]',
+    '--fov': 'Horizontal field of view, degrees, in place of focal lengths.',
+}
 
 
 raw: Decorator = click.option(
@@ -126,16 +106,61 @@ params: Decorator = click.option(
     type=FILE,
     help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
 )
-method: Decorator = click.option(
-    '--method',
-    type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
-    help='Method, in place of that of the parameters.',
-)
-exact: Decorator = click.option(
-    '--exact',
-    is_flag=True,
-    help='Minimise with every label at full resolution instead of coarse to fine: slow.',
-)
+_PARAMETERS: dict[str, Decorator] = {
+    'method': click.option(
+        '--method',
+        type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
+        help='Method, in place of that of the parameters.',
+    ),
+    'exact': click.option(
+        '--exact',
+        is_flag=True,
+        help='Minimise with every label at full resolution instead of coarse to fine: slow.',
+    ),
+    'fixed_frame': click.option(
+        '--fixed-frame',
+        metavar='FRAME',
+        help='Frame in which planes stay put, such as odom.  [default: that of the parameters]',
+    ),
+}
+
+
+def config(*names: str) -> Decorator:
+    """--params, and options for the parameters `names`, which win; the command gets `config`."""
+
+    def decorate(command: Callable[..., Any]) -> Any:
+        @wraps(command)
+        def with_config(*args: Any, params_file: Path | None, **given: Any) -> Any:
+            named = {name: given.pop(name) for name in names}
+            chosen = {name: value for name, value in named.items() if value not in (None, False)}
+            return command(*args, config=read_config(params_file, **chosen), **given)
+
+        return together(params, *(_PARAMETERS[name] for name in names))(with_config)
+
+    return decorate
+
+
+def intrinsics(command: Callable[..., Any]) -> Any:
+    """--camera or numbers in its place, and --raw; the command gets `intrinsics`."""
+
+    @wraps(command)
+    def with_intrinsics(
+        *args: Any, camera_file: Path | None, raw: bool, fov: float | None, **given: Any
+    ) -> Any:
+        numbers = [given.pop(name) for name in ('fx', 'fy', 'cx', 'cy')]
+        any_number = any(number is not None for number in numbers)
+        if (camera_file is not None) + any_number + (fov is not None) > 1:
+            raise click.UsageError('give one of --camera, --fx ... --cy and --fov')
+        if any_number and not (numbers[0] or numbers[1]):
+            raise click.UsageError('--cx and --cy need --fx')
+        camera = read_camera(camera_file, raw) if camera_file else None
+        known = Intrinsics(camera, numbers if any_number else (), fov)
+        return command(*args, intrinsics=known, **given)
+
+    options = [click.option(name, type=Finite(), help=text) for name, text in _NUMBERS.items()]
+    return together(camera, *options, raw)(with_intrinsics)
+
+
 depth_scale: Decorator = click.option(
     '--depth-scale',
     type=Finite(min=1e-9, max=1e3),
@@ -145,14 +170,6 @@ overwrite: Decorator = click.option(
     '--overwrite', is_flag=True, help='Replace files that are there already.'
 )
 jobs = count('--jobs', help='Processes.  [default: one for each core]')
-fixed_frame: Decorator = click.option(
-    '--fixed-frame',
-    metavar='FRAME',
-    help='Frame in which planes stay put, such as odom: the map of planes is in it, where the '
-    'recording has tf.  [default: that of the parameters]',
-)
-
-
 topics = together(
     click.option('--depth-topic', help='Depth.  [default: found by type and name]'),
     click.option('--camera-topic', help='Intrinsics.  [default: those beside depth]'),
@@ -234,18 +251,11 @@ def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:
             interrupts.check()
 
 
-def read_parameters(params_file: Path | None, **given: Any) -> Config:
-    """Config of the option `params`; options of the command line win over the file."""
-    named = {name: value for name, value in given.items() if value not in (None, False)}
-    return read_config(params_file, **named)
-
-
 @contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
     """Make a folder that appears under its name once it is complete."""
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise click.ClickException(f'{path}: exists already, not overwritten')
-    clear_abandoned(path)
     with replacing(path) as partial:
         partial.mkdir()
         yield partial

@@ -9,18 +9,13 @@ import click
 
 from rangeseg_ros.batch.plan import PlanOutcome, PlanTask
 from rangeseg_ros.cli import options, recordings
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.tasks import Failure
 
 
 @click.command()
 @recordings.argument
 @options.output_folder()
-@click.option(
-    '--fixed-frame',
-    metavar='FRAME',
-    help='Frame in which planes stay put.  [default: that of the parameters, or that which the '
-    'tf of the recording moves in; without tf, the odometry of the planes]',
-)
 @click.option(
     '--headroom',
     type=options.Finite(min=0.1, max=100),
@@ -39,14 +34,12 @@ from rangeseg_ros.tasks import Failure
 @options.overwrite
 @options.jobs
 @recordings.scheduler
-@options.params
-@options.exact
+@options.config('exact', 'fixed_frame')
 @click.pass_context
 def command(
     ctx: click.Context,
     paths: tuple[Path, ...],
     output: Path,
-    fixed_frame: str | None,
     headroom: float,
     resolution: float,
     depth_topic: str | None,
@@ -54,8 +47,7 @@ def command(
     overwrite: bool,
     jobs: int | None,
     scheduler: str | None,
-    params_file: Path | None,
-    exact: bool,
+    config: Config,
 ) -> None:
     """Make floor plans and maps of recordings. Needs the extra plan.
 
@@ -68,13 +60,14 @@ def command(
       map.pgm, map.yaml   for map_server of Nav2
       map.ply, map.glb    meshes
 
-    All are in metres in the fixed frame, turned so that z is up where it is not. Walls are made
+    All are in metres in the fixed frame, turned so that z is up where it is not; without
+    --fixed-frame in that which the tf of the recording moves in, without tf in the odometry of the
+    planes. Walls are made
     exactly square where their covariances allow it.
     """
     missing = [name for name in ('ezdxf', 'trimesh') if find_spec(name) is None]
     if missing:
         raise click.ClickException(f'{" and ".join(missing)} missing: install the extra plan')
-    config = options.read_parameters(params_file, exact=exact, fixed_frame=fixed_frame)
     tasks = [
         PlanTask(path, folder, config, headroom, resolution, overwrite, depth_topic, camera_topic)
         for path, folder in recordings.with_folders(paths, output, scheduler)

@@ -14,7 +14,6 @@ from rosbags.rosbag2 import Reader
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli import options
 from rangeseg_ros.extras import import_extra
-from rangeseg_ros.io.recordings import why_unreadable
 
 CLOCK = '/clock'
 CLOCK_PERIOD = 0.025
@@ -46,8 +45,7 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
         reader.open()
     # Readers meet damaged bytes with exceptions of every kind.
     except Exception as error:
-        reason = why_unreadable(bag, error)
-        raise click.ClickException(f'{bag}: not a readable rosbag2: {reason}') from None
+        raise click.ClickException(f'{bag}: not a readable rosbag2: {error}') from None
     rclpy.init(args=[], signal_handler_options=no_handlers)
     node = rclpy.create_node('rangeseg_play')
     try:

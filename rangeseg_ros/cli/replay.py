@@ -11,6 +11,7 @@ import click
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options, recordings
 from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.page import page_kind
@@ -41,9 +42,7 @@ from rangeseg_ros.tasks import Failure
 @click.option('--copy', is_flag=True, help='Copy the topics of the recording into the bag.')
 @options.jobs
 @recordings.scheduler
-@options.fixed_frame
-@options.params
-@options.exact
+@options.config('exact', 'fixed_frame')
 @click.pass_context
 def command(
     ctx: click.Context,
@@ -58,9 +57,7 @@ def command(
     copy: bool,
     jobs: int | None,
     scheduler: str | None,
-    fixed_frame: str | None,
-    params_file: Path | None,
-    exact: bool,
+    config: Config,
 ) -> None:
     """Segment the depth images of recordings: rosbag2 (mcap, sqlite3) and ROS 1 bags.
 
@@ -79,7 +76,6 @@ def command(
     recording is damaged is left out, and the exit code is 1; a recording that fails costs no
     other, and the exit code is 2.
     """
-    config = options.read_parameters(params_file, exact=exact, fixed_frame=fixed_frame)
     topics = tuple(name for name in OUTPUTS if name in topics)
     tasks = [
         Replay(

@@ -11,13 +11,14 @@ import click
 from rangeseg_ros.batch.frame_files import FRAME_FILES, frame_path, write_frame
 from rangeseg_ros.cli import options
 from rangeseg_ros.compilation.preparation import prepare, show
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImageError
 from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.depth_files import CLOUDS, files_in, read_frame, scale_of
+from rangeseg_ros.io.depth_files import CLOUDS, Intrinsics, files_in, read_frame, scale_of
 
 # Outputs of the node that show what the files hold, so that they need the same kernels.
 _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
@@ -26,12 +27,10 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 @click.command()
 @click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @options.intrinsics
-@options.raw
 @options.output_folder()
 @options.depth_scale
-@options.params
+@options.config('exact')
 @options.overwrite
-@options.exact
 @click.option(
     '--normals',
     is_flag=True,
@@ -50,18 +49,11 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 )
 def command(
     depth: tuple[Path, ...],
-    camera_file: Path | None,
-    fx: float | None,
-    fy: float | None,
-    cx: float | None,
-    cy: float | None,
-    fov: float | None,
-    raw: bool,
+    intrinsics: Intrinsics,
     output: Path,
     depth_scale: float | None,
-    params_file: Path | None,
+    config: Config,
     overwrite: bool,
-    exact: bool,
     normals: bool,
     curved: bool,
     sensor: bool,
@@ -80,23 +72,21 @@ def command(
     name, count = Counter(path.stem for path, _ in frames).most_common(1)[0]
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
-    intrinsics = options.read_intrinsics(camera_file, raw, (fx, fy, cx, cy), fov)
-    segmenter = Segmenter(options.read_parameters(params_file, exact=exact))
+    segmenter = Segmenter(config)
     asked = {'normals': normals, 'curved': curved}
     files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
-    inputs = [path for path, _ in frames] + [*filter(None, [camera_file, params_file])]
-    options.check_new(outputs, inputs, overwrite)
+    options.check_new(outputs, [path for path, _ in frames], overwrite)
     clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
     kinds = ('image', 'points') if clouds else ('image',)
-    prepare(segmenter.config, kinds, show, _SHOWN)
+    prepare(config, kinds, show, _SHOWN)
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
-            image = corrected(read_frame(path, intrinsics, scale), segmenter.config)
+            image = corrected(read_frame(path, intrinsics, scale), config)
         except (RangeImageError, CameraError, DistortionError) as error:
             raise click.ClickException(f'{path}: {error}') from None
         result = segmenter.segment(image)
-        result = replace(result, planes=with_roles(result.planes, segmenter.config, result.up))
+        result = replace(result, planes=with_roles(result.planes, config, result.up))
         write_frame(output, path.stem, image, result, files)
         if result.planes:
             click.echo(f'{path}: {len(result.planes)} planes, {result.ground}')

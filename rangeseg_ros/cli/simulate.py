@@ -17,11 +17,11 @@ from rangeseg_ros.evaluation.terrain import TerrainTable
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
 from rangeseg_ros.simulation.render import Frame, simulate
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.sensor import resize
+from rangeseg_ros.simulation.sensors.kinect import NOISES, Kinect
+from rangeseg_ros.simulation.sensors.sensor import Sensor, resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.hard import HARD
 from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
@@ -66,12 +66,12 @@ def command() -> None:
 @command.command()
 @_sensor
 @_of_rooms
-def rooms(sensor: str, **given: Any) -> None:
+def rooms(sensor: str, sensor_seed: int, **given: Any) -> None:
     """Rooms as depth sensors of several kinds see them.
 
     The files are those of `simulate kinect`. Another width keeps the horizontal field of view.
     """
-    _write_rooms(sensor, 'measured', **given)
+    _write_rooms(SENSORS[sensor](sensor_seed), **given)
 
 
 @command.command()
@@ -82,7 +82,7 @@ def rooms(sensor: str, **given: Any) -> None:
     'independent; or none.',
 )
 @_of_rooms
-def kinect(noise: str, **given: Any) -> None:
+def kinect(noise: str, sensor_seed: int, **given: Any) -> None:
     """Rooms as a Kinect sees them, with a choice of its noise.
 
     \b
@@ -98,36 +98,29 @@ def kinect(noise: str, **given: Any) -> None:
     NAME is the scene's seed, and the number of the frame where there are several. Without noise
     the images are rounded to millimetres; the bag then holds exact metres (32FC1).
     """
-    _write_rooms('kinect', noise, **given)
+    _write_rooms(Kinect(sensor_seed, noise), **given)
 
 
 def _write_rooms(
-    sensor: str,
-    noise: str,
+    sensor: Sensor,
     *,
     scenes: int,
     frames: int,
     seed: int,
-    sensor_seed: int,
     scene: str,
     width: int | None,
     height: int | None,
     output: Path,
 ) -> None:
     """Write what a sensor sees in rooms. More than seven parameters: the options of a command."""
-    camera = _camera(sensor, sensor_seed, width, height)
+    camera = _camera(sensor, width, height)
 
     def seen() -> Iterator[tuple[str, Frame]]:
         for number in range(seed, seed + scenes):
             room = SCENES[scene](number, frames)
             for frame in range(frames):
                 name = f'{number:06d}' if frames == 1 else f'{number:06d}_{frame:06d}'
-                given = {'frame': frame, 'seed': number}
-                if sensor == 'kinect':
-                    given['sensor_seed'] = sensor_seed
-                    yield name, simulate_kinect(room, camera, noise=noise, **given)
-                else:
-                    yield name, simulate(room, SENSORS[sensor](sensor_seed), camera, **given)
+                yield name, simulate(room, sensor, camera, frame=frame, seed=number)
 
     truth: list[tuple[str, TruePlane]] = []
     count = scenes * frames
@@ -219,7 +212,7 @@ def _write_terrains(
     output: Path,
 ) -> None:
     """Write scenes with numbers from `seed` on, as images of so many columns and rows."""
-    camera = _camera(sensor, seed, *size)
+    camera = _camera(SENSORS[sensor](seed), *size)
     with (
         options.new_folder(output) as folder,
         TerrainTable(folder / 'terrain.csv') as table,
@@ -235,9 +228,9 @@ def _write_terrains(
     click.echo(f'{output}: {len(scenes)} images')
 
 
-def _camera(sensor: str, seed: int, width: int | None, height: int | None) -> Camera:
-    """Camera of a sensor of the catalogue, for images of another size where one is given."""
-    camera = SENSORS[sensor](seed).camera
+def _camera(sensor: Sensor, width: int | None, height: int | None) -> Camera:
+    """Camera of a sensor, for images of another size where one is given."""
+    camera = sensor.camera
     return resize(camera, width or camera.width, height or camera.height)
 
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from rangeseg_ros.evaluation.hoover import Classification, classify
 from rangeseg_ros.evaluation.measure import Measurement
-from rangeseg_ros.evaluation.overlap import Overlap, overlap_figures
+from rangeseg_ros.evaluation.overlap import overlap_figures
 from rangeseg_ros.evaluation.plane_errors import angle_errors, plane_errors
 
 TOLERANCES = (0.51, 0.6, 0.7, 0.8, 0.9, 0.95)
@@ -25,26 +24,8 @@ _ERRORS = {
 }
 
 
-class Compared(NamedTuple):
-    """An image to make figures of.
-
-    Attributes
-    ----------
-    overlap : Overlap
-        Of truth and segmentation.
-    angles : sequence of (label, label, degrees)
-        Angles between regions of the truth, where known.
-    normals : mapping of label to (3,)
-        Normals of the segmentation's regions, where known.
-    """
-
-    overlap: Overlap
-    angles: Sequence[tuple[int, int, float]] = ()
-    normals: Mapping[int, Any] = MappingProxyType({})
-
-
-def comparison_figures(
-    images: Mapping[str, Compared], tolerances: Sequence[float]
+def evaluation_figures(
+    measurements: Sequence[Measurement], tolerances: Sequence[float]
 ) -> dict[str, Any]:
     """Figures of one or more images.
 
@@ -53,39 +34,18 @@ def comparison_figures(
     dict
         `images`, their number; `tolerances`, for each tolerance the sums of the counts over the
         images, `mean_iou` and `pixel_accuracy` over all their regions and pixels (which do not
-        depend on the tolerance), and where angles are known `angle_mean` and `angle_std`,
-        degrees, of an image's errors, averaged over the images; `precision` and `recall` at
-        intersection over union 0.8; `per_image`, the same for each image.
+        depend on the tolerance), where angles are known `angle_mean` and `angle_std`, degrees, of
+        an image's errors, averaged over the images, and where planes are, of those of all correct
+        regions, `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`,
+        metres; `precision` and `recall` at intersection over union 0.8; `per_image`, the same for
+        each image but errors of planes; `milliseconds`, median time of a segmentation where known.
     """
-    figures = _figures(list(images.values()), tolerances)
-    single = {name: _figures([image], tolerances) for name, image in images.items()}
-    return {'images': len(images), **figures, 'per_image': single}
-
-
-def evaluation_figures(
-    measurements: Sequence[Measurement], tolerances: Sequence[float]
-) -> dict[str, Any]:
-    """Figures of `comparison_figures`, and the errors of the planes where the truth knows them.
-
-    Returns
-    -------
-    dict
-        As `comparison_figures`, and for each tolerance, of the planes of all correct regions,
-        `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`, metres.
-        `milliseconds`: median time of a segmentation.
-    """
-    images = {
-        item.name: Compared(
-            item.overlap,
-            item.angles,
-            {label: plane[:3] for label, plane in item.found_planes.items()},
-        )
-        for item in measurements
-    }
-    figures = comparison_figures(images, tolerances)
+    figures = {'images': len(measurements), **_figures(measurements, tolerances)}
+    figures['per_image'] = {item.name: _figures([item], tolerances) for item in measurements}
     for tolerance in tolerances:
         figures['tolerances'][f'{tolerance:g}'].update(_plane_figures(measurements, tolerance))
-    figures['milliseconds'] = float(np.median([sum(m.timings.values()) for m in measurements]))
+    if times := [sum(item.timings.values()) for item in measurements if item.timings]:
+        figures['milliseconds'] = float(np.median(times))
     return figures
 
 
@@ -110,12 +70,16 @@ def _plane_figures(measurements: Sequence[Measurement], tolerance: float) -> dic
 
 
 def _angle_figures(
-    images: Sequence[Compared], classes: Sequence[Classification]
+    images: Sequence[Measurement], classes: Sequence[Classification]
 ) -> dict[str, float]:
     errors = [
-        angle_errors(image.angles, image.normals, of_image.matches)
+        angle_errors(
+            image.angles,
+            {label: plane[:3] for label, plane in image.found_planes.items()},
+            of_image.matches,
+        )
         for image, of_image in zip(images, classes, strict=True)
-        if image.angles and image.normals
+        if image.angles and image.found_planes
     ]
     moments = [(each.mean(), each.std()) for each in errors if each.size]
     if not moments:
@@ -124,7 +88,7 @@ def _angle_figures(
     return {'angle_mean': float(mean), 'angle_std': float(std)}
 
 
-def _figures(images: Sequence[Compared], tolerances: Sequence[float]) -> dict[str, Any]:
+def _figures(images: Sequence[Measurement], tolerances: Sequence[float]) -> dict[str, Any]:
     shared = overlap_figures([image.overlap for image in images])
     table: dict[str, dict[str, float]] = {}
     for tolerance in tolerances:
@@ -140,7 +104,7 @@ def _figures(images: Sequence[Compared], tolerances: Sequence[float]) -> dict[st
 
 
 def table(figures: Mapping[str, Any]) -> str:
-    """Text table of `comparison_figures` or `evaluation_figures`, one row per tolerance.
+    """Text table of `evaluation_figures`, one row per tolerance.
 
     Counts are averages per image; of the errors of angles and planes, those that are known.
     """

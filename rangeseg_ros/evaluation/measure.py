@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
@@ -27,18 +29,18 @@ class Measurement:
         Of truth and segmentation: gives every metric at every tolerance.
     angles : list
         (label, label, degrees) of the truth, where known.
-    true_planes, found_planes : dict
-        Plane (nx, ny, nz, d) of each label, where known.
-    timings : dict
+    true_planes, found_planes : mapping
+        Plane (nx, ny, nz, d) of each label, where known; of the found ones normals do.
+    timings : mapping
         Milliseconds per stage.
     """
 
     name: str
     overlap: Overlap
-    angles: list[tuple[int, int, float]]
-    true_planes: dict[int, list[float]]
-    found_planes: dict[int, list[float]]
-    timings: dict[str, float]
+    angles: Sequence[tuple[int, int, float]]
+    true_planes: Mapping[int, Any]
+    found_planes: Mapping[int, Any]
+    timings: Mapping[str, float]
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,9 @@ class Task:
         return Measurement(
             self.case.name,
             overlap,
-            [(a, b, degrees) for a, b, degrees in sample.angles],
-            {label: [float(x) for x in plane] for label, plane in sample.planes.items()},
-            {p.label: [*map(float, p.normal), float(p.distance)] for p in result.planes},
+            sample.angles,
+            sample.planes,
+            {plane.label: (*plane.normal, plane.distance) for plane in result.planes},
             result.timings,
         )
 

@@ -1,25 +1,22 @@
-"""Writers of rosbag2: any messages, with checksums of chunks, and depth images."""
+"""Writers of rosbag2: any messages, and depth images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Any
-from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 from rosbags import rosbag2
 from rosbags.interfaces import Connection
-from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.io.files import clear_abandoned, replacing
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.message_types import (
     CAMERA_INFO,
     IMAGE,
@@ -30,21 +27,6 @@ from rangeseg_ros.io.message_types import (
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.cameras import camera_info_message
 from rangeseg_ros.messages.images import image_message
-
-# Of the checksum in the record of a chunk: opcode, length, two times and the size come first.
-_CRC_OFFSET = 1 + 8 + 8 + 8 + 8
-
-
-class _CheckedMcapWriter(McapWriter):
-    """Writes the checksum of every chunk, for which rosbags leaves a 0."""
-
-    def close_chunk(self) -> None:
-        crc, start = crc32(self.chunk.bio.getbuffer()), self.bio.tell()
-        super().close_chunk()
-        end = self.bio.tell()
-        self.bio.seek(start + _CRC_OFFSET)
-        self.bio.write(crc.to_bytes(4, 'little'))
-        self.bio.seek(end)
 
 
 class BagWriter(rosbag2.Writer):
@@ -57,10 +39,6 @@ class BagWriter(rosbag2.Writer):
     compressed : bool
         Compress the chunks with zstd.
     """
-
-    STORAGE_PLUGINS: Mapping[rosbag2.StoragePlugin, Any] = {
-        rosbag2.StoragePlugin.MCAP: _CheckedMcapWriter
-    }
 
     def __init__(self, path: Path, compressed: bool = False) -> None:
         super().__init__(path, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP)
@@ -110,7 +88,6 @@ class DepthBagWriter:
     def __enter__(self) -> DepthBagWriter:
         if self.path.exists():
             raise BagError(f'{self.path}: exists already, not overwritten')
-        clear_abandoned(self.path)
         with ExitStack() as stack:
             partial = stack.enter_context(replacing(self.path))
             self._writer = stack.enter_context(BagWriter(partial))

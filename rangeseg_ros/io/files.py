@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import atexit
 import errno
-import fcntl
 import os
 import re
 import shutil
-import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
-from tempfile import gettempdir
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 T = TypeVar('T')
 
-# Temporary folders of this process. A signal may come while one is made or removed, where no
-# `finally` helps; what is still there when the process exits goes then.
-_unfinished: set[Path] = set()
+TEMPORARY = '.rangeseg-'
+"""How the names of temporary folders begin."""
+
 # A full disk, quota or largest file: Python does not say of which file.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -36,9 +33,9 @@ class NotReplacedError(OSError):
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary place for a file or folder of the name of `path`.
 
-    On success it is moved to `path`, or to what that links to; after an exception or an
-    interruption nothing is left. A file keeps its mode; other names (hard links) of one that is
-    replaced stay with what it was.
+    On success it is moved to `path`, or to what that links to; after an exception nothing is
+    left. A file keeps its mode; other names (hard links) of one that is replaced stay with what it
+    was.
 
     Raises
     ------
@@ -49,13 +46,14 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     path = resolved(path) if path.is_symlink() else path
     check_regular(path)
-    folder = path.with_name(f'.{os.getpid()}.{path.name}')
-    with temporary_folder(folder):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=TEMPORARY, dir=path.parent) as folder:
+        partial = Path(folder, path.name)
         try:
-            yield folder / path.name
+            yield partial
             if path.is_file():
-                shutil.copymode(path, folder / path.name)
-            os.replace(folder / path.name, path)
+                shutil.copymode(path, partial)
+            os.replace(partial, path)
         except OSError as error:
             if error.errno in _NO_ROOM:
                 error.filename = str(path)
@@ -73,78 +71,6 @@ def check_regular(path: Path) -> None:
     """Raise NotReplacedError for devices, pipes and the like."""
     if path.exists() and not (path.is_file() or path.is_dir()):
         raise NotReplacedError(path, 'not a regular file')
-
-
-@contextmanager
-def temporary_folder(folder: Path) -> Iterator[None]:
-    """Make a folder that is gone in the end; while it is there, `abandoned` knows that it is used.
-
-    Raises
-    ------
-    FileExistsError
-        Another process uses a folder of this name.
-    """
-    if abandoned(folder):
-        shutil.rmtree(folder, ignore_errors=True)
-    _unfinished.add(folder)
-    try:
-        folder.mkdir(mode=0o700, parents=True)
-    except OSError:
-        _unfinished.discard(folder)
-        raise
-    lock = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(lock)
-        shutil.rmtree(folder, ignore_errors=True)
-        _unfinished.discard(folder)
-
-
-@atexit.register
-def _remove_unfinished() -> None:
-    for folder in list(_unfinished):
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def scratch_folder(name: str) -> Iterator[Path]:
-    """Give a folder in the temporary directory for what is needed until the end of the block.
-
-    Those of this `name` that killed processes have left are removed.
-    """
-    path = Path(gettempdir(), name)
-    clear_abandoned(path)
-    folder = path.with_name(f'.{os.getpid()}.{name}')
-    with temporary_folder(folder):
-        yield folder
-
-
-def abandoned(folder: Path) -> bool:
-    """Whether this is a `temporary_folder` whose process was killed."""
-    try:
-        if not stat.S_ISDIR(folder.lstat().st_mode):
-            return False
-        lock = os.open(folder, os.O_RDONLY)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    finally:
-        os.close(lock)
-    return True
-
-
-def clear_abandoned(path: Path) -> None:
-    """Remove the temporary folders that killed processes have left of `replacing(path)`."""
-    pattern = re.compile(rf'\.\d+\.{re.escape(path.name)}')
-    if path.parent.is_dir():
-        for folder in path.parent.iterdir():
-            if pattern.fullmatch(folder.name) and abandoned(folder):
-                shutil.rmtree(folder, ignore_errors=True)
 
 
 def cached_while_unchanged(read: Callable[[Path], T]) -> Callable[[Path], T]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import struct
+import io
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.messages.images import png_is_whole, png_shape
+from rangeseg_ros.messages.images import png_shape
 
 
 class ImageFileError(ValueError):
@@ -118,18 +119,15 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     except OSError as error:
         raise ImageFileError(f'{path}: {error.strerror}') from None
     size, pages = png_shape(data), 1
-    # Damage is found before decoding: the libraries would print many lines about it.
-    whole = size is not None and png_is_whole(data)
     if size is None:
-        size, pages = tiff_shape(data)
-        whole = size is not None
+        size, pages = _tiff_shape(data)
     if size and shape and size != shape:
         raise ImageFileError(
             f'{path}: depth image is {size[1]}x{size[0]}, its camera {shape[1]}x{shape[0]}'
         )
     try:
         pixels = np.frombuffer(data, np.uint8)
-        image = cv2.imdecode(pixels, cv2.IMREAD_UNCHANGED) if whole else None
+        image = cv2.imdecode(pixels, cv2.IMREAD_UNCHANGED) if size else None
     except cv2.error:
         image = None
     if image is None:
@@ -139,28 +137,11 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     return image
 
 
-def tiff_shape(data: bytes) -> tuple[tuple[int, int] | None, int]:
-    """(H, W) of the first page of a TIFF or BigTIFF, and the number of pages; None for others."""
-    order = {b'II': '<', b'MM': '>'}.get(data[:2])
+def _tiff_shape(data: bytes) -> tuple[tuple[int, int] | None, int]:
+    """(H, W) of the first page of a TIFF, and the number of pages; None for others."""
     try:
-        if not order or struct.unpack_from(f'{order}H', data, 2)[0] not in (42, 43):
-            return None, 0
-        big = struct.unpack_from(f'{order}H', data, 2)[0] == 43
-        pointer, count, entry = ('Q', 'Q', 20) if big else ('I', 'H', 12)
-        (start,) = struct.unpack_from(order + pointer, data, 8 if big else 4)
-        shape, starts = None, set()
-        while start and start not in starts:
-            starts.add(start)
-            (entries,) = struct.unpack_from(order + count, data, start)
-            first = start + struct.calcsize(count)
-            if shape is None:
-                tags = {}
-                for at in range(first, first + entries * entry, entry):
-                    tag, kind = struct.unpack_from(f'{order}HH', data, at)
-                    code = {3: 'H', 4: 'I', 16: 'Q'}.get(kind, 'H')
-                    tags[tag] = struct.unpack_from(order + code, data, at + (12 if big else 8))[0]
-                shape = tags[257], tags[256]
-            (start,) = struct.unpack_from(order + pointer, data, first + entries * entry)
-    except (struct.error, KeyError):
+        with Image.open(io.BytesIO(data), formats=['TIFF']) as file:
+            return file.size[::-1], getattr(file, 'n_frames', 1)
+    # Damaged bytes are met with exceptions of every kind.
+    except Exception:
         return None, 0
-    return shape, len(starts)

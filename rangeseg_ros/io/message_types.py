@@ -1,16 +1,13 @@
-"""Messages of recordings: their types and their contents."""
+"""Types of the messages of recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
-
-from rangeseg_ros.io.bag_formats import Lost, Record
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -40,25 +37,3 @@ def make_rosbags(kind: str, **fields: Any) -> Any:
 def is_rosbag1(path: Path) -> bool:
     """Whether it is a bag of ROS 1, and no folder of a rosbag2 that is called *.bag."""
     return path.suffix == '.bag' and not path.is_dir()
-
-
-def deserialized(
-    path: Path, records: Iterator[Record | Lost], topics: Collection[str]
-) -> Iterator[tuple[str, int, Any]]:
-    """Messages on `topics`.
-
-    A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
-    """
-    deserialize: Callable[[bytes, str], Any] = message_types(Stores.ROS2_JAZZY).deserialize_cdr
-    if is_rosbag1(path):
-        deserialize = message_types(Stores.ROS1_NOETIC).deserialize_ros1
-    for record in records:
-        if record.topic not in topics:
-            continue
-        message: Any = record
-        if isinstance(record, Record):
-            try:
-                message = deserialize(record.data, record.type)
-            except Exception as error:
-                message = Lost(record.topic, record.time, 1, f'damaged message: {error!r}')
-        yield record.topic, record.time, message

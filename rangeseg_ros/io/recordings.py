@@ -1,34 +1,29 @@
-"""Recordings, whole or damaged: rosbag2 (mcap, sqlite3) and ROS 1 bags.
+"""Recordings, whole or damaged: rosbag2 (mcap, sqlite3) and ROS 1 bags, read by `rosbags`.
 
-`rosbags` reads the indices of whole recordings; their messages are read by `bag_formats`.
+What that lacks is here: an mcap file is read up to where it is cut off, as the recorder leaves it
+when it is killed, and without a damaged chunk.
 """
 
 from __future__ import annotations
 
-import shutil
+import heapq
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
+from operator import itemgetter
 from pathlib import Path
-from tempfile import gettempdir
-from typing import Any
+from typing import Any, BinaryIO, NamedTuple
 
-import zstandard
 from rosbags import rosbag1, rosbag2
+from rosbags.interfaces import Connection
 from rosbags.rosbag2.reader import DirectoryReader
-from rosbags.rosbag2.storage_mcap import McapReader
+from rosbags.rosbag2.storage_mcap import MAXSIZE, McapReader, msgsrc
+from rosbags.typesys import Stores
 
-from rangeseg_ros.io.bag_formats import (
-    Channels,
-    DamageError,
-    Lost,
-    Record,
-    check_expansion,
-    file_records,
-)
 from rangeseg_ros.io.files import natural_order
-from rangeseg_ros.io.message_types import deserialized, is_rosbag1
-from rangeseg_ros.io.yaml_files import LARGEST
+from rangeseg_ros.io.message_types import is_rosbag1, message_types
+
+# Of mcap: the records that end the data, and the bytes of a record before its content.
+_FOOTER, _DATA_END, _HEAD = 2, 15, 9
 
 
 class BagError(ValueError):
@@ -39,11 +34,83 @@ class RecordingError(ValueError):
     """A file that is no recording, or of which nothing can be read."""
 
 
-class _McapReader(McapReader):
-    """Leaves files without an index to `bag_formats`, which unpacks no more than it may."""
+class DamageError(ValueError):
+    """The end of what can be read of a recording that does not say how much there was."""
 
-    def meta_scan(self) -> None:
-        raise RecordingError('no index')
+
+class Record(NamedTuple):
+    """A message as it is stored; `time` is that of its recording, nanoseconds."""
+
+    topic: str
+    type: str
+    time: int
+    data: bytes
+
+
+class Lost(NamedTuple):
+    """So many messages of a topic that cannot be read."""
+
+    topic: str
+    time: int
+    messages: int
+    reason: str
+
+
+class _McapReader(McapReader):
+    """Reads what is whole: each chunk by itself, and a file without its end up to there."""
+
+    damage = cut = ''
+
+    def open(self) -> None:
+        try:
+            super().open()
+        except PermissionError:
+            raise
+        # Readers meet damaged bytes with exceptions of every kind.
+        except Exception as error:
+            if not self.data_start:  # no mcap at all
+                raise
+            self.cut = self.damage = f'without its end: {error}'
+            self.bio = self.path.open('rb')
+            self.data_end = _end_of_whole_records(self.bio, self.data_start)
+            self.meta_scan()
+            counts = self.statistics.channel_message_counts if self.statistics else {}
+            self.connections = [
+                connection._replace(msgcount=counts.get(connection.id, 0))
+                for connection in self.connections
+            ]
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Any:
+        if not self.chunks:
+            return self.messages_scan(connections, start, stop)
+        wanted = {connection.id: connection for connection in connections}
+        chunks = [c for c in self.chunks if any(c.channel_count.get(key, 0) for key in wanted)]
+        merged = heapq.merge(*(self._of_chunk(c, wanted) for c in chunks), key=itemgetter(0))
+        return ((message[2], message[0], message[3]) for message in merged if message[2])
+
+    def _of_chunk(self, chunk: Any, wanted: dict[int, Connection]) -> Iterator[Any]:
+        assert self.bio
+        try:
+            yield from msgsrc(chunk, wanted, 0, MAXSIZE, self.bio)
+        except Exception as error:
+            self.damage = f'damaged chunk: {error}'
+
+
+def _end_of_whole_records(file: BinaryIO, start: int) -> int:
+    """Where the last whole record of the data of an mcap file ends."""
+    size = file.seek(0, 2)
+    while True:
+        file.seek(start)
+        head = file.read(_HEAD)
+        end = start + _HEAD + int.from_bytes(head[1:], 'little')
+        if len(head) < _HEAD or head[0] in (_FOOTER, _DATA_END) or end > size:
+            return start
+        start = end
 
 
 class _DirectoryReader(DirectoryReader):
@@ -69,12 +136,12 @@ class Recording:
     ----------
     types : dict of str
         Message type of each topic, in the ROS 2 form.
-    counts : dict of int
-        Messages of each topic, of a recording without an index those that can be read.
+    counts : Counter of str
+        Messages of each topic, of a file without its end those that can be read.
     connections : list of rosbags.interfaces.Connection
-        The topics with all that is recorded of them; empty without an index.
-    damage : str
-        What ends the reading of a recording without an index; empty when nothing does.
+        The topics with all that is recorded of them.
+    cut : str
+        Why a file has no end; empty when all have.
 
     Raises
     ------
@@ -88,123 +155,89 @@ class Recording:
         self.path = path
         self.types: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
-        self.connections: list[Any] = []
-        self.damage = ''
-        check_files(path)
-        self._reader: Any = rosbag1.Reader(path) if is_rosbag1(path) else None
+        self._readers: list[Any] = []
+        path.stat()
+        for part in path.iterdir() if path.is_dir() else [path]:
+            if part.exists() and not (part.is_file() or part.is_dir()):
+                raise RecordingError(f'{part.name}: not a regular file')
         try:
-            self._reader = self._reader or _Reader(path)
-            self._reader.open()
+            for reader in _readers(path):
+                reader.open()
+                self._readers.append(reader)
         except PermissionError:
+            self.close()
             raise
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
-            self._reader = None
-            self._count()
-            if not self.types:
-                reason = self.damage or why_unreadable(path, error)
-                raise RecordingError(f'not a readable bag: {reason}') from None
-            return
-        self.connections = list(self._reader.connections)
+            self.close()
+            raise RecordingError(f'not a readable bag: {error}') from None
+        self.cut = next((storage.cut for storage in self._storages() if storage.cut), '')
+        # Where a file is cut off, the metadata of its folder count what is gone.
+        readers = self._storages() if self.cut else self._readers
+        self.connections = [c for reader in readers for c in reader.connections]
         for connection in self.connections:
             self.types[connection.topic] = connection.msgtype
             self.counts[connection.topic] += connection.msgcount
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time and content of the messages on `topics`.
+        """Topic, time and content of the messages on `topics`, in the order of their times.
 
-        Of a whole recording in the order of their times; `Lost` is the content of what cannot be
-        read. Raises DamageError at the end of a recording without an index that is damaged.
+        A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
+
+        Raises
+        ------
+        DamageError
+            At the end of a recording without its end. `Lost` is the content of what cannot be
+            read of others.
         """
-        return deserialized(self.path, self.records(topics), topics)
+        ros1 = is_rosbag1(self.path)
+        store = message_types(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
+        deserialize: Any = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+        for record in self.records(topics):
+            message: Any = record
+            if isinstance(record, Record):
+                try:
+                    message = deserialize(record.data, record.type)
+                except Exception as error:
+                    message = Lost(record.topic, record.time, 1, f'damaged message: {error!r}')
+            yield record.topic, record.time, message
 
     def records(self, topics: Collection[str]) -> Iterator[Record | Lost]:
         """Messages on `topics` as they are stored, else as `messages`."""
-        damage = ''
         missing = Counter({topic: self.counts[topic] for topic in topics})
-        time = 0
-        for path, channels in self._files():
+        damage, time = '', 0
+        for reader in self._readers:
+            wanted = [c for c in reader.connections if c.topic in topics]
             try:
-                for record in file_records(path, channels, topics):
-                    if record.topic in topics:
-                        missing[record.topic] -= 1
-                        time = record.time
-                        yield self._unpacked(record)
-            except DamageError as error:
-                damage = damage or str(error)
-        if damage and not self._reader:
+                for connection, time, data in reader.messages(wanted) if wanted else ():
+                    missing[connection.topic] -= 1
+                    yield Record(connection.topic, connection.msgtype, time, bytes(data))
+            except Exception as error:
+                damage = str(error) or type(error).__name__
+        damage = damage or next((s.damage for s in self._storages() if s.damage), '')
+        if self.cut:
             raise DamageError(damage)
-        for topic, count in missing.items():
-            if damage and count > 0:
-                yield Lost(topic, time, count, damage)
+        for topic, count in (+missing).items() if damage else ():
+            yield Lost(topic, time, count, damage)
 
     def close(self) -> None:
         """Close the files."""
-        if self._reader:
-            self._reader.close()
+        for reader in self._readers:
+            reader.close()
 
-    def _files(self) -> list[tuple[Path, Channels]]:
-        """Files that hold the messages, and their topics by the index."""
-        if self._reader is None:
-            if not self.path.is_dir():
-                return [(self.path, {})]
-            parts = [*self.path.glob('*.mcap'), *self.path.glob('*.db3')]
-            return [(part, {}) for part in sorted(parts, key=natural_order)]
-        storage = getattr(self._reader, 'storage', self._reader)
-        return [
-            (Path(part.path), {c.id: (c.topic, c.msgtype) for c in part.connections})
-            for part in getattr(storage, 'storages', [storage])
-        ]
-
-    def _unpacked(self, record: Record) -> Record | Lost:
-        """Record of a bag whose messages may be compressed one by one."""
-        if getattr(self._reader, 'compression_mode', None) != 'message':
-            return record
-        return unpacked(record)
-
-    def _count(self) -> None:
-        for path, _ in self._files():
-            try:
-                for record in file_records(path, {}):
-                    self.types[record.topic] = record.type
-                    self.counts[record.topic] += 1
-            except DamageError as error:
-                self.damage = self.damage or str(error)
+    def _storages(self) -> list[_McapReader]:
+        storages = (getattr(reader, 'storage', reader) for reader in self._readers)
+        parts = [part for one in storages for part in getattr(one, 'storages', [one])]
+        return [part for part in parts if isinstance(part, _McapReader)]
 
 
-def unpacked(record: Record) -> Record | Lost:
-    """Record of a message that is compressed by itself (zstd)."""
-    try:
-        check_expansion(len(record.data), zstandard.frame_content_size(record.data))
-        data = zstandard.ZstdDecompressor().decompress(record.data)
-    except (DamageError, zstandard.ZstdError) as error:
-        return Lost(record.topic, record.time, 1, f'damaged message: {error}')
-    return record._replace(data=data)
-
-
-def check_files(path: Path) -> None:
-    """Raise RecordingError for what would never be read to its end, OSError where nothing is."""
-    path.stat()
-    for part in path.iterdir() if path.is_dir() else [path]:
-        if part.exists() and not (part.is_file() or part.is_dir()):
-            raise RecordingError(f'{part.name}: not a regular file')
-    metadata = path / 'metadata.yaml'
-    if metadata.is_file() and metadata.stat().st_size > LARGEST:
-        raise RecordingError('metadata.yaml: too large for such a file')
-    for packed in path.glob('*.zstd') if path.is_dir() else ():
-        _check_room(packed)
-
-
-def _check_room(packed: Path) -> None:
-    """Raise RecordingError where a whole compressed file, which is unpacked, has no room."""
-    with packed.open('rb') as file, suppress(zstandard.ZstdError):
-        size = zstandard.frame_content_size(file.read(18))
-        if size > shutil.disk_usage(gettempdir()).free:
-            raise RecordingError(f'{packed.name}: no room for {size} bytes in {gettempdir()}')
-
-
-def why_unreadable(path: Path, error: Exception) -> str:
-    """What the reader of `rosbags` stumbled over; it calls the metadata by the bag's name."""
-    if path.is_dir() and not (path / 'metadata.yaml').exists():
-        return 'the folder has no metadata.yaml'
-    return str(error)
+def _readers(path: Path) -> list[Any]:
+    """One reader, or of a folder without metadata one for each file."""
+    if is_rosbag1(path):
+        return [rosbag1.Reader(path)]
+    if not path.is_dir() or (path / 'metadata.yaml').exists():
+        return [_Reader(path)]
+    parts = sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=natural_order)
+    if not parts:
+        raise RecordingError('the folder has no metadata.yaml')
+    return [_Reader(part) for part in parts]

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
-from rangeseg_ros.io.bag_formats import Lost
 from rangeseg_ros.io.message_types import EARLY_TRANSFORMS, TRANSFORMS
-from rangeseg_ros.io.recordings import Recording
+from rangeseg_ros.io.recordings import Lost, Recording
 from rangeseg_ros.messages.transforms import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'

@@ -22,8 +22,7 @@ def read_yaml(path: Path) -> Any:
     Raises
     ------
     YamlError
-        A missing file or one that cannot be read; no YAML; one that is too large, also by its
-        aliases, too deep or endless.
+        A missing file or one that cannot be read; no YAML; one that is too large or too deep.
     """
     # JSON may be indented by tabs, YAML may not.
     parse, kind = (json.loads, 'JSON') if path.suffix == '.json' else (yaml.safe_load, 'YAML')
@@ -34,8 +33,6 @@ def read_yaml(path: Path) -> Any:
         if size > LARGEST:
             raise YamlError(f'{path}: too large for such a file')
         content = parse(path.read_text())
-        if _size(content, {}) > LARGEST:
-            raise YamlError(f'{path}: too large for such a file')
     except OSError as error:
         raise YamlError(f'{path}: {error.strerror}') from None
     except RecursionError:
@@ -46,19 +43,3 @@ def read_yaml(path: Path) -> Any:
     except (ValueError, OverflowError, yaml.YAMLError):
         raise YamlError(f'{path}: not a {kind} file') from None
     return content
-
-
-def _size(content: Any, known: dict[int, int | None]) -> int:
-    """Number of values, those behind aliases as often as they are named."""
-    if not isinstance(content, dict | list | tuple | set):
-        return 1
-    key = id(content)
-    if key in known:
-        size = known[key]
-        if size is None:  # it holds itself
-            raise RecursionError
-        return size
-    known[key] = None
-    parts = [*content, *content.values()] if isinstance(content, dict) else content
-    known[key] = size = 1 + sum(_size(part, known) for part in parts)
-    return size

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import struct
 from typing import Any
-from zlib import crc32
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from rangeseg_ros.messages.make import Make
 
@@ -32,53 +33,25 @@ def depth_from_message(
     ----------
     message : sensor_msgs/Image or CompressedImage
     shape : (int, int), optional
-        (H, W) that the image must have; a compressed one of another size is not decoded.
-
-    Raises
-    ------
-    EncodingError
-        The message holds no depth image, a damaged one, or one of another size.
-    """
-    if hasattr(message, 'format'):
-        return decode_compressed(message.format, message.data, shape)
-    return decode_image(
-        message.height,
-        message.width,
-        message.encoding,
-        bool(message.is_bigendian),
-        message.step,
-        message.data,
-    )
-
-
-def decode_image(
-    height: int, width: int, encoding: str, is_bigendian: bool, step: int, data: Any
-) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Depth image of the fields of a sensor_msgs/Image.
-
-    Parameters
-    ----------
-    height, width : int
-        Size of the image, pixels.
-    encoding : str
-        One of `PIXEL_TYPES`.
-    is_bigendian : bool
-        Byte order of `data`.
-    step : int
-        Length of a row, bytes; rows may be padded.
-    data : bytes-like
-        The rows; the padding of the last one may be missing.
+        (H, W) that a compressed image must have; one of another size is not decoded.
 
     Returns
     -------
-    (H, W) uint16 in millimetres or float32 in metres, native byte order; a view of `data` where
+    (H, W) uint16 in millimetres or float32 in metres, native byte order; a view of the data where
     that is possible, so not to be written to.
 
     Raises
     ------
     EncodingError
-        Another encoding, an empty image, rows or data too short for the size.
+        Another encoding or compression, an empty image, data too short for the size or damaged, or
+        another size.
     """
+    return _compressed(message, shape) if hasattr(message, 'format') else _plain(message)
+
+
+def _plain(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+    """Image whose rows may be padded, the last one not."""
+    height, width, encoding, step = message.height, message.width, message.encoding, message.step
     if encoding not in PIXEL_TYPES:
         raise EncodingError(
             f'encoding {encoding!r} is no depth image; known: {", ".join(PIXEL_TYPES)}'
@@ -89,7 +62,7 @@ def decode_image(
     row = width * dtype.itemsize
     if step < row:
         raise EncodingError(f'step of {step} bytes is too short for {width} pixels of {encoding}')
-    raw = np.frombuffer(data, np.uint8)
+    raw = np.frombuffer(message.data, np.uint8)
     needed = step * (height - 1) + row
     if raw.size < needed:
         raise EncodingError(
@@ -97,57 +70,35 @@ def decode_image(
             f'{step} bytes'
         )
     rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1), writeable=False)
-    stored = dtype.newbyteorder('>' if is_bigendian else '<')
+    stored = dtype.newbyteorder('>' if message.is_bigendian else '<')
     return np.ascontiguousarray(rows).view(stored).astype(dtype, copy=False)
 
 
-def decode_compressed(
-    format: str, data: Any, shape: tuple[int, int] | None = None
+def _compressed(
+    message: Any, shape: tuple[int, int] | None
 ) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """Depth image of a sensor_msgs/CompressedImage written by compressed_depth_image_transport.
+    """Image of compressed_depth_image_transport: a 12-byte header and a 16-bit PNG.
 
-    Parameters
-    ----------
-    format : str
-        E.g. '16UC1; compressedDepth png'.
-    data : bytes-like
-        A 12-byte header and a 16-bit PNG. 32FC1 is quantised in inverse depth:
-        depth = a / (value - b), 0 invalid, with a and b in the header.
-    shape : (int, int), optional
-        (H, W) that the image must have.
-
-    Returns
-    -------
-    (H, W) uint16 in millimetres or float32 in metres with NaN where invalid.
-
-    Raises
-    ------
-    EncodingError
-        Another format or compression, another size, or damaged data.
+    32FC1 is quantised in inverse depth: depth = a / (value - b), 0 invalid, a and b in the header.
     """
-    encoding, _, compression = (part.strip() for part in format.partition(';'))
+    encoding, _, compression = (part.strip() for part in message.format.partition(';'))
     # Older publishers do not name the codec; it was always PNG.
-    if encoding not in PIXEL_TYPES or compression not in (
-        'compressedDepth',
-        'compressedDepth png',
-    ):
-        raise EncodingError(
-            f'format {format!r} is no known depth image; known: '
-            f'{", ".join(f"{name}; compressedDepth png" for name in PIXEL_TYPES)}'
-        )
-    raw = np.frombuffer(data, np.uint8)
+    known = ('compressedDepth', 'compressedDepth png')
+    if encoding not in PIXEL_TYPES or compression not in known:
+        formats = ', '.join(f'{name}; {known[1]}' for name in PIXEL_TYPES)
+        raise EncodingError(f'format {message.format!r} is no known depth image; known: {formats}')
+    raw = np.frombuffer(message.data, np.uint8)
     if raw.size <= _HEADER.size:
         raise EncodingError(f'compressed depth image of {raw.size} bytes has no PNG')
     _, a, b = _HEADER.unpack(raw[: _HEADER.size].tobytes())
     png = raw[_HEADER.size :]
-    size = png_shape(png[:24].tobytes())
+    size = png_shape(png.tobytes())
     if size and shape and size != shape:
         raise EncodingError(
             f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
         )
     try:
-        whole = size is not None and png_is_whole(png.tobytes())
-        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if whole else None
+        image = cv2.imdecode(png, cv2.IMREAD_UNCHANGED) if size else None
     except cv2.error:
         image = None
     if image is None:
@@ -166,29 +117,19 @@ def decode_compressed(
 
 
 def png_shape(data: bytes) -> tuple[int, int] | None:
-    """(H, W) of the PNG that begins with `data`, 24 bytes or more; None when it is no PNG."""
-    if len(data) < 24 or data[:8] != b'\x89PNG\r\n\x1a\n' or data[12:16] != b'IHDR':
-        return None
-    width, height = struct.unpack('>II', data[16:24])
-    return height, width
+    """(H, W) of a PNG; None when it is none, or its checksums say that it is damaged.
 
-
-def png_is_whole(data: bytes) -> bool:
-    """Whether a PNG has all its parts with their checksums, and can hold the pixels it promises.
-
-    OpenCV would take gigabytes for a damaged length, and libpng complain on stderr.
+    Found before decoding: OpenCV would take gigabytes for a damaged length, and libpng complain on
+    stderr.
     """
-    at = 8
-    while at + 12 <= len(data):
-        end = at + 12 + int.from_bytes(data[at : at + 4], 'big')
-        if crc32(data[at + 4 : end - 4]) != int.from_bytes(data[end - 4 : end], 'big'):
-            return False
-        if data[at + 4 : at + 8] == b'IEND':
-            height, width = png_shape(data) or (0, 0)
-            # Deflate packs no more than 1032 bytes into one; a pixel has a bit or more.
-            return height * width <= 8 * 1032 * len(data)
-        at = end
-    return False
+    try:
+        with Image.open(io.BytesIO(data), formats=['PNG']) as file:
+            width, height = file.size
+            file.verify()
+    # Damaged bytes are met with exceptions of every kind.
+    except Exception:
+        return None
+    return height, width
 
 
 def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import cv2
 import jinja2
 import numpy as np
-from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.files import replacing
@@ -94,12 +93,6 @@ def _jpeg(path: Path) -> str:
     bgr = cv2.imread(str(path))
     if bgr is None:  # somebody has removed it meanwhile
         bgr = np.zeros((1, 1, 3), np.uint8)
-    return as_jpeg(np.asarray(bgr, np.uint8)[..., ::-1])
-
-
-def as_jpeg(picture: NDArray[np.uint8]) -> str:
-    """An RGB picture (H, W, 3) as the address of an image in a page."""
-    bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     _, jpeg = cv2.imencode('.jpg', bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])
     return _data('image/jpeg', jpeg.tobytes())
 

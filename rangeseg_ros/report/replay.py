@@ -12,12 +12,8 @@ import numpy as np
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.drawing import normals_picture
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import Picture, as_jpeg, evenly_spaced, shared_values, write_page
-
-# Frames whose normals are shown: up to twice as many, evenly spaced.
-_NORMALS = 6
+from rangeseg_ros.report.page import Picture, evenly_spaced, shared_values, write_page
 
 
 class ReplayReport:
@@ -44,8 +40,6 @@ class ReplayReport:
         self._sightings = [np.empty(0, charts.SIGHTING)]
         self._timings: list[dict[str, float]] = []
         self._pictures: list[Picture] = []
-        self._normals: list[tuple[str, int]] = []
-        self._stride = 1
         self._sensors: list[SensorModel] = []
 
     @property
@@ -59,10 +53,6 @@ class ReplayReport:
         self._sightings.append(np.array(rows, charts.SIGHTING))
         found = f'{len(result.planes)} planes' if result.planes else result.reason
         self._pictures.append(Picture(picture, f'frame {self.frames}: {found}'))
-        if self.frames % self._stride == 0:
-            self._normals.append((as_jpeg(normals_picture(result.normals)), self.frames))
-            if len(self._normals) > 2 * _NORMALS:
-                self._normals, self._stride = self._normals[::2], 2 * self._stride
         self._stamps.append(stamp)
         self._timings.append(result.timings)
         self._sensors.append(result.sensor)
@@ -104,7 +94,6 @@ class ReplayReport:
             else '',
             **self.figures(),
             pictures=evenly_spaced(self._pictures),
-            normals=self._normals,
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
             drifts=charts.drifts(sightings, times) if len(sightings) else '',

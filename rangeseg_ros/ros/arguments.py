@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import fields
-from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import yaml
 from rclpy.node import Node
 from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -63,8 +60,8 @@ def check_arguments(arguments: list[str]) -> None:
 def check_parameters(node: Node, arguments: list[str]) -> None:
     """Refuse parameters that the node does not have, so that none is misspelt in silence.
 
-    Those of the wildcard section of a parameter file may be meant for other nodes, and
-    `qos_overrides` for other topics: they are warned of.
+    Those of a parameter file may be meant for other nodes, and `qos_overrides` for other topics:
+    they are warned of, unless they look like one of this node.
 
     Raises
     ------
@@ -78,16 +75,16 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
     known = {field.name for field in fields(NodeConfig)} | quality
     given = [name for name in node._parameter_overrides if name.partition('.')[0] not in _FOREIGN]
     unknown = sorted(set(given) - known)
-    shared = _shared(arguments)
+    alone = {argument.partition(':=')[0].rpartition(':')[2] for argument in arguments}
     topics = {name.split('.')[1] for name in quality}
     for name in unknown:
         problem = unknown_parameter(name, known)
         # `ros2 param dump` writes those of the topics that a node had, maybe under other names.
         foreign = name.startswith('qos_overrides.') and name.split('.')[1] not in topics
-        if name not in shared and not foreign:
+        if name in alone or ('meant' in problem and not foreign):
             raise ConfigError(problem)
-        where = 'of another topic' if foreign else 'of /**'
-        node.get_logger().warning(f'{problem} ({where}, ignored)')
+        where = 'of another topic' if foreign else 'of another node'
+        node.get_logger().warning(f'{problem} ({where}?), ignored')
 
 
 def logging_arguments() -> list[str]:
@@ -132,26 +129,3 @@ def _check_policy(name: str, value: object) -> None:
 def _described() -> Iterable[str]:
     for field in fields(NodeConfig):
         yield f'  {field.name} (default {field.default!r}): {field.metadata["description"]}'
-
-
-def _shared(arguments: list[str]) -> set[str]:
-    """Names in the wildcard sections of the parameter files, but none given by itself."""
-    names: set[str] = set()
-    alone: set[str] = set()
-    for option, value in pairwise(arguments):
-        if option == '--params-file':
-            content = yaml.safe_load(Path(value).read_text())
-            for section, part in content.items() if isinstance(content, dict) else ():
-                if section == '/**' and isinstance(part, dict):
-                    names.update(_flat(part.get('ros__parameters') or {}))
-        elif option in ('-p', '--param'):
-            alone.add(value.partition(':=')[0].rpartition(':')[2])
-    return names - alone
-
-
-def _flat(parameters: Mapping[str, Any], prefix: str = '') -> Iterable[str]:
-    for name, value in parameters.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f'{prefix}{name}.')
-        else:
-            yield f'{prefix}{name}'

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.scenes import Scene
 from rangeseg_ros.simulation.sensors.sensor import Sensor
 from rangeseg_ros.simulation.solids import cast
@@ -58,6 +59,13 @@ def simulate(
     pose = scene.poses[frame]
     rays = camera.rays.astype(np.float64) @ pose.rotation.T
     depth, face = cast(scene.solids, pose.position, rays)
-    image = sensor.measure(depth, camera, np.random.default_rng([seed, frame, 9]))
+    random = np.random.default_rng([seed, frame, 4])
+    image = sensor.measure(depth, camera, random)
+    # Exact depth, in metres, is that of renderings, which need no light.
+    if image.dtype == np.uint16 and len(scene.dark):
+        points = pose.position + np.where(face >= 0, depth, 1.0)[..., None] * rays
+        ragged = 1 + 0.06 * smooth_field(camera.shape, (2.5, 2.5), random)
+        for *centre, radius in scene.dark:
+            image[np.linalg.norm(points - centre, axis=-1) < radius * ragged] = 0
     labels, planes = visible_regions(np.where(image > 0, face, -1), scene.planes(pose))
     return Frame(image, labels, planes, camera)

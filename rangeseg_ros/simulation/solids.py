@@ -157,38 +157,6 @@ def _quadric_interval(
     return (-b - root) / a, (-b + root) / a
 
 
-def lit(
-    solids: Sequence[Solid], lamp: ArrayLike, points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Whether light from `lamp` (3,) reaches points (..., 3) on surfaces; (...) bool."""
-    reach, _ = cast(solids, lamp, points - np.asarray(lamp))
-    # The light ends at parameter 1 on the very surface, give or take rounding.
-    return reach > 1 - 1e-7
-
-
-def cosine_of_incidence(
-    rays: NDArray[np.float64], face: NDArray[np.int32], planes: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Cosine of the angle between rays and the normals of the faces they hit.
-
-    Parameters
-    ----------
-    rays : (..., 3) float64
-        Directions, of any length.
-    face : (...) int32
-        Numbers of faces, -1 for none.
-    planes : (F, 4) float64
-        Equations of the faces in the frame of the rays.
-
-    Returns
-    -------
-    (...) float64
-        1 where there is no face or a curved one.
-    """
-    towards = -np.einsum('...i,...i', rays, planes[face, :3]) / np.linalg.norm(rays, axis=-1)
-    return np.where((face >= 0) & (towards > 0), np.minimum(towards, 1), 1.0)
-
-
 def half_space(normal: ArrayLike, point: ArrayLike) -> Solid:
     """Everything behind the plane through `point` whose outward normal is `normal`."""
     unit = np.asarray(normal, np.float64)

@@ -26,6 +26,9 @@ SHADOW_SHARE = 0.75
 """Part of a shadow's geometric width that real sensors leave blank (median)."""
 
 
+NOISES = ('measured', 'correlated', 'independent', 'none')
+
+
 @dataclass(frozen=True)
 class Kinect:
     """Kinect v1.
@@ -34,9 +37,25 @@ class Kinect:
     ----------
     seed : int
         Which sensor: its fixed distortion and bands.
+    noise : {'measured', 'correlated', 'independent', 'none'}
+        measured: fixed distortion, vertical bands, correlated noise, blind zones. independent:
+        sigma = 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the
+        same, correlated over 1.5 pixels as by block matching. These three quantise disparity to
+        1/8 pixel and depth to millimetres. none: exact metres. All have the shadows of the
+        projector.
+
+    Raises
+    ------
+    ValueError
+        Unknown noise.
     """
 
     seed: int = 0
+    noise: str = 'measured'
+
+    def __post_init__(self) -> None:
+        if self.noise not in NOISES:
+            raise ValueError(f'noise must be one of {", ".join(NOISES)}, not {self.noise!r}')
 
     @property
     def camera(self) -> Camera:
@@ -45,14 +64,23 @@ class Kinect:
 
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
-    ) -> NDArray[np.uint16]:
-        """See `Sensor.measure`; surfaces that are too dark are not known here."""
+    ) -> NDArray[np.uint16] | NDArray[np.float32]:
+        """See `Sensor.measure`."""
         inverse = inverse_depth(depth)
-        slope = slopes(inverse, camera)
-        blind = ~np.isfinite(depth)
-        blind |= blind_zones(depth, slope, smooth_field(depth.shape, (2.5, 2.5), random))
-        blind |= unseen_from_the_right(inverse, camera, SHADOW_SHARE * BASELINE)
-        disparity = measured_disparity(np.where(blind, 1.0, depth), slope, self.seed, random)
+        share = SHADOW_SHARE if self.noise == 'measured' else 1.0
+        blind = ~np.isfinite(depth) | unseen_from_the_right(inverse, camera, share * BASELINE)
+        depth = np.where(blind, 1.0, depth)
+        if self.noise == 'none':
+            return np.where(blind, 0, depth).astype(np.float32)
+        if self.noise == 'measured':
+            slope = slopes(inverse, camera)
+            blind |= blind_zones(depth, slope, smooth_field(depth.shape, (2.5, 2.5), random))
+            disparity = measured_disparity(depth, slope, self.seed, random)
+        else:
+            width = (1.5, 1.5) if self.noise == 'correlated' else None
+            error = 0.0012 + 0.0019 * (depth - 0.4) ** 2
+            error *= smooth_field(depth.shape, width, random)
+            disparity = 1 / (QUANTUM * np.maximum(depth + error, 0.1))
         values = in_millimetres(disparity)
         return np.where(blind | (values > 65535), 0, values).astype(np.uint16)
 
