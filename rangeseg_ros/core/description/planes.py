@@ -210,9 +210,10 @@ def describe_regions(
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
     cells, start = fits.sums.cells, fits.sums.start
-    normal, distance, covariance, centroid, rms, confidence = _described(
-        cells, start, fits.total, theta, theta_covariance, fits.outlier_share(), fits.sensor
+    normal, distance, centroid, rms, confidence = _described(
+        cells, start, fits.total, theta, fits.outlier_share(), fits.sensor
     )
+    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     if image.place.any():
         # From the sensor to the frame of the points.
         shift = np.eye(4)
@@ -246,11 +247,10 @@ def _described(
     start: NDArray[np.intp],
     total: NDArray[np.float64],
     theta: NDArray[np.float64],
-    theta_covariance: NDArray[np.float64],
     outlier_share: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Normal, distance, covariance, centroid, rms and confidence of regions 0...M; see `Plane`."""
+    """Normal, distance, centroid, rms and confidence of regions 0...M; see `Plane`."""
     regions = len(theta)
     normal, distance = np.zeros((regions, 3)), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
@@ -277,8 +277,7 @@ def _described(
         expected = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
         expected *= distance[k] ** 2
         confidence[k] = (1 - outlier_share[k]) * min(1.0, expected / max(square, 1e-18))
-    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
-    return normal, distance, covariance, centroid, rms, confidence
+    return normal, distance, centroid, rms, confidence
 
 
 @njit(cache=True)

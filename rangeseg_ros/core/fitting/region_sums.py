@@ -244,7 +244,7 @@ def _accumulate(
         bottom = min((bi + 1) * BLOCK, height)
         for bj in range(inside.shape[1]):
             right, squared = min((bj + 1) * BLOCK, width), blocks.squared[bi, bj]
-            label = inside[bi, bj]
+            label = int(inside[bi, bj])
             if squared == 0 or label == 0:
                 continue
             # Rays of a cloud are not of one length along any axis: their sums are not known.
@@ -252,14 +252,14 @@ def _accumulate(
                 plane, moments = theta[label], blocks.moments[bi, bj]
                 limit = random_variance(sensor, squared) + systematic_variance(sensor, squared)
                 limit *= OUTLIER**2 * moments[COUNT]
-                far = plane.any() and squares_left(moments, plane) > limit
-                record = cells[int(far), _cell_of(layout, label, bi, bj)]
-                middle = (bi * BLOCK + bottom - 1) / 2, (bj * BLOCK + right - 1) / 2
-                _add_block(record, moments, squared, sensor, axis, middle)
-                continue
+                if not plane.any() or squares_left(moments, plane) <= limit:
+                    record = cells[0, _cell_of(layout, label, bi, bj)]
+                    middle = (bi * BLOCK + bottom - 1) / 2, (bj * BLOCK + right - 1) / 2
+                    _add_block(record, moments, squared, sensor, axis, middle)
+                    continue
             for i in range(bi * BLOCK, bottom):
                 for j in range(bj * BLOCK, right):
-                    label, y = np.int32(labels[i, j]), float(inverse[i, j])
+                    label, y = int(labels[i, j]), float(inverse[i, j])
                     if label == 0 or y == 0:
                         continue
                     ray = ray_of(rays, pinhole, i, j)
@@ -272,7 +272,7 @@ def _accumulate(
                     # Seen from one centre, the error is in the inverse range. Otherwise its
                     # direction is unknown, and weights are those of distances from the plane.
                     weight = 1 / (variance if central else squared)
-                    record = cells[int(far), _cell_of(layout, label, bi, bj)]
+                    record = cells[1 if far else 0, _cell_of(layout, label, bi, bj)]
                     _add_pixel(record, float(i), float(j), ray, y, weight)
     return cells
 
