@@ -15,7 +15,6 @@ from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import (
-    is_empty,
     level_of,
     plane_jacobians,
     sandwiches,
@@ -287,8 +286,6 @@ def _expected_square(
     """Mean square distance from a plane, over distance^2, that the sensor's errors make."""
     total = pixels = 0.0
     for cell in cells:
-        if is_empty(cell):
-            continue
         level, count = level_of(cell, theta), cell[COUNT]
         # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
         squared = level * level if level > 0 else 1.0

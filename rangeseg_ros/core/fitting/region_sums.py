@@ -79,7 +79,7 @@ class RegionSums(NamedTuple):
     start : (M + 2,) int
         Where each region's cells begin in `cells`.
     cells : (N, 29) float64
-        See `RECORD`.
+        Those with pixels, see `RECORD`.
     pixels, outliers : (M + 1,) int
         Number of measured pixels, and of those that were left out.
     """
@@ -137,7 +137,9 @@ def sum_regions(
     many = 2 * outliers > measured
     cells += outside * np.repeat(many, np.diff(layout.start))[:, None]
     total += left_out * many[:, None]
-    return RegionSums(layout.box, layout.start, cells, measured, outliers), total
+    kept = cells[:, COUNT] > 0
+    start = np.searchsorted(np.flatnonzero(kept), layout.start)
+    return RegionSums(layout.box, start, cells[kept], measured, outliers), total
 
 
 @njit(cache=True)

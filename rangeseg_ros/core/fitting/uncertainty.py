@@ -26,8 +26,8 @@ from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
 # Standard deviations of a correlation beyond which it is zero.
 _FAR = 5.0
-_FULL = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-"""Entries of an upper triangle in the order of a symmetric matrix."""
+# Rows and columns of an upper triangle, and where its entries are in a symmetric matrix.
+_ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
 class Field(NamedTuple):
@@ -66,7 +66,7 @@ class Cells(NamedTuple):
         """Cells whose planes are at such inverse ranges (N,)."""
         cells = sums.cells
         count = cells[:, COUNT]
-        mean = cells[:, PLACE : PLACE + 4] / np.maximum(count, 1)[:, None]
+        mean = cells[:, PLACE : PLACE + 4] / count[:, None]
         spread = np.maximum(mean[:, 2:] - mean[:, :2] ** 2, 0)
         deviation = np.sqrt(field.constant + field.quartic * level**4)
         ray = deviation[:, None] * cells[:, RAY : RAY + 3]
@@ -105,32 +105,28 @@ def theta_covariances(
     variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
     random = Field(*map(float, (sensor.correlation, *variances)))
     level = levels(sums, theta)
-    weight, count = sums.cells[:, WEIGHT], np.maximum(sums.cells[:, COUNT], 1)
-    mean = weight / count
-    scatter = sums.cells[:, _FULL]
-    ray = sums.cells[:, RAY : RAY + 3]
-    outer = (ray[:, :, None] * ray[:, None]).reshape(-1, 9)
-    centred = scatter - outer / np.maximum(weight, 1e-300)[:, None]
+    weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
+    mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
+    centred = scatter - ray[:, _ROW] * ray[:, _COLUMN] / weight[:, None]
     # Squares of the same scale as the rays: variance times weight.
     white = (1 - smooth) * random_variance(sensor, level**2) * mean
     own = white[:, None] * scatter
-    middle = np.zeros((len(theta), 9))
+    middle = np.zeros((len(theta), 3, 3))
     for field in (random, distortion_field(sensor)):
         if field.constant + field.quartic > 0:
             cells = Cells.of(sums, level, field)
             own += (_within(cells, field.width) * mean)[:, None] * centred
             upper, lower = map_halves(_between, len(theta), sums.start, cells, field.width)
-            middle += (upper + lower).reshape(-1, 9)
-    middle += sum_cells(sums.start, own)
-    return sandwiches(inverse, middle.reshape(-1, 3, 3))
+            middle += upper + lower
+    middle += sum_cells(sums.start, own)[:, _FULL].reshape(-1, 3, 3)
+    return sandwiches(inverse, middle)
 
 
 def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
     plane = np.repeat(theta, np.diff(sums.start), axis=0)
-    total = (plane * sums.cells[:, RAY : RAY + 3]).sum(axis=1)
-    result: NDArray[np.float64] = total / np.maximum(sums.cells[:, WEIGHT], 1e-300)
-    return result
+    total: NDArray[np.float64] = (plane * sums.cells[:, RAY : RAY + 3]).sum(axis=1)
+    return total / sums.cells[:, WEIGHT]
 
 
 def sandwiches(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -195,8 +191,6 @@ def add_common_errors(
     for i in range(*one):
         x = y = z = 0.0
         for j in range(*other):
-            if count[i] == 0 or count[j] == 0:
-                continue
             down = variance + place[i, 2] + place[j, 2]
             across = variance + place[i, 3] + place[j, 3]
             lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
