@@ -157,7 +157,8 @@ MECHANISMS = (
               {'method': 'normals'}, option=True),
     # Planes.
     Mechanism('outliers left out of fits', 'fitting/region_sums.py:_inner_planes',
-              {'fitting.region_sums._inner_planes': lambda _: lambda labels, blocks, count: np.zeros((count, 3))}),
+              {'fitting.region_sums._inner_planes':
+               lambda _: lambda inside, moments, count: np.zeros((count, 3))}),
     Mechanism('parts of a surface found', 'fitting/coplanar.py',
               {'description.planes.common_surfaces':
                lambda _: lambda fits, covariance: np.arange(len(fits.theta))}),
