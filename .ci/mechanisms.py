@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rangeseg_ros.core.by_planes.shifts import Shifts
-from rangeseg_ros.core.fitting.errors import BOTH
 
 
 class Mechanism(NamedTuple):
@@ -87,10 +86,10 @@ def _near_height_zero(_: Any) -> Any:
     return near
 
 
-_DISTORTION = 'fitting/nested.py'
-_CORRELATION = 'fitting/noise.py:_random,_white_and_correlated'
-_TURNING = 'fitting/errors.py:ByTurn,by_turn,_by_turn,turning'
-_NOISE = ('noise', 'nested', 'errors', 'scale', 'alike', 'quantisation')
+_DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
+_CORRELATION = 'fitting/noise.py:_random'
+_TURNING = 'fitting/error_law.py:fit_turning'
+_NOISE = ('noise', 'error_law', 'quantisation')
 _NORMALS = ('method', 'angles', 'normals', 'coarse_to_fine', 'directions')
 # Costs of borders that let nothing merge by the energy.
 _NO_BORDER = _given(4, -1e12)
@@ -113,10 +112,10 @@ MECHANISMS = (
               {'fitting.noise.quantisation': _returning((0.0, 0.0))}),
     Mechanism('noise of directions', _TURNING, _zero('column_noise', 'row_noise')),
     Mechanism('scanners that turn', _TURNING,
-              {'fitting.noise.turning':
-               lambda _: lambda turns, variance, quantile, noise, least: (noise.tilt, BOTH)}),
-    Mechanism('errors in range', 'fitting/errors.py:_likeliest,_deviance',
-              {'fitting.noise.explaining': _given(3, False)}),
+              {'fitting.noise.fit_turning':
+               lambda _: lambda strata, blocks, shown, law: law}),
+    Mechanism('errors in range', 'fitting/error_law.py:_scale_term,_deviance',
+              {'fitting.noise.fit_law': _given(3, False)}),
     # Edges and holes.
     Mechanism('jump edges', 'sensing/jump_edges.py fitting/steps.py',
               {'jump_edges': 'none'}),
@@ -157,8 +156,9 @@ MECHANISMS = (
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),
     # Planes.
-    Mechanism('outliers left out of fits', 'fitting/region_sums.py:_trim',
-              {'fitting.region_sums._trim': lambda _: lambda start, cells, *rest: cells}),
+    Mechanism('outliers left out of fits', 'fitting/region_sums.py:_inner_planes',
+              {'fitting.region_sums._inner_planes':
+               lambda _: lambda inside, moments, count: np.zeros((count, 3))}),
     Mechanism('parts of a surface found', 'fitting/coplanar.py',
               {'description.planes.common_surfaces':
                lambda _: lambda fits, covariance: np.arange(len(fits.theta))}),

@@ -5,7 +5,7 @@ import pytest
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.sensing.blocks import Blocks, slope_of
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
@@ -133,7 +133,7 @@ def test_slopes_and_residuals_are_those_of_the_planes():
     assert blocks.squared[i, j] == pytest.approx((y**2).mean(), rel=1e-6)
     # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
     expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
-    assert slope_of(blocks, i, j, (1.0, 1.0)) == pytest.approx(max(expected, 0), rel=1e-4)
+    assert blocks.across[i, j] + blocks.down[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
 
 
 @pytest.mark.parametrize('theta', [(0.0, 0.0, 0.3), (0.1, -0.8, 0.9), (-0.6, 0.1, 1.5)])

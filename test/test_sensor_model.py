@@ -8,10 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.alike import alike, ranked
-from rangeseg_ros.core.fitting.errors import Errors, explaining
+from rangeseg_ros.core.fitting.error_law import Strata, fit_law
 from rangeseg_ros.core.fitting.noise import measured_sensor
-from rangeseg_ros.core.fitting.scale import Scale
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -38,8 +36,8 @@ def three_planes():
     return inverse
 
 
-def sensor_of(inverse, prior=STATED):
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+def sensor_of(inverse, prior=STATED, camera=CAMERA):
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), camera)
     return measured_sensor(image, Blocks.of(image), prior)
 
 
@@ -98,7 +96,7 @@ def test_directions_err_both_ways_or_one(errors):
     for error, slope in zip(errors, (across, down), strict=True):
         inverse += error * slope * random.normal(size=CAMERA.shape)
     inverse += random.normal(0, 0.0005, CAMERA.shape)
-    sensor = sensor_of(inverse)
+    sensor = sensor_of(inverse, camera=CAMERA if errors[0] == errors[1] else None)
     # Blocks that are compared slope alike to a third or so.
     assert sensor.column_noise == pytest.approx(errors[0], rel=0.3)
     assert sensor.row_noise == pytest.approx(errors[1], rel=0.3)
@@ -106,14 +104,30 @@ def test_directions_err_both_ways_or_one(errors):
 
 @pytest.mark.parametrize(('count', 'told'), [(13, False), (200, False), (1000, True)])
 def test_a_few_blocks_tell_no_kind_of_error(count, told):
-    """Of one set of blocks either kind explains the median, so that rounding would decide."""
-    draw, none = np.random.default_rng(5), Errors(0.0, 0.0, 0.0)
+    """Of one stratum of blocks either kind explains the median, so that rounding would decide."""
+    draw = np.random.default_rng(5)
     for _ in range(200):
-        squared, slope = draw.uniform(0.04, 4, count), np.zeros(count)
-        scale = Scale(np.arange(count), squared, slope, alike(squared, slope))
-        variance = 1e-6 * squared**2 * draw.uniform(0.5, 2, count)
-        found = explaining(scale, variance, 0.5, True, none, none)
-        assert (found.quartic > 0) == told and (found.constant > 0) != told
+        squared, none = draw.uniform(0.04, 4, (1, count)), np.zeros((1, count))
+        blocks = Blocks(none, squared, none, none, none)
+        strata = Strata.of(blocks, np.arange(count), none)
+        shown = strata.medians(1e-6 * squared**2 * draw.uniform(0.5, 2, count))
+        law = fit_law(strata, shown, np.zeros(len(shown)), in_range=True)
+        assert (law.quartic > 0) == told and (law.constant > 0) != told
+
+
+def test_strata_are_ranges_of_equal_size_and_slopes_in_them():
+    draw = np.random.default_rng(6)
+    squared, slope = draw.integers(0, 50, (2, 30, 40)).astype(float)
+    blocks = Blocks(slope, squared, slope, slope, slope)
+    strata = Strata.of(blocks, np.arange(3, 1200), slope)
+    assert strata.blocks.shape == (24, 49) and len(np.unique(strata.blocks)) == strata.blocks.size
+    for key, count in ((squared, 8), (slope, 3)):
+        parts = key.ravel()[strata.blocks].reshape(8, 3, -1)
+        parts = parts.reshape(8, 1, -1).transpose(1, 0, 2) if count == 8 else parts
+        assert (parts[:, :-1].max(axis=2) <= parts[:, 1:].min(axis=2)).all()
+    np.testing.assert_array_equal(
+        strata.medians(slope), np.sort(slope.ravel()[strata.blocks], axis=1)[:, 24]
+    )
 
 
 def test_slopes_explain_no_noise_that_is_of_two_kinds():
@@ -305,20 +319,6 @@ def test_a_patch_is_what_the_mean_of_four_pixels_keeps_of_the_noise(white, width
     field = np.exp(-squared / (4 * width**2)) if width else np.eye(4)
     covariance = white * np.eye(4) + (1 - white) * field
     assert sensor.patch == pytest.approx(4 * covariance.mean(), rel=1e-9)
-
-
-def test_a_ranked_value_is_that_of_a_sort():
-    rng = np.random.default_rng(0)
-    for size in range(1, 60):
-        up = np.arange(float(size))
-        for values in (
-            rng.normal(size=size),
-            rng.integers(0, 4, size).astype(float),
-            np.concatenate([up, up[::-1]]),
-        ):
-            for quantile in (0.0, rng.random(), 1.0):
-                expected = np.sort(values)[int(quantile * (len(values) - 1))]
-                assert ranked(values.copy(), quantile) == expected
 
 
 def test_what_is_said_of_the_errors():

@@ -15,7 +15,6 @@ from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import (
-    is_empty,
     level_of,
     plane_jacobians,
     sandwiches,
@@ -210,9 +209,10 @@ def describe_regions(
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
     cells, start = fits.sums.cells, fits.sums.start
-    normal, distance, covariance, centroid, rms, confidence = _described(
-        cells, start, fits.total, theta, theta_covariance, fits.outlier_share(), fits.sensor
+    normal, distance, centroid, rms, confidence = _described(
+        cells, start, fits.total, theta, fits.outlier_share(), fits.sensor
     )
+    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     if image.place.any():
         # From the sensor to the frame of the points.
         shift = np.eye(4)
@@ -246,11 +246,10 @@ def _described(
     start: NDArray[np.intp],
     total: NDArray[np.float64],
     theta: NDArray[np.float64],
-    theta_covariance: NDArray[np.float64],
     outlier_share: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Normal, distance, covariance, centroid, rms and confidence of regions 0...M; see `Plane`."""
+    """Normal, distance, centroid, rms and confidence of regions 0...M; see `Plane`."""
     regions = len(theta)
     normal, distance = np.zeros((regions, 3)), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
@@ -277,8 +276,7 @@ def _described(
         expected = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
         expected *= distance[k] ** 2
         confidence[k] = (1 - outlier_share[k]) * min(1.0, expected / max(square, 1e-18))
-    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
-    return normal, distance, covariance, centroid, rms, confidence
+    return normal, distance, centroid, rms, confidence
 
 
 @njit(cache=True)
@@ -288,8 +286,6 @@ def _expected_square(
     """Mean square distance from a plane, over distance^2, that the sensor's errors make."""
     total = pixels = 0.0
     for cell in cells:
-        if is_empty(cell):
-            continue
         level, count = level_of(cell, theta), cell[COUNT]
         # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
         squared = level * level if level > 0 else 1.0

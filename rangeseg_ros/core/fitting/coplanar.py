@@ -7,8 +7,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.region_sums import RegionSums
-from rangeseg_ros.core.fitting.uncertainty import Field, common_errors, distortion_field
+from rangeseg_ros.core.fitting.uncertainty import (
+    Cells,
+    add_common_errors,
+    distortion_field,
+    levels,
+)
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.significance import chi2_quantile
 
@@ -47,17 +51,20 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
     field = distortion_field(fits.sensor)
-    return _surfaces(order, fits.sums, fits.theta, fits.inverses(), covariance, field)
+    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), field)
+    start, inverses = fits.sums.start, fits.inverses()
+    return _surfaces(order, start, fits.theta, inverses, covariance, cells, field.width)
 
 
 @njit(cache=True, nogil=True)
 def _surfaces(
     order: NDArray[np.intp],
-    sums: RegionSums,
+    start: NDArray[np.intp],
     theta: NDArray[np.float64],
     inverse: NDArray[np.float64],
     covariance: NDArray[np.float64],
-    field: Field,
+    cells: Cells,
+    width: float,
 ) -> NDArray[np.intp]:
     surface = np.zeros(len(theta), np.intp)
     for rank in range(len(order)):
@@ -70,9 +77,9 @@ def _surfaces(
             both = covariance[k] + covariance[m]
             value = _chi_squared(theta[k] - theta[m], both)
             if value <= _LIMIT:
-                cells_k = sums.cells[sums.start[k] : sums.start[k + 1]]
-                cells_m = sums.cells[sums.start[m] : sums.start[m + 1]]
-                common = common_errors(cells_k, theta[k], cells_m, theta[m], field)
+                common = np.zeros((3, 3))
+                own, other = (start[k], start[k + 1]), (start[m], start[m + 1])
+                add_common_errors(cells, own, other, width, common)
                 common = _product(_product(inverse[k], common), inverse[m])
                 value = _chi_squared(theta[k] - theta[m], both - common - common.T)
             if value < least:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import (
@@ -98,26 +97,15 @@ class Fits(NamedTuple):
 
     def inverses(self) -> NDArray[np.float64]:
         """Inverses (M + 1, 3, 3) of the sums of w r r^T; zeros where there is no plane."""
-        return _inverses(self.total, self.theta)
+        known = self.theta.any(axis=1)
+        *entries, determinant = cofactors(*self.total[:, :6].T)
+        inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+        inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
+        return inverse.reshape(-1, 3, 3)
 
     def covariances(self) -> NDArray[np.float64]:
         """Covariances of theta, (M + 1, 3, 3)."""
         return theta_covariances(self.sums, self.theta, self.inverses(), self.sensor)
-
-
-@njit(cache=True)
-def _inverses(total: NDArray[np.float64], theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    inverse = np.zeros((len(theta), 3, 3))
-    for k in range(len(theta)):
-        if theta[k].any():
-            a, b, c, d, e, f = total[k, :6]
-            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-            inverse[k, 0, 0], inverse[k, 1, 1], inverse[k, 2, 2] = aa, dd, ff
-            inverse[k, 0, 1] = inverse[k, 1, 0] = bb
-            inverse[k, 0, 2] = inverse[k, 2, 0] = cc
-            inverse[k, 1, 2] = inverse[k, 2, 1] = ee
-            inverse[k] /= determinant
-    return inverse
 
 
 def _total_least_squares(

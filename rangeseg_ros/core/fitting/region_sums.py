@@ -19,6 +19,7 @@ from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
     NO_PIXEL,
+    SIZE,
     fit,
     plus_pixel,
     squares_left,
@@ -42,16 +43,30 @@ class Layout(NamedTuple):
     ----------
     box : (M + 1, 4) int
         First row and column of each region, and the ones after its last; zeros without pixels.
-    size, columns : (M + 1,) int
-        Rows and columns of a cell, and cells side by side.
+    side, columns : (M + 1,) int
+        Blocks along the side of a cell, and cells side by side.
     start : (M + 2,) int
         Where each region's cells begin.
     """
 
     box: NDArray[np.intp]
-    size: NDArray[np.intp]
+    side: NDArray[np.intp]
     columns: NDArray[np.intp]
     start: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, labels: NDArray[np.uint16]) -> Layout:
+        """Cells of whole blocks for the regions of labels (H, W), as small as may be."""
+        upper, lower = map_halves(_find_boxes, len(labels), labels, int(labels.max(initial=0)) + 1)
+        first, after = np.minimum(upper, lower)[:, :2], np.maximum(upper, lower)[:, 2:]
+        first[after[:, 0] == 0] = 0
+        rows, across = (-(-after // BLOCK) - first // BLOCK).T
+        side = np.maximum(np.sqrt(rows * across / MAX_CELLS).astype(np.intp), 1)
+        while (many := -(-rows // side) * -(-across // side) > MAX_CELLS).any():
+            side += many
+        columns = -(-across // side)
+        start = np.concatenate([[0], np.cumsum(-(-rows // side) * columns)])
+        return cls(np.hstack([first, after]), side, columns, start)
 
 
 class RegionSums(NamedTuple):
@@ -64,9 +79,9 @@ class RegionSums(NamedTuple):
     start : (M + 2,) int
         Where each region's cells begin in `cells`.
     cells : (N, 29) float64
-        See `RECORD`.
+        Those with pixels, see `RECORD`.
     pixels, outliers : (M + 1,) int
-        Number of measured pixels, and of those beyond four standard deviations.
+        Number of measured pixels, and of those that were left out.
     """
 
     box: NDArray[np.intp]
@@ -88,9 +103,9 @@ def sum_regions(
 ) -> tuple[RegionSums, NDArray[np.float64]]:
     """Sum up the measured pixels of regions, but for outliers from their least-squares planes.
 
-    Outliers are beyond four standard deviations of the sensor's errors from the plane of all
-    pixels. A region keeps them where they are more than half of it: it is then the sensor model
-    that does not fit, or no plane.
+    Outliers are beyond four standard deviations of the sensor's errors from the plane of the
+    blocks that the region fills. It keeps them where they are more than half of it: it is then
+    the sensor model that does not fit, or no plane.
 
     Parameters
     ----------
@@ -108,24 +123,23 @@ def sum_regions(
     total : (M + 1, 29) float64
         Sums over the cells of each region.
     """
-    count = int(labels.max(initial=0)) + 1
-    layout = Layout(*_lay_out(*map_halves(_find_boxes, len(labels), labels, count)))
+    layout = Layout.of(labels)
+    inside = _labels_of_blocks(labels)
     axis = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
-    pixels = image.inverse, image.rays, image.pinhole, image.camera is not None, axis
-    rows = len(blocks.squared)
-
-    def accumulate(theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        given = labels, *pixels, blocks, sensor, layout, theta
-        (upper, out), (lower, also_out) = map_halves(_accumulate, rows, *given)
-        return upper + lower, out + also_out
-
-    cells, _ = accumulate(np.zeros((count, 3)))
-    total = _totals(layout.start, cells)
-    trimmed, outliers = accumulate(fit_sums(total))
-    measured = total[:, COUNT].astype(np.intp)
-    cells = _trim(layout.start, cells, trimmed, 2 * outliers <= measured)
-    sums = RegionSums(layout.box, layout.start, cells, measured, outliers)
-    return sums, _totals(layout.start, cells)
+    pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
+    planes = _inner_planes(inside, blocks.moments, len(layout.box))
+    given = *pixels, axis, blocks, sensor, layout, planes
+    upper, lower = map_halves(_accumulate, len(inside), *given)
+    cells, outside = upper + lower
+    total, left_out = sum_cells(layout.start, cells), sum_cells(layout.start, outside)
+    outliers = left_out[:, COUNT].astype(np.intp)
+    measured = total[:, COUNT].astype(np.intp) + outliers
+    many = 2 * outliers > measured
+    cells += outside * np.repeat(many, np.diff(layout.start))[:, None]
+    total += left_out * many[:, None]
+    kept = cells[:, COUNT] > 0
+    start = np.searchsorted(np.flatnonzero(kept), layout.start)
+    return RegionSums(layout.box, start, cells[kept], measured, outliers), total
 
 
 @njit(cache=True)
@@ -138,56 +152,71 @@ def fit_sums(total: NDArray[np.float64]) -> NDArray[np.float64]:
     return theta
 
 
+@njit(cache=True)
+def sum_cells(start: NDArray[np.intp], cells: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums (M + 1, K) over the cells (N, K) of each region."""
+    total = np.zeros((len(start) - 1, cells.shape[1]))
+    for k in range(len(total)):
+        for c in range(start[k], start[k + 1]):
+            total[k] += cells[c]
+    return total
+
+
 @njit(cache=True, nogil=True)
 def _find_boxes(
     first: int, after: int, labels: NDArray[np.uint16], count: int
 ) -> NDArray[np.intp]:
-    """Bounding boxes (count, 4) of the regions in some rows; zeros without pixels."""
-    width = labels.shape[1]
+    """Bounding boxes (count, 4) of the regions in some rows, see `Layout`."""
+    height, width = labels.shape
     box = np.zeros((count, 4), np.intp)
+    box[:, 0], box[:, 1] = height, width
     for i in range(first, after):
         begin = 0
         for j in range(1, width + 1):
             if j < width and labels[i, j] == labels[i, begin]:
                 continue
             label = labels[i, begin]
-            if box[label, 2] == 0:
-                box[label, 0], box[label, 1] = i, begin
-            box[label, 1], box[label, 2] = min(box[label, 1], begin), i + 1
-            box[label, 3] = max(box[label, 3], j)
+            box[label, 0], box[label, 1] = min(box[label, 0], i), min(box[label, 1], begin)
+            box[label, 2], box[label, 3] = i + 1, max(box[label, 3], j)
             begin = j
     box[0] = 0
     return box
 
 
-@njit(cache=True)
-def _lay_out(box: NDArray[np.intp], lower: NDArray[np.intp]) -> tuple[NDArray[np.intp], ...]:
-    """Fields of the `Layout`: cells for the boxes of regions in both halves of an image."""
-    count = len(box)
-    size, columns = np.full(count, BLOCK), np.zeros(count, np.intp)
-    start = np.zeros(count + 1, np.intp)
-    for k in range(count):
-        if box[k, 2] == 0:
-            box[k] = lower[k]
-        elif lower[k, 2] > 0:
-            box[k, 1] = min(box[k, 1], lower[k, 1])
-            box[k, 2], box[k, 3] = lower[k, 2], max(box[k, 3], lower[k, 3])
-        top, left = box[k, 0] // BLOCK, box[k, 1] // BLOCK
-        rows, across = -(-box[k, 2] // BLOCK) - top, -(-box[k, 3] // BLOCK) - left
-        side = max(int(np.sqrt(rows * across / MAX_CELLS)), 1)
-        while -(-rows // side) * -(-across // side) > MAX_CELLS:
-            side += 1
-        size[k], columns[k] = side * BLOCK, -(-across // side)
-        start[k + 1] = start[k] + (-(-rows // side)) * columns[k]
-    return box, size, columns, start
+@njit(cache=True, nogil=True)
+def _labels_of_blocks(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
+    """Labels (rows, columns) of all pixels of each block; -1 where they have several."""
+    height, width = labels.shape
+    result = np.empty((-(-height // BLOCK), -(-width // BLOCK)), np.int32)
+    for bi in range(result.shape[0]):
+        for bj in range(result.shape[1]):
+            label = labels[bi * BLOCK, bj * BLOCK]
+            unlike = label ^ label
+            for i in range(bi * BLOCK, min((bi + 1) * BLOCK, height)):
+                for j in range(bj * BLOCK, min((bj + 1) * BLOCK, width)):
+                    unlike |= labels[i, j] ^ label
+            result[bi, bj] = label if unlike == 0 else -1
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _inner_planes(
+    inside: NDArray[np.int32], moments: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Planes (count, 3) of the blocks that regions fill; zeros where these do not tell one."""
+    sums = np.zeros((count, SIZE))
+    for bi in range(inside.shape[0]):
+        for bj in range(inside.shape[1]):
+            if inside[bi, bj] > 0:
+                sums[inside[bi, bj]] += moments[bi, bj]
+    return fit_sums(sums)
 
 
 @njit(cache=True, inline='always')
 def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
     """Cell of a region's pixels in a block: cells consist of whole blocks."""
-    side = layout.size[label] // BLOCK
-    row = (bi - layout.box[label, 0] // BLOCK) // side
-    column = (bj - layout.box[label, 1] // BLOCK) // side
+    row = (bi - layout.box[label, 0] // BLOCK) // layout.side[label]
+    column = (bj - layout.box[label, 1] // BLOCK) // layout.side[label]
     return layout.start[label] + row * layout.columns[label] + column
 
 
@@ -196,6 +225,7 @@ def _accumulate(
     first: int,
     after: int,
     labels: NDArray[np.uint16],
+    inside: NDArray[np.int32],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     pinhole: bool,
@@ -205,49 +235,33 @@ def _accumulate(
     sensor: SensorModel,
     layout: Layout,
     theta: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-    """Sums (N, 29) over the pixels in some rows of blocks, and numbers (M + 1,) of outliers.
+) -> NDArray[np.float64]:
+    """Sums (2, N, 29) over the pixels in some rows of blocks: of inliers of `theta`, of outliers.
 
-    Without outliers of `theta` (M + 1, 3); of regions whose plane is zero all pixels count.
+    Of regions whose plane (M + 1, 3) is zero there are no outliers.
     """
     height, width = labels.shape
-    cells = np.zeros((layout.start[-1], RECORD))
-    outliers = np.zeros(len(theta), np.intp)
+    cells = np.zeros((2, layout.start[-1], RECORD))
     for bi in range(first, after):
         bottom = min((bi + 1) * BLOCK, height)
-        for bj in range(blocks.squared.shape[1]):
-            right = min((bj + 1) * BLOCK, width)
-            label, squared = labels[bi * BLOCK, bj * BLOCK], blocks.squared[bi, bj]
-            if squared == 0:
+        for bj in range(inside.shape[1]):
+            right, squared = min((bj + 1) * BLOCK, width), blocks.squared[bi, bj]
+            label = int(inside[bi, bj])
+            if squared == 0 or label == 0:
                 continue
-            unlike = label ^ label
-            for i in range(bi * BLOCK, bottom):
-                for j in range(bj * BLOCK, right):
-                    unlike |= labels[i, j] ^ label
-            if unlike == 0:
-                if label == 0:
-                    continue
-                variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+            # Rays of a cloud are not of one length along any axis: their sums are not known.
+            if central and label > 0:
                 plane, moments = theta[label], blocks.moments[bi, bj]
-                limit = OUTLIER**2 * variance
-                # No pixel is farther off than all together.
-                explained = not plane.any() or squares_left(moments, plane) <= limit
-                if central and not explained:
-                    explained = True
-                    for i in range(bi * BLOCK, bottom):
-                        for j in range(bj * BLOCK, right):
-                            ray, y = ray_of(rays, pinhole, i, j), float(inverse[i, j])
-                            left = y - plane[0] * ray[0] - plane[1] * ray[1] - plane[2] * ray[2]
-                            explained &= (left * left <= limit) | (y == 0)
-                # Rays of a cloud are not of one length along any axis: their sums are not known.
-                if central and explained:
-                    record = cells[_cell_of(layout, label, bi, bj)]
+                limit = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+                limit *= OUTLIER**2 * moments[COUNT]
+                if not plane.any() or squares_left(moments, plane) <= limit:
+                    record = cells[0, _cell_of(layout, label, bi, bj)]
                     middle = (bi * BLOCK + bottom - 1) / 2, (bj * BLOCK + right - 1) / 2
                     _add_block(record, moments, squared, sensor, axis, middle)
                     continue
             for i in range(bi * BLOCK, bottom):
                 for j in range(bj * BLOCK, right):
-                    label, y = labels[i, j], float(inverse[i, j])
+                    label, y = int(labels[i, j]), float(inverse[i, j])
                     if label == 0 or y == 0:
                         continue
                     ray = ray_of(rays, pinhole, i, j)
@@ -256,15 +270,13 @@ def _accumulate(
                     variance = random_variance(sensor, squared)
                     left = y - a * ray[0] - b * ray[1] - c * ray[2]
                     limit = OUTLIER**2 * (variance + systematic_variance(sensor, squared))
-                    if (a != 0 or b != 0 or c != 0) and left * left > limit:
-                        outliers[label] += 1
-                        continue
+                    far = (a != 0 or b != 0 or c != 0) and left * left > limit
                     # Seen from one centre, the error is in the inverse range. Otherwise its
                     # direction is unknown, and weights are those of distances from the plane.
                     weight = 1 / (variance if central else squared)
-                    record = cells[_cell_of(layout, label, bi, bj)]
+                    record = cells[1 if far else 0, _cell_of(layout, label, bi, bj)]
                     _add_pixel(record, float(i), float(j), ray, y, weight)
-    return cells, outliers
+    return cells
 
 
 @njit(cache=True, inline='always')
@@ -320,27 +332,3 @@ def _add_block(
     for entry in range(2):
         record[PLACE + entry] += count * middle[entry]
         record[PLACE + 2 + entry] += count * (middle[entry] ** 2 + spread)
-
-
-@njit(cache=True)
-def _trim(
-    start: NDArray[np.intp],
-    cells: NDArray[np.float64],
-    trimmed: NDArray[np.float64],
-    few: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Cells `trimmed` of the regions that have `few` outliers, and all pixels of the others."""
-    for k in range(len(few)):
-        if few[k]:
-            cells[start[k] : start[k + 1]] = trimmed[start[k] : start[k + 1]]
-    return cells
-
-
-@njit(cache=True)
-def _totals(start: NDArray[np.intp], cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums over the cells of each region, (M + 1, 29)."""
-    total = np.zeros((len(start) - 1, RECORD))
-    for k in range(len(total)):
-        for c in range(start[k], start[k + 1]):
-            total[k] += cells[c]
-    return total

@@ -19,16 +19,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
+from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, sum_cells
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
 # Standard deviations of a correlation beyond which it is zero.
 _FAR = 5.0
-# Of a row of `field_units`: mean row and column, their variances, pixels, the deviation and the
-# weighted ray (3) times it.
-_UNIT = 9
+# Rows and columns of an upper triangle, and where its entries are in a symmetric matrix.
+_ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
 class Field(NamedTuple):
@@ -40,6 +39,38 @@ class Field(NamedTuple):
     width: float
     constant: float
     quartic: float
+
+
+class Cells(NamedTuple):
+    """Cells of regions as a field sees them; see `RegionSums` for which are whose.
+
+    Attributes
+    ----------
+    place : (N, 4) float64
+        Mean row and column of the pixels, and their variances.
+    pixels : (N,) float64
+        Number of them.
+    ray : (N, 3) float64
+        Sum of the weighted rays, times the standard deviation of the field.
+    deviation : (N,) float64
+        That deviation.
+    """
+
+    place: NDArray[np.float64]
+    pixels: NDArray[np.float64]
+    ray: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, sums: RegionSums, level: NDArray[np.float64], field: Field) -> Cells:
+        """Cells whose planes are at such inverse ranges (N,)."""
+        cells = sums.cells
+        count = cells[:, COUNT]
+        mean = cells[:, PLACE : PLACE + 4] / count[:, None]
+        spread = np.maximum(mean[:, 2:] - mean[:, :2] ** 2, 0)
+        deviation = np.sqrt(field.constant + field.quartic * level**4)
+        ray = deviation[:, None] * cells[:, RAY : RAY + 3]
+        return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation)
 
 
 def distortion_field(sensor: SensorModel) -> Field:
@@ -73,217 +104,108 @@ def theta_covariances(
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
     random = Field(*map(float, (sensor.correlation, *variances)))
-    fields = random, distortion_field(sensor)
-    result = np.zeros_like(inverse)
-    map_halves(_covariances, len(theta), sums, theta, inverse, sensor, 1 - smooth, *fields, result)
-    return result
+    level = levels(sums, theta)
+    weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
+    mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
+    centred = scatter - ray[:, _ROW] * ray[:, _COLUMN] / weight[:, None]
+    # Squares of the same scale as the rays: variance times weight.
+    white = (1 - smooth) * random_variance(sensor, level**2) * mean
+    own = white[:, None] * scatter
+    middle = np.zeros((len(theta), 3, 3))
+    for field in (random, distortion_field(sensor)):
+        if field.constant + field.quartic > 0:
+            cells = Cells.of(sums, level, field)
+            own += (_within(cells, field.width) * mean)[:, None] * centred
+            upper, lower = map_halves(_between, len(theta), sums.start, cells, field.width)
+            middle += upper + lower
+    middle += sum_cells(sums.start, own)[:, _FULL].reshape(-1, 3, 3)
+    return sandwiches(inverse, middle)
 
 
-@njit(cache=True, nogil=True)
+def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
+    plane = np.repeat(theta, np.diff(sums.start), axis=0)
+    total: NDArray[np.float64] = (plane * sums.cells[:, RAY : RAY + 3]).sum(axis=1)
+    return total / sums.cells[:, WEIGHT]
+
+
 def sandwiches(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """outer middle outer^T, (N, m, m), of `outer` (N, m, 3) and covariances `middle` (N, 3, 3)."""
-    result = np.empty((len(outer), outer.shape[1], outer.shape[1]))
-    for k in range(len(outer)):
-        sandwich(outer[k], middle[k], result[k])
+    """outer middle outer^T, (N, m, m), of `outer` (N, m, 3) and covariances `middle` (N, 3, 3).
+
+    By a root of it, so that no rounding that `outer` magnifies makes a variance negative. What
+    rounding has made of directions without variance is left out.
+    """
+    values, vectors = np.linalg.eigh(middle)
+    along = outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None])
+    result: NDArray[np.float64] = (along[:, :, None] * along[:, None]).sum(axis=3)
     return result
 
 
-@njit(cache=True)
-def sandwich(
-    outer: NDArray[np.float64], middle: NDArray[np.float64], result: NDArray[np.float64]
-) -> None:
-    """outer middle outer^T, to `result` (m, m), of `outer` (m, 3) and a covariance (3, 3).
-
-    By a root of it, so that no rounding that `outer` magnifies makes a variance negative.
-    """
-    root = _root(middle)
-    along = np.zeros((len(outer), 3))
-    for a in range(len(outer)):
-        for b in range(3):
-            for c in range(3):
-                along[a, b] += outer[a, c] * root[c, b]
-    for a in range(len(outer)):
-        for b in range(a, len(outer)):
-            result[a, b] = result[b, a] = (along[a] * along[b]).sum()
-
-
-@njit(cache=True)
-def _root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A matrix that makes a covariance (3, 3) times its transpose (Cholesky, with pivots).
-
-    What rounding has made of directions without variance is left out.
-    """
-    left, root = covariance.copy(), np.zeros((3, 3))
-    for step in range(3):
-        pivot = 0
-        for a in range(1, 3):
-            if left[a, a] > left[pivot, pivot]:
-                pivot = a
-        if left[pivot, pivot] <= 0:
-            break
-        scale = 1 / np.sqrt(left[pivot, pivot])
-        for a in range(3):
-            root[a, step] = scale * left[a, pivot]
-        for a in range(3):
-            for b in range(3):
-                left[a, b] -= root[a, step] * root[b, step]
-        for a in range(3):
-            left[a, pivot] = left[pivot, a] = 0
-    return root
-
-
-@njit(cache=True)
 def plane_jacobians(
     normal: NDArray[np.float64], distance: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Derivative (N, 4, 3) of (normal, distance) by theta = -normal / distance."""
-    jacobian = np.empty((len(normal), 4, 3))
-    for k in range(len(normal)):
-        for a in range(3):
-            for b in range(3):
-                tangent = (1.0 if a == b else 0.0) - normal[k, a] * normal[k, b]
-                jacobian[k, a, b] = -distance[k] * tangent
-            jacobian[k, 3, a] = distance[k] ** 2 * normal[k, a]
-    return jacobian
+    tangent = np.eye(3) - normal[:, :, None] * normal[:, None]
+    along = distance[:, None, None] ** 2 * normal[:, None]
+    return np.concatenate([-distance[:, None, None] * tangent, along], axis=1)
+
+
+def _within(cells: Cells, width: float) -> NDArray[np.float64]:
+    """Variance (N,) by which a field varies in cells, as far as it is narrower than they are."""
+    variance, spread = 2 * width**2, cells.place[:, 2:]
+    total = np.maximum((variance + 2 * spread).prod(axis=1), 1e-300)
+    alike = np.maximum(cells.pixels * variance / np.sqrt(total), 1)
+    mean = spread.mean(axis=1)
+    share = mean / np.maximum(variance + mean, 1e-300)
+    result: NDArray[np.float64] = share * alike * cells.deviation**2
+    return result
 
 
 @njit(cache=True, nogil=True)
-def _covariances(
-    first: int,
-    after: int,
-    sums: RegionSums,
-    theta: NDArray[np.float64],
-    inverse: NDArray[np.float64],
-    sensor: SensorModel,
-    white: float,
-    random: Field,
-    distortion: Field,
-    result: NDArray[np.float64],
-) -> None:
-    """What `theta_covariances` returns, of the regions from the first to before the second."""
-    for k in range(max(first, 1), after):
-        if not theta[k].any():
-            continue
-        cells = sums.cells[sums.start[k] : sums.start[k + 1]]
-        middle = np.zeros((3, 3))
-        for c in range(len(cells)):
-            if is_empty(cells[c]):
-                continue
-            # Squares of the same scale as the rays: variance times weight.
-            variance = white * random_variance(sensor, level_of(cells[c], theta[k]) ** 2)
-            _add_symmetric(middle, cells[c], variance * cells[c, WEIGHT] / cells[c, COUNT], False)
-        for field in (random, distortion):
-            if field.constant + field.quartic > 0:
-                _add_field(middle, cells, theta[k], field)
-        sandwich(inverse[k], middle, result[k])
-
-
-@njit(cache=True)
-def _add_symmetric(
-    middle: NDArray[np.float64], cell: NDArray[np.float64], factor: float, centred: bool
-) -> None:
-    """Add so many times the sum of w r r^T of a cell, around its mean ray where `centred`."""
-    entry = 0
-    for a in range(3):
-        for b in range(a, 3):
-            value = cell[entry]
-            if centred:
-                value -= cell[RAY + a] * cell[RAY + b] / cell[WEIGHT]
-            middle[a, b] += factor * value
-            if a != b:
-                middle[b, a] += factor * value
-            entry += 1
-
-
-@njit(cache=True)
-def _add_field(
-    middle: NDArray[np.float64],
-    cells: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    field: Field,
-) -> None:
-    """Add the sum over pairs of pixels of a region."""
-    middle += common_errors(cells, theta, cells, theta, field)
-    variance = 2 * field.width**2
-    for c in range(len(cells)):
-        if is_empty(cells[c]):
-            continue
-        # Within a cell the error varies as far as the field is narrower.
-        unit = np.empty(_UNIT)
-        _fill_unit(unit, cells[c], theta, field)
-        spread = (unit[2] + unit[3]) / 2
-        alike = unit[4] * _mean_correlation(unit, unit, field.width)
-        share = spread / (variance + spread) if spread > 0 else 0.0
-        mean = cells[c, WEIGHT] / cells[c, COUNT]
-        _add_symmetric(middle, cells[c], share * alike * unit[5] ** 2 * mean, True)
-
-
-@njit(cache=True)
-def common_errors(
-    cells_a: NDArray[np.float64],
-    theta_a: NDArray[np.float64],
-    cells_b: NDArray[np.float64],
-    theta_b: NDArray[np.float64],
-    field: Field,
+def _between(
+    first: int, after: int, start: NDArray[np.intp], cells: Cells, width: float
 ) -> NDArray[np.float64]:
-    """Sum over pairs of pixels (3, 3), the first of region a, the second of b: of cells' means."""
-    units_a, units_b = _units(cells_a, theta_a, field), _units(cells_b, theta_b, field)
-    result, seen = np.zeros((3, 3)), np.zeros(3)
-    for i in range(len(units_a)):
-        seen[:] = 0
-        for j in range(len(units_b)):
-            correlation = _mean_correlation(units_a[i], units_b[j], field.width)
-            if correlation > 0:
-                for p in range(3):
-                    seen[p] += correlation * units_b[j, 6 + p]
-        for p in range(3):
-            for q in range(3):
-                result[p, q] += units_a[i, 6 + p] * seen[q]
+    """Sums over pairs of cells (M + 1, 3, 3), of regions from the first to before the second."""
+    result = np.zeros((len(start) - 1, 3, 3))
+    for k in range(first, after):
+        own = start[k], start[k + 1]
+        add_common_errors(cells, own, own, width, result[k])
     return result
 
 
 @njit(cache=True)
-def _units(
-    cells: NDArray[np.float64], theta: NDArray[np.float64], field: Field
-) -> NDArray[np.float64]:
-    """Cells as a field sees them, (N, 9), see `_UNIT`."""
-    units, count = np.empty((len(cells), _UNIT)), 0
-    for c in range(len(cells)):
-        if not is_empty(cells[c]):
-            _fill_unit(units[count], cells[c], theta, field)
-            count += 1
-    return units[:count]
-
-
-@njit(cache=True, inline='always')
-def _fill_unit(
-    unit: NDArray[np.float64],
-    cell: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    field: Field,
+def add_common_errors(
+    cells: Cells,
+    one: tuple[int, int],
+    other: tuple[int, int],
+    width: float,
+    result: NDArray[np.float64],
 ) -> None:
-    count = cell[COUNT]
-    for axis in range(2):
-        unit[axis] = cell[PLACE + axis] / count
-        unit[2 + axis] = max(cell[PLACE + 2 + axis] / count - unit[axis] ** 2, 0.0)
-    unit[4] = count
-    unit[5] = np.sqrt(field.constant + field.quartic * level_of(cell, theta) ** 4)
-    for p in range(3):
-        unit[6 + p] = unit[5] * cell[RAY + p]
+    """Add the sum over pairs of pixels to `result` (3, 3): of the means of cells.
 
-
-@njit(cache=True, inline='always')
-def _mean_correlation(one: NDArray[np.float64], other: NDArray[np.float64], width: float) -> float:
-    """Mean correlation between the pixels of two cells; 0 where they are far apart."""
+    The first pixel is in cells from the first of `one` to before its second, the second one in
+    those of `other`.
+    """
     variance = 2 * width**2
-    down, across = variance + one[2] + other[2], variance + one[3] + other[3]
-    lag = (one[0] - other[0]) ** 2 / max(down, 1e-300)
-    lag += (one[1] - other[1]) ** 2 / max(across, 1e-300)
-    if lag > _FAR**2:
-        return 0.0
-    mean = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
-    # A pixel agrees with itself.
-    return mean if lag > 0 else max(mean, 1 / min(one[4], other[4]))
+    place, count, ray = cells.place, cells.pixels, cells.ray
+    for i in range(*one):
+        x = y = z = 0.0
+        for j in range(*other):
+            down = variance + place[i, 2] + place[j, 2]
+            across = variance + place[i, 3] + place[j, 3]
+            lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
+            lag += (place[i, 1] - place[j, 1]) ** 2 / max(across, 1e-300)
+            if lag > _FAR**2:
+                continue
+            alike = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
+            if lag == 0:
+                # A pixel agrees with itself.
+                alike = max(alike, 1 / min(count[i], count[j]))
+            x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
+        for p in range(3):
+            result[p, 0] += ray[i, p] * x
+            result[p, 1] += ray[i, p] * y
+            result[p, 2] += ray[i, p] * z
 
 
 @njit(cache=True)

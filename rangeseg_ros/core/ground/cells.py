@@ -99,9 +99,7 @@ def cells_of(
         place = np.tensordot(axes_of(up).astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
         # The median: a cell on a jump edge scatters by more than noise.
-        variance = np.maximum(
-            random_variance.py_func(sensor, inverse**2), cv2.medianBlur(scatter[0], 5)
-        )
+        variance = np.maximum(random_variance(sensor, inverse**2), cv2.medianBlur(scatter[0], 5))
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
     whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white

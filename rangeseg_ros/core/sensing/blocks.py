@@ -74,12 +74,6 @@ class Blocks(NamedTuple):
         return cls(moments, *(np.empty((rows, columns)) for _ in range(4)))
 
 
-@njit(cache=True, inline='always')
-def slope_of(blocks: Blocks, i: int, j: int, way: tuple[float, float]) -> Any:
-    """Sum of so much of the squared slopes of a block along the row and down the column."""
-    return way[0] * blocks.across[i, j] + way[1] * blocks.down[i, j]
-
-
 @njit(cache=True, nogil=True)
 def _sum_pixels(
     first: int,
@@ -126,17 +120,6 @@ def _sum_blocks(
             for i in range(2 * bi, min(2 * bi + 2, len(moments))):
                 add_moments(lanes, moments[i, 2 * begin :])
             _store(bi, begin, lanes, rays, size, blocks)
-
-
-@njit(cache=True, nogil=True)
-def merged_alone(blocks: Blocks, rays: NDArray[np.float32], size: int) -> Blocks:
-    """What `Blocks.merged` returns, for kernels and on one thread."""
-    rows, columns = (blocks.squared.shape[0] + 1) // 2, (blocks.squared.shape[1] + 1) // 2
-    shape = rows, columns
-    squared, across, down = np.empty(shape), np.empty(shape), np.empty(shape)
-    result = Blocks(np.empty((rows, columns, SIZE)), squared, across, down, np.empty(shape))
-    _sum_blocks(0, rows, blocks.moments, rays, size, result)
-    return result
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

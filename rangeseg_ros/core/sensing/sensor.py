@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA, Config
@@ -187,7 +188,7 @@ def distortion_share(pixels: float, smooth: float) -> float:
 FLOOR = 1e-12
 
 
-@njit(cache=True, inline='always')
+@register_jitable(inline='always')
 def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
     """Variance of the random error at the square of an inverse range, (1/m)^2.
 
@@ -196,13 +197,13 @@ def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -
     return FLOOR + sensor.noise**2 + (sensor.range_noise * squared) ** 2
 
 
-@njit(cache=True, inline='always')
-def tilt_variance(sensor: SensorModel, across: float, down: float) -> Any:
+@register_jitable(inline='always')
+def tilt_variance(sensor: SensorModel, across: Any, down: Any) -> Any:
     """Variance that errors of direction add where the squared slopes are these, (1/m)^2."""
     return sensor.column_noise**2 * across + sensor.row_noise**2 * down
 
 
-@njit(cache=True, inline='always')
+@register_jitable(inline='always')
 def systematic_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -> Any:
     """Variance of the systematic error at the square of an inverse range, (1/m)^2."""
     return sensor.distortion**2 + (sensor.range_distortion * squared) ** 2
