@@ -91,7 +91,7 @@ _DISTORTION = 'fitting/nested.py'
 _CORRELATION = 'fitting/noise.py:_random,_white_and_correlated'
 _TURNING = 'fitting/errors.py:ByTurn,by_turn,_by_turn,turning'
 _NOISE = ('noise', 'nested', 'errors', 'scale', 'alike', 'quantisation')
-_NORMALS = ('method', 'angles', 'normals', 'coarse_to_fine', 'directions')
+_NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
 # Costs of borders that let nothing merge by the energy.
 _NO_BORDER = _given(4, -1e12)
 
