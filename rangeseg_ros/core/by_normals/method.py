@@ -72,8 +72,8 @@ def segment(
     """
     normals = observed_normals(image, grid, config)
     lap('normals')
-    labels_of = directions(config.directions, config.direction_count, config.seed)
-    labels_of = (labels_of @ image.axes.T).astype(np.float32)
+    unturned = directions(config.directions, config.direction_count, config.seed)
+    labels_of = (unturned @ image.axes.T).astype(np.float32)
     problem = normals, labels_of, grid, config.smoothness
     if config.exact:
         labels = minimise_exactly(*problem, config.moves, config.cycles)

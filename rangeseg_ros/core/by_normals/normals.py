@@ -152,8 +152,8 @@ def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
 def _means(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
     """Means (H, W, n) over windows, as if 0 outside the image."""
     size = 2 * radius + 1, 2 * radius + 1
-    means: NDArray[np.float64] = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
-    return means
+    means = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(means, np.float64)
 
 
 def _towards_sensor(
