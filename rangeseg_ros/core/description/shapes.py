@@ -32,10 +32,14 @@ class Shapes:
         Of the regions.
     place : (3,) float64
         Of the sensor in the frame of the image.
+    right : (3,) float64
+        To the right in the image: the longer axes point there.
     """
 
-    def __init__(self, outlines: list[Outline], place: NDArray[np.float64]) -> None:
-        self._outlines, self._place = outlines, place
+    def __init__(
+        self, outlines: list[Outline], place: NDArray[np.float64], right: NDArray[np.float64]
+    ) -> None:
+        self._outlines, self._place, self._right = outlines, place, right
 
     def __getitem__(self, number: int) -> Shape:
         return self._shapes[number]
@@ -45,7 +49,7 @@ class Shapes:
         # Contours cut the corners between pixels, and those of clouds run through the middles of
         # pixels: all pixels of a region have the mean area of those that its contours enclose.
         rectangles = [
-            _rectangle(*outline.corners(), outline.theta, outline.farthest)
+            _rectangle(*outline.corners(), outline.theta, outline.farthest, self._right)
             for outline in self._outlines
         ]
         pixels = [cv2.countNonZero(outline.mask.view(np.uint8)) for outline in self._outlines]
@@ -75,6 +79,7 @@ def _rectangle(
     ring: NDArray[np.intp],
     theta: NDArray[np.float64],
     farthest: float,
+    right: NDArray[np.float64],
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Rectangle around a polygon, along the principal axes of its area.
 
@@ -82,7 +87,7 @@ def _rectangle(
     ----------
     places : (N, 2) float64
         Corners of all rings in the image, (x, y), one ring after the other; holes run the other
-        way round. The longer axis points to the right of the image.
+        way round.
     rays : (N, 3) float64
         Of the corners.
     ring : (N,) int
@@ -91,6 +96,8 @@ def _rectangle(
         Plane, theta . ray = inverse range.
     farthest : float
         Least inverse range of corners that count.
+    right : (3,) float64
+        Direction to whose side the longer axis points.
 
     Returns
     -------
@@ -139,10 +146,9 @@ def _rectangle(
         sxx, syy = xx / (6 * area) - mx * mx, yy / (6 * area) - my * my
         turn = 0.5 * np.arctan2(2 * (xy / (12 * area) - mx * my), sxx - syy)
     cosine, sine = np.cos(turn), np.sin(turn)
+    if cosine * (first * right).sum() + sine * (second * right).sum() < 0:
+        cosine, sine = -cosine, -sine
     along, up = cosine * x + sine * y, cosine * y - sine * x
-    to_right = ((places[:, 0] - places[:, 0].mean()) * along).sum()
-    if to_right < 0:
-        cosine, sine, along, up = -cosine, -sine, -along, -up
     frame = np.empty((3, 3))
     frame[:, 0], frame[:, 1] = cosine * first + sine * second, cosine * second - sine * first
     frame[:, 2] = normal
