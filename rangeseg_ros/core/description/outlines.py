@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -49,6 +49,10 @@ class Outline:
     farthest: float
     rays: Camera | NDArray[np.float32]
 
+    def __getstate__(self) -> dict[str, Any]:
+        # Without what it has worked out.
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
     @cached_property
     def mask(self) -> NDArray[np.bool_]:
         """(h, w) the region in its bounding box."""
@@ -71,11 +75,15 @@ class Outline:
         """Hull and holes of each part: of the largest one."""
         return [[self.hull, *self.holes]]
 
-    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.intp]]:
-        """Places (N, 2) in the image, rays (N, 3) and number of the ring (N,) of all corners."""
+    def corners(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+        """Of all rings, place in the image and ray (N, 5), and number of the ring (N,)."""
         contours = self._contours[0]
-        ring = np.repeat(np.arange(len(contours)), [len(contour) for contour in contours])
-        return *self._rays(np.concatenate(contours)), ring
+        corners = self._rays(np.concatenate(contours))
+        length = [len(contour) for contour in contours]
+        if not (corners[:, 2:] @ self.theta >= self.farthest).all():
+            rings = list(map(self._clipped, np.split(corners, np.cumsum(length)[:-1])))
+            corners, length = np.concatenate(rings), [len(ring) for ring in rings]
+        return corners, np.repeat(np.arange(len(length)), length)
 
     @cached_property
     def _contours(self) -> tuple[list[NDArray[np.int32]], NDArray[Any]]:
@@ -102,28 +110,39 @@ class Outline:
         corners = np.asarray(cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0], np.int32)
         if len(corners) < 3:  # of regions no wider than the tolerance nothing would be left
             corners = contour
-        rays = self._rays(corners)[1]
-        level = rays @ self.theta
-        ahead = level >= self.farthest
-        points: NDArray[np.float64] = rays[ahead] / level[ahead, None]
+        rays = self._clipped(self._rays(corners))[:, 2:]
+        points: NDArray[np.float64] = rays / (rays @ self.theta)[:, None]
         return points + self.rays.place if isinstance(self.rays, Camera) else points
 
-    def _rays(self, corners: NDArray[np.int32]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Places (N, 2) in the image and rays (N, 3) of corners (x, y) of pixels in the box."""
+    def _clipped(self, corners: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A ring (N, 5) of places and rays as far as its plane counts (Sutherland and Hodgman)."""
+        level = corners[:, 2:] @ self.theta - self.farthest
+        # Lenses that fold the image leave corners without a ray.
+        corners, level = corners[np.isfinite(level)], level[np.isfinite(level)]
+        kept = level >= 0
+        if kept.all():
+            return corners
+        after, later = np.roll(corners, -1, axis=0), np.roll(level, -1)
+        ends = np.flatnonzero(kept != np.roll(kept, -1))
+        share = (level[ends] / (level[ends] - later[ends]))[:, None]
+        crossing = corners[ends] + share * (after[ends] - corners[ends])
+        order = np.argsort(np.append(np.flatnonzero(kept), ends + 0.5), kind='stable')
+        return np.concatenate([corners[kept], crossing])[order]
+
+    def _rays(self, corners: NDArray[np.int32]) -> NDArray[np.float64]:
+        """Places (x, y) in the image and rays (N, 5) of corners (x, y) of pixels in the box."""
         if isinstance(self.rays, Camera):
-            left, top = self.column - 0.5, self.row - 0.5
-            places = corners + np.array([left, top])
-            return places, self.rays.rays_at(places[:, 0], places[:, 1])
+            places = corners + np.array([self.column - 0.5, self.row - 0.5])
+            return np.hstack([places, self.rays.rays_at(places[:, 0], places[:, 1])])
         total = np.zeros((len(corners), 6))
         height, width = self.mask.shape
         for i in (0, -1):
             for j in (0, -1):
                 row = np.clip(corners[:, 1] + i, 0, height - 1)
                 column = np.clip(corners[:, 0] + j, 0, width - 1)
-                values = np.column_stack([column, row, np.ones(len(row)), self.rays[row, column]])
+                values = np.column_stack([column, row, self.rays[row, column], np.ones(len(row))])
                 total += values * self.mask[row, column, None]
-        total /= total[:, 2:3]
-        return total[:, :2], total[:, 3:]
+        return total[:, :5] / total[:, 5:]
 
 
 def triangles(

@@ -49,7 +49,7 @@ class Shapes:
         # Contours cut the corners between pixels, and those of clouds run through the middles of
         # pixels: all pixels of a region have the mean area of those that its contours enclose.
         rectangles = [
-            _rectangle(*outline.corners(), outline.theta, outline.farthest, self._right)
+            _rectangle(*outline.corners(), outline.theta, self._right)
             for outline in self._outlines
         ]
         pixels = [cv2.countNonZero(outline.mask.view(np.uint8)) for outline in self._outlines]
@@ -74,28 +74,22 @@ class RegionShape:
 
 @njit(cache=True, error_model='numpy')
 def _rectangle(
-    places: NDArray[np.float64],
-    rays: NDArray[np.float64],
+    corners: NDArray[np.float64],
     ring: NDArray[np.intp],
     theta: NDArray[np.float64],
-    farthest: float,
     right: NDArray[np.float64],
 ) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Rectangle around a polygon, along the principal axes of its area.
 
     Parameters
     ----------
-    places : (N, 2) float64
-        Corners of all rings in the image, (x, y), one ring after the other; holes run the other
-        way round.
-    rays : (N, 3) float64
-        Of the corners.
+    corners : (N, 5) float64
+        Place in the image (x, y) and ray of the corners of all rings, one ring after the other;
+        holes run the other way round.
     ring : (N,) int
         Number of each corner's ring.
     theta : (3,) float64
         Plane, theta . ray = inverse range.
-    farthest : float
-        Least inverse range of corners that count.
     right : (3,) float64
         Direction to whose side the longer axis points.
 
@@ -108,10 +102,9 @@ def _rectangle(
     frame : (3, 3) float64
         Directions of length, width and normal, as columns.
     """
+    places, rays = corners[:, :2], corners[:, 2:]
     level = rays[:, 0] * theta[0] + rays[:, 1] * theta[1] + rays[:, 2] * theta[2]
-    ahead = np.flatnonzero(level >= farthest)
-    places, ring = places[ahead], ring[ahead]
-    points = rays[ahead] / level[ahead].reshape(-1, 1)
+    points = rays / level.reshape(-1, 1)
     normal = -theta / np.sqrt((theta * theta).sum())
     count = len(points)
     across = np.zeros(3)
