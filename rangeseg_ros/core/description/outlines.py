@@ -108,9 +108,10 @@ class Outline:
     def _simplified(self, contour: NDArray[np.int32]) -> NDArray[np.float64]:
         """Points (N, 3) on the plane of a contour without the corners that say little."""
         corners = np.asarray(cv2.approxPolyDP(contour, TOLERANCE, True)[:, 0], np.int32)
-        if len(corners) < 3:  # of regions no wider than the tolerance nothing would be left
-            corners = contour
         rays = self._clipped(self._rays(corners))[:, 2:]
+        # Of regions no wider than the tolerance, or with few corners that have a ray, all count.
+        if len(rays) < 3:
+            rays = self._clipped(self._rays(contour))[:, 2:]
         points: NDArray[np.float64] = rays / (rays @ self.theta)[:, None]
         return points + self.rays.place if isinstance(self.rays, Camera) else points
 
