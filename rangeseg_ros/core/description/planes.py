@@ -191,8 +191,7 @@ def describe_regions(
     Parameters
     ----------
     labels : (H, W) uint16
-        1...M, 0 for no plane; labels whose pixels determine no plane, or one without a finite
-        outline, are left out.
+        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
     image : RangeImage
         (H, W).
     fits : Fits
@@ -223,11 +222,11 @@ def describe_regions(
         centroid = centroid + image.place
 
     found = np.flatnonzero(farthest > 0)
-    known, boxes = found.tolist(), fits.boxes()[found].tolist()
-    outlines = [
-        _outline(k, labels, image, box, theta[k], far)
-        for k, box, far in zip(known, boxes, farthest[found].tolist(), strict=True)
-    ]
+    known, outlines = found.tolist(), []
+    for k, box, far in zip(known, fits.boxes()[found].tolist(), farthest[found], strict=True):
+        crop = slice(box[0], box[2]), slice(box[1], box[3])
+        rays = image.camera or image.rays[crop]
+        outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
     columns = surfaces.result(), distance, fits.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in columns)
@@ -304,18 +303,3 @@ def _expected_square(
         pixels += count
         least = min(least, level)
     return total / max(pixels, 1.0), least if pixels > 0 else 0.0
-
-
-def _outline(
-    label: int,
-    labels: NDArray[np.uint16],
-    image: RangeImage,
-    box: list[int],
-    theta: NDArray[np.float64],
-    farthest: float,
-) -> Outline:
-    top, left, bottom, right = box
-    crop = slice(top, bottom), slice(left, right)
-    return Outline(
-        labels[crop], label, top, left, theta, farthest, image.camera or image.rays[crop]
-    )
