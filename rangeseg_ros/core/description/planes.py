@@ -231,7 +231,7 @@ def describe_regions(
     columns = surfaces.result(), distance, fits.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in columns)
     equations = normal[found], offset, covariance[found]
-    shapes = Shapes(outlines, image.place, image.axes[:, 0])
+    shapes = Shapes(outlines, image.place, image.axes[:, 0].copy())
     forms = outlines, [RegionShape(shapes, n) for n in range(len(known))]
     return list(map(Plane, known, known, group, *equations, centroid[found], *figures, *forms))
 
