@@ -90,7 +90,7 @@ _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
 _TURNING = 'fitting/error_law.py:fit_turning'
 _NOISE = ('noise', 'error_law', 'quantisation')
-_NORMALS = ('method', 'angles', 'normals', 'coarse_to_fine', 'directions')
+_NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
 # Costs of borders that let nothing merge by the energy.
 _NO_BORDER = _given(4, -1e12)
 

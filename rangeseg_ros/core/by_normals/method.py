@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import coarse_to_fine
-from rangeseg_ros.core.by_normals.angles import AngularCost, angle
+from rangeseg_ros.core.by_normals.angular_cost import data_costs, label_costs
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.config import Config
@@ -18,39 +19,36 @@ from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
-class Labelling:
+class Labelling(NamedTuple):
     """Discretised normals as labels of the pixels of an image.
 
     Attributes
     ----------
-    labels : (H, W) integer
+    labels : (H, W) int32
         Numbers of directions.
-    directions : (K, 3) float64
+    directions : (K, 3) float32
         Unit vectors towards the sensor.
+    observed : (H, W, 3) float32
+        Observed normals, NaN where undefined.
+    grid : Grid
+    smoothness : float
+        Lambda.
     """
 
-    def __init__(
-        self,
-        labels: NDArray[np.integer],
-        directions: NDArray[np.float64],
-        normals: NDArray[np.float32],
-        grid: Grid,
-        smoothness: float,
-    ) -> None:
-        self.labels = labels
-        self.directions = directions
-        self._normals = normals
-        self._grid = grid
-        self._smoothness = smoothness
+    labels: NDArray[np.int32]
+    directions: NDArray[np.float32]
+    observed: NDArray[np.float32]
+    grid: Grid
+    smoothness: float
 
     def normals(self) -> NDArray[np.float32]:
         """The reconstructed normals (H, W, 3)."""
-        return self.directions.astype(np.float32)[self.labels]
+        return self.directions[self.labels]
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
-        data = angle(np.moveaxis(self._normals, 2, 0), np.moveaxis(self.normals(), 2, 0))
-        return energy(data, self.labels, self._grid, self._smoothness)
+        data = data_costs(self.labels, 1, self.observed, self.directions)
+        return energy(data, self.labels, self.grid, self.smoothness)
 
 
 def segment(
@@ -74,8 +72,8 @@ def segment(
     """
     normals = observed_normals(image, grid, config)
     lap('normals')
-    labels_of = directions(config.directions, config.direction_count, config.seed)
-    labels_of = labels_of @ image.axes.T
+    unturned = directions(config.directions, config.direction_count, config.seed)
+    labels_of = (unturned @ image.axes.T).astype(np.float32)
     problem = normals, labels_of, grid, config.smoothness
     if config.exact:
         labels = minimise_exactly(*problem, config.moves, config.cycles)
@@ -87,7 +85,7 @@ def segment(
 
 def minimise_exactly(
     normals: NDArray[np.float32],
-    directions: NDArray[np.floating],
+    directions: NDArray[np.float32],
     grid: Grid,
     smoothness: float,
     moves: str = 'expansion',
@@ -98,8 +96,11 @@ def minimise_exactly(
     Parameters and result as in `coarse_to_fine.minimise`; `moves` and `cycles` as in
     `moves.Labelling.minimise` (thesis 4.8).
     """
-    cost = AngularCost(normals, directions)
-    nearest = cost.nearest().reshape(normals.shape[:2])
+
+    def cost(label: int, pixels: NDArray[np.integer]) -> NDArray[np.float32]:
+        return label_costs(label, pixels, 1, normals, directions)
+
+    nearest = coarse_to_fine.nearest_directions(normals, directions)
     labelling = graphcut.Labelling(nearest, cost, grid, smoothness)
     labelling.minimise(len(directions), moves, cycles)
     return labelling.image

@@ -15,6 +15,10 @@ from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
+# Rows and columns of the six entries of a symmetric matrix, and the matrix made of them.
+_ROWS, _COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
+_SYMMETRIC = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+
 
 def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[np.float32]:
     """Normals by the method that `config` names.
@@ -120,25 +124,12 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     (H, W, 3) float32
         NaN where the window holds a pixel that was not measured or lies outside the image.
     """
-    valid = image.valid
-    a, b, c = (np.where(valid, ray, 0) for ray in cv2.split(image.rays.astype(np.float64)))
-    w = image.inverse.astype(np.float64)
-    aa, ab, ac, bb, bc, cc = (
-        _means(p, radius) for p in (a * a, a * b, a * c, b * b, b * c, c * c)
-    )
-    aw, bw, cw = (_means(p, radius) for p in (a * w, b * w, c * w))
-    aaa, aab, aac, abb, abc, acc, _ = cofactors(aa, ab, ac, bb, bc, cc)
+    rays = np.where(image.valid[..., None], image.rays, 0).astype(np.float64)
+    products = _means(rays[..., _ROWS] * rays[..., _COLUMNS], radius)
+    inverse = np.stack(cofactors(*np.moveaxis(products, 2, 0))[:6], axis=-1)[..., _SYMMETRIC]
+    right = _means(rays * image.inverse[..., None], radius)
     # Cramer's rule, without the determinant: the result is normalised anyhow.
-    normal = np.stack(
-        [
-            aaa * aw + aab * bw + aac * cw,
-            aab * aw + abb * bw + abc * cw,
-            aac * aw + abc * bw + acc * cw,
-        ],
-        axis=-1,
-    )
-    normal[~_complete(valid, radius)] = np.nan
-    return _towards_sensor(normal, image)
+    return _towards_sensor((inverse @ right[..., None])[..., 0], image, radius)
 
 
 def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
@@ -151,41 +142,32 @@ def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     # About their mean, so that the products of coordinates keep their digits.
     points = image.points.astype(np.float64)
     points = np.where(valid[..., None], points - points[valid].mean(axis=0), 0)
-    mean = np.stack([_means(points[..., k], radius) for k in range(3)], axis=-1)
-    covariance = np.empty((*valid.shape, 3, 3))
-    for a in range(3):
-        for b in range(a + 1):
-            product = _means(points[..., a] * points[..., b], radius)
-            covariance[..., a, b] = product - mean[..., a] * mean[..., b]
-    complete = _complete(valid, radius)
-    normal = np.full(points.shape, np.nan)
-    # Eigenvalues ascend; only the lower triangle is read.
-    normal[complete] = np.linalg.eigh(covariance[complete])[1][..., 0]
-    return _towards_sensor(normal, image)
+    mean = _means(points, radius)
+    products = _means(points[..., _ROWS] * points[..., _COLUMNS], radius)
+    covariance = (products - mean[..., _ROWS] * mean[..., _COLUMNS])[..., _SYMMETRIC]
+    # Eigenvalues ascend.
+    return _towards_sensor(np.linalg.eigh(covariance)[1][..., 0], image, radius)
 
 
-def _means(values: NDArray[np.float64], radius: int) -> NDArray:
-    """Means over windows, as if 0 outside the image."""
+def _means(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
+    """Means (H, W, n) over windows, as if 0 outside the image."""
     size = 2 * radius + 1, 2 * radius + 1
-    return cv2.boxFilter(values, cv2.CV_64F, size, borderType=cv2.BORDER_CONSTANT)
+    means = cv2.boxFilter(values, -1, size, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(means, np.float64)
 
 
-def _complete(valid: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
-    """Pixels whose window lies in the image and was measured throughout."""
+def _towards_sensor(
+    normals: NDArray[np.float64], image: RangeImage, radius: int
+) -> NDArray[np.float32]:
+    """Unit vectors against the rays; NaN for vectors without a direction and for windows that
+    reach out of the image or hold a pixel that was not measured."""
     kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    inside = cv2.erode(
-        valid.astype(np.uint8), kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0
-    )
-    return inside > 0
-
-
-def _towards_sensor(normals: NDArray, image: RangeImage) -> NDArray[np.float32]:
-    """Unit vectors against the rays; NaN for vectors without a direction."""
-    length = np.sqrt(np.einsum('ijk,ijk->ij', normals, normals))
-    facing = np.einsum('ijk,ijk->ij', normals, image.rays)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        scale = np.where(length > 0, -np.sign(facing) / length, np.nan)
-    scale[scale == 0] = np.nan
+    valid = image.valid.astype(np.uint8)
+    complete = cv2.erode(valid, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+    length = np.linalg.norm(normals, axis=2)
+    facing = (normals * image.rays).sum(axis=2)
+    scale = np.full(length.shape, np.nan)
+    np.divide(-np.sign(facing), length, out=scale, where=complete & (length > 0) & (facing != 0))
     return (normals * scale[..., None]).astype(np.float32)
 
 

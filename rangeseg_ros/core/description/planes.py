@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import Outline, lies_ahead, triangles
+from rangeseg_ros.core.description.outlines import Outline, triangles
 from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
@@ -27,6 +27,9 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
+
+# A border is taken seriously up to this many times the range of the farthest part of its plane.
+_FAR = 2.0
 
 Own = TypeVar('Own', bound='Plane')
 
@@ -64,11 +67,11 @@ class Plane:
     probability : float
         0...1: posterior probability that the region is a plane and no curved surface, see
         `by_planes.posterior`.
+    outline : Outline
+        What `hull` and `holes` are made of when first asked for.
     shape : Shape or RegionShape
         What `area`, `extents`, `centre` and `orientation` are of, worked out when first asked
         for.
-    outline : Outline
-        What `hull` and `holes` are made of when first asked for.
     role : str
         Of `roles.ROLES`; empty when none is asked for.
     """
@@ -84,8 +87,8 @@ class Plane:
     rms: float
     confidence: float
     probability: float
-    shape: Shape | RegionShape = field(repr=False)
     outline: Outline = field(repr=False)
+    shape: Shape | RegionShape = field(repr=False)
     role: str = ''
 
     def named(self: Own, **names: int | str) -> Own:
@@ -187,8 +190,7 @@ def describe_regions(
     Parameters
     ----------
     labels : (H, W) uint16
-        1...M, 0 for no plane; labels whose pixels determine no plane, or one without a finite
-        outline, are left out.
+        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
     image : RangeImage
         (H, W).
     fits : Fits
@@ -203,13 +205,12 @@ def describe_regions(
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
-    found = np.flatnonzero(theta.any(axis=1))
-    if not len(found):
+    if not theta.any():
         return []
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
     cells, start = fits.sums.cells, fits.sums.start
-    normal, distance, centroid, rms, confidence = _described(
+    normal, distance, centroid, rms, confidence, farthest = _described(
         cells, start, fits.total, theta, fits.outlier_share(), fits.sensor
     )
     covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
@@ -220,23 +221,18 @@ def describe_regions(
         distance, covariance = distance - normal @ image.place, shift @ covariance @ shift.T
         centroid = centroid + image.place
 
-    shapes = Shapes(labels, image, theta)
-    boxes = fits.boxes()
-    places = boxes.tolist()
-    outlines = {k: _outline(k, labels, image, places[k], theta[k]) for k in found.tolist()}
-    # Of steep planes neither need be finite.
-    steep = found[~lies_ahead(boxes[found], theta[found], image.camera)]
-    if len(steep):
-        finite = shapes.finite() & np.isfinite(centroid).all(1)
-        kept = finite[steep] & np.array([outlines[int(k)].exists() for k in steep])
-        found = np.setdiff1d(found, steep[~kept])
-    surface = surfaces.result()
+    found = np.flatnonzero(farthest > 0)
+    known, outlines = found.tolist(), []
+    for k, box, far in zip(known, fits.boxes()[found].tolist(), farthest[found], strict=True):
+        crop = slice(box[0], box[2]), slice(box[1], box[3])
+        rays = image.camera or image.rays[crop]
+        outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    columns = surface, distance, fits.pixels, rms, confidence, probability
+    columns = surfaces.result(), distance, fits.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in columns)
-    known = found.tolist()
-    forms = [RegionShape(shapes, k) for k in known], [outlines[k] for k in known]
     equations = normal[found], offset, covariance[found]
+    shapes = Shapes(outlines, image.place, image.axes[:, 0].copy())
+    forms = outlines, [RegionShape(shapes, n) for n in range(len(known))]
     return list(map(Plane, known, known, group, *equations, centroid[found], *figures, *forms))
 
 
@@ -249,15 +245,20 @@ def _described(
     outlier_share: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.float64], ...]:
-    """Normal, distance, centroid, rms and confidence of regions 0...M; see `Plane`."""
+    """What regions 0...M have as planes, see `Plane`.
+
+    Normal, distance, centroid, rms, confidence, and the inverse range at which the plane ends for
+    its outline: 0 where there is no plane.
+    """
     regions = len(theta)
-    normal, distance = np.zeros((regions, 3)), np.zeros(regions)
+    normal, distance, farthest = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
     centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
     for k in range(regions):
         x, y, z = theta[k]
         slope = np.sqrt(x * x + y * y + z * z)
-        if slope > 0:
-            distance[k] = 1 / slope
+        if slope == 0:
+            continue
+        distance[k] = 1 / slope
         for a in range(3):
             normal[k, a] = -theta[k, a] * distance[k]
         n, inliers = normal[k], max(total[k, COUNT], 1.0)
@@ -273,18 +274,22 @@ def _described(
         square += distance[k] * (2 * offset + distance[k])
         rms[k] = np.sqrt(max(square, 0.0))
         centroid[k] -= (offset + distance[k]) * n
-        expected = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
+        expected, least = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
         expected *= distance[k] ** 2
+        farthest[k] = least / _FAR
         confidence[k] = (1 - outlier_share[k]) * min(1.0, expected / max(square, 1e-18))
-    return normal, distance, centroid, rms, confidence
+    return normal, distance, centroid, rms, confidence, farthest
 
 
 @njit(cache=True)
 def _expected_square(
     cells: NDArray[np.float64], theta: NDArray[np.float64], sensor: SensorModel
-) -> float:
-    """Mean square distance from a plane, over distance^2, that the sensor's errors make."""
-    total = pixels = 0.0
+) -> tuple[float, float]:
+    """Mean square distance from a plane, over distance^2, that the sensor's errors make.
+
+    And the inverse range of the plane in its farthest cell.
+    """
+    total, pixels, least = 0.0, 0.0, np.inf
     for cell in cells:
         level, count = level_of(cell, theta), cell[COUNT]
         # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
@@ -292,16 +297,5 @@ def _expected_square(
         variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
         total += count * variance / squared
         pixels += count
-    return total / max(pixels, 1.0)
-
-
-def _outline(
-    label: int,
-    labels: NDArray[np.uint16],
-    image: RangeImage,
-    box: list[int],
-    theta: NDArray[np.float64],
-) -> Outline:
-    top, left, bottom, right = box
-    crop = slice(top, bottom), slice(left, right)
-    return Outline(labels[crop], label, top, left, theta, image.camera or image.rays[crop])
+        least = min(least, level)
+    return total / max(pixels, 1.0), least if pixels > 0 else 0.0
