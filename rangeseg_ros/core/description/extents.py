@@ -7,8 +7,8 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.runtime.threads import map_halves
+from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.ray_rows import ray_of
 
 # A pixel's place on its plane is taken seriously up to this many times its measured range.
 _FAR = 2.0
