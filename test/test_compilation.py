@@ -13,9 +13,9 @@ from clouds import cloud_of
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.compilation import preparation
-from rangeseg_ros.compilation.discovery import discover
 from rangeseg_ros.compilation.preparation import needs, prepare
 from rangeseg_ros.compilation.rehearsal import FIRST, KINDS, rehearse
+from rangeseg_ros.compilation.worker import discover
 from rangeseg_ros.core.runtime.first_use import nothing_compiled
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter

@@ -12,8 +12,8 @@ import pytest
 from numba import types
 
 from rangeseg_ros import Config
-from rangeseg_ros.compilation.discovery import discover
 from rangeseg_ros.compilation.rehearsal import rehearse
+from rangeseg_ros.compilation.worker import discover
 
 
 def named(kind):

@@ -36,10 +36,10 @@ from rangeseg_ros.core.fitting.scale import (
 )
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, slope_of
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, correlated_residuals
-from rangeseg_ros.core.sensing.verdict import Cells
 from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13
