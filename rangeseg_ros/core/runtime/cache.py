@@ -12,10 +12,10 @@ import json
 import os
 import re
 import shutil
+import stat
 import sys
 import tempfile
 import warnings
-from importlib import metadata
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2]
@@ -75,6 +75,8 @@ def _choose_processor() -> None:
         return
     if 'NUMBA_CPU_NAME' in os.environ:
         return
+    from importlib import metadata
+
     from llvmlite import binding
 
     has = binding.get_host_cpu_features()
@@ -106,12 +108,24 @@ def _own_folder(root: Path) -> Path | None:
     folder = root if root.name == name else root / name
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        found = folder.lstat()
     except OSError:
         return None
-    # Where others may write to `root`, they can put no folder of ours there.
-    ours = not hasattr(os, 'getuid') or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
-    return folder if ours and not folder.is_symlink() and writable(folder) else None
+    return folder if _private(folder) and writable(folder) else None
+
+
+def _private(folder: Path) -> bool:
+    """Whether nobody but this user and root can write to the folder, or put another in its place.
+
+    A group with the number of its user is taken for that user's own, as Linux gives it.
+    """
+    for path in (folder, *folder.resolve().parents):
+        found = path.lstat()
+        others = stat.S_IWOTH if found.st_gid == found.st_uid else stat.S_IWOTH | stat.S_IWGRP
+        # Where the sticky bit is set, as for /tmp, nobody can replace what others have in there.
+        sticky = path != folder and found.st_mode & stat.S_ISVTX
+        if found.st_uid not in (0, os.getuid()) or (found.st_mode & others and not sticky):
+            return False
+    return True
 
 
 def _user_folder() -> Path | None:
