@@ -16,7 +16,7 @@ from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.preparation import needs, prepare
 from rangeseg_ros.compilation.rehearsal import FIRST, KINDS, rehearse
 from rangeseg_ros.compilation.worker import discover
-from rangeseg_ros.core.runtime.first_use import nothing_compiled
+from rangeseg_ros.core.runtime.kernels import nothing_compiled
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.outputs import OUTPUTS

@@ -17,20 +17,17 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
-from rangeseg_ros.core.runtime.first_use import with_kernels
-from rangeseg_ros.core.runtime.loading import load_lazily
+from rangeseg_ros.core.runtime.kernels import load_lazily, with_kernels
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
-from rangeseg_ros.core.runtime.stopwatch import Stopwatch
-from rangeseg_ros.core.runtime.work import step_within
+from rangeseg_ros.core.runtime.work import Stopwatch, step_within
 from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
-from rangeseg_ros.core.sensing.grid import GridEdges, weights
+from rangeseg_ros.core.sensing.grid import GridEdges, View, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.view import View
 
 
 class Segmenter:
