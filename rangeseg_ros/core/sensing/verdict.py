@@ -90,7 +90,7 @@ def judge(
             'Surfaces are flat only if the values are distances from the camera, not along its '
             'axis: multiply them by 1 / |ray|.'
         )
-    if 2 * np.count_nonzero(image.inverse[image.valid] < 1 / FAR) > np.count_nonzero(image.valid):
+    if image.beyond_reach:
         found['millimetres in floats'] = (
             f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres.'
         )
