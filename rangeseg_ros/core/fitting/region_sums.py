@@ -332,7 +332,9 @@ def _trim(
     """Cells `trimmed` of the regions that have `few` outliers, and all pixels of the others."""
     for k in range(len(few)):
         if few[k]:
-            cells[start[k] : start[k + 1]] = trimmed[start[k] : start[k + 1]]
+            for c in range(start[k], start[k + 1]):
+                for entry in range(RECORD):
+                    cells[c, entry] = trimmed[c, entry]
     return cells
 
 
