@@ -154,7 +154,7 @@ def _fit_planes(
             blocks.across[bi, bj], blocks.down[bi, bj] = share * across, share * down
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, inline='always')
 def _change(
     theta: tuple[float, float, float],
     rays: NDArray[np.float32],
@@ -170,17 +170,17 @@ def _change(
     (top, left), (di, dj) = corner, way
     farthest, change = 0, 0.0
     for line in range(size):
-        first = last = -1
-        for k in range(size):
-            i, j = top + di * k + dj * line, left + dj * k + di * line
-            if i < rays.shape[0] and j < rays.shape[1] and _known(rays, i, j):
-                first, last = (k if first < 0 else first), k
+        i, j, first, last = top + dj * line, left + di * line, 0, size - 1
+        while first < last and not _known(rays, i + di * first, j + dj * first):
+            first += 1
+        while first < last and not _known(rays, i + di * last, j + dj * last):
+            last -= 1
         if last - first > farthest:
             farthest, change = last - first, 0.0
-            i, j = top + di * first + dj * line, left + dj * first + di * line
-            for axis in range(3):
-                step = rays[i + di * farthest, j + dj * farthest, axis] - rays[i, j, axis]
-                change += theta[axis] * step / farthest
+            begin, end = (i + di * first, j + dj * first), (i + di * last, j + dj * last)
+            for k in range(3):
+                step = rays[end[0], end[1], k] - rays[begin[0], begin[1], k]
+                change += theta[k] * step / farthest
         if farthest == size - 1:
             break
     return change
@@ -188,5 +188,7 @@ def _change(
 
 @njit(cache=True, inline='always')
 def _known(rays: NDArray[np.float32], i: int, j: int) -> Any:
-    """Whether a pixel has a ray: those of a cloud are 0 where nothing was measured."""
+    """Whether there is a pixel and it has a ray: a cloud has none where nothing was measured."""
+    if i >= rays.shape[0] or j >= rays.shape[1]:
+        return False
     return (rays[i, j, 0] != 0) | (rays[i, j, 1] != 0) | (rays[i, j, 2] != 0)
