@@ -332,9 +332,7 @@ def _trim(
     """Cells `trimmed` of the regions that have `few` outliers, and all pixels of the others."""
     for k in range(len(few)):
         if few[k]:
-            for c in range(start[k], start[k + 1]):
-                for entry in range(RECORD):
-                    cells[c, entry] = trimmed[c, entry]
+            cells[start[k] : start[k + 1]] = trimmed[start[k] : start[k + 1]]
     return cells
 
 
