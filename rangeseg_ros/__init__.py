@@ -11,14 +11,12 @@ if TYPE_CHECKING:
     from rangeseg_ros.core.options import ConfigError
     from rangeseg_ros.core.segmentation import Segmentation
     from rangeseg_ros.core.segmenter import Segmenter
-    from rangeseg_ros.core.sensing.calibrations import (
-        camera_from_calibration,
-        camera_from_matrices,
-    )
     from rangeseg_ros.core.sensing.camera import Camera, CameraError
     from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
     from rangeseg_ros.core.sequence import SequenceSegmenter
+    from rangeseg_ros.io.cameras import camera_from_calibration
     from rangeseg_ros.io.corrections import corrected
+    from rangeseg_ros.messages.cameras import camera_from_matrices
     from rangeseg_ros.messages.clouds import planes_from_message
     from rangeseg_ros.notebook import segment
 
@@ -54,11 +52,12 @@ _HOMES = {
     'core.options': ('ConfigError',),
     'core.segmentation': ('Segmentation',),
     'core.segmenter': ('Segmenter',),
-    'core.sensing.calibrations': ('camera_from_calibration', 'camera_from_matrices'),
     'core.sensing.camera': ('Camera', 'CameraError'),
     'core.sensing.range_image': ('RangeImage', 'RangeImageError'),
     'core.sequence': ('SequenceSegmenter',),
+    'io.cameras': ('camera_from_calibration',),
     'io.corrections': ('corrected',),
+    'messages.cameras': ('camera_from_matrices',),
     'messages.clouds': ('planes_from_message',),
     'notebook': ('segment',),
 }

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from recordings import SUFFIXES, Recording, depth_images, record
 
-from rangeseg_ros.core.sensing.calibrations import CameraWarning
-from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.cameras import read_camera, write_camera

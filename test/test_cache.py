@@ -111,23 +111,6 @@ def test_nothing_is_taken_from_where_others_can_write(tmp_path, variable, within
     assert told == (variable == 'NUMBA_CACHE_DIR' and mode != 0o1777)
 
 
-def test_only_folders_of_the_user_alone_are_private(tmp_path, monkeypatch):
-    own = tmp_path / 'own'
-    own.mkdir(mode=0o700)
-    assert cache._private(own)
-    for mode in (0o707, 0o702, 0o1777):
-        own.chmod(mode)
-        assert not cache._private(own)
-    own.chmod(0o700)
-    (tmp_path / 'link').symlink_to(own)
-    (tmp_path / 'loop').symlink_to(tmp_path / 'loop')
-    (tmp_path / 'file').touch()
-    for name in ('link', 'loop', 'file', 'none'):
-        assert not cache._private(tmp_path / name)
-    monkeypatch.setattr(os, 'getuid', lambda: own.stat().st_uid + 1)
-    assert not cache._private(own)
-
-
 def test_help_needs_no_place_to_write_to():
     code = "sys.argv[1:] = ['--help']\nfrom rangeseg_ros.start import rangeseg; rangeseg()"
     run = run_restricted(code)

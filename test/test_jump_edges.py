@@ -6,7 +6,7 @@ import pytest
 
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.jump_edges import bridge_edges, edges_of, plane_deviation, sobel
+from rangeseg_ros.core.sensing.jump_edges import bridge_edges, plane_deviation, sobel
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
 STEP = 0.0044
@@ -158,14 +158,6 @@ def test_bridging_leaves_touching_neighbours_alone():
     corner = np.eye(7, dtype=bool)
     np.testing.assert_array_equal(bridge_edges(corner), corner)
     assert bridge_edges(edges)[edges].all()
-
-
-def test_edge_pixels_lose_all_their_edges():
-    pixels = np.zeros((3, 3), bool)
-    pixels[1, 1] = True
-    horizontal, vertical = edges_of(pixels)
-    assert horizontal.tolist() == [[False] * 2, [True] * 2, [False] * 2]
-    assert vertical.T.tolist() == [[False] * 2, [True] * 2, [False] * 2]
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (1, 7), (2, 2), (5, 3)])

@@ -8,8 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, CameraError, Config, RangeImage, Segmenter
-from rangeseg_ros.core.sensing.calibrations import CameraWarning, camera_from_matrices
+from rangeseg_ros.core.sensing.camera import CameraWarning
 from rangeseg_ros.core.sensing.lens import undistort
+from rangeseg_ros.messages.cameras import camera_from_matrices
 
 K = [[300, 0, 159.5], [0, 310, 119.5], [0, 0, 1]]
 P = [[290, 0, 160, 0], [0, 290, 120, 0], [0, 0, 1, 0]]

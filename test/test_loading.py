@@ -21,7 +21,7 @@ parsed, parse = [], binding.parse_bitcode
 binding.parse_bitcode = lambda code: parsed.append(code) or parse(code)
 """
 
-LAZY = 'from rangeseg_ros.core.runtime.loading import load_lazily\nload_lazily()\n'
+LAZY = 'from rangeseg_ros.core.runtime.kernels import load_lazily\nload_lazily()\n'
 
 
 def run(folder, code):

@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.runtime.pace import Pace
 from rangeseg_ros.core.runtime.work import STEPS, step_within
+from rangeseg_ros.ros.pace import Pace
 
 PERIOD = 1 / 30
 

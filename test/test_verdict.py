@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
-from rangeseg_ros.core.sensing.verdict import filled_share, interpolation, judge, replication
+from rangeseg_ros.core.sensing.enlargement import interpolation, replication
+from rangeseg_ros.core.sensing.verdict import filled_share, judge
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS

@@ -4,7 +4,7 @@ With this package imported, a frame that needs kernels which are not compiled ha
 """
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.first_use import compile_ahead_by
+from rangeseg_ros.core.runtime.kernels import compile_ahead_by
 
 
 def _compile_ahead(config: Config, cloud: bool) -> None:

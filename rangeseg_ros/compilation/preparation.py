@@ -13,7 +13,7 @@ from typing import Any
 
 from rangeseg_ros.compilation.rehearsal import KINDS, rehearse
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.first_use import NotCompiledError, not_ahead, nothing_compiled
+from rangeseg_ros.core.runtime.kernels import NotCompiledError, not_ahead, nothing_compiled
 from rangeseg_ros.messages.outputs import OUTPUTS
 
 Report = Callable[[str], None]

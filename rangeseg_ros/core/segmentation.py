@@ -20,11 +20,12 @@ from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.ground.tilt import Tilt, tilt_of
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.verdict import Cells, Verdict, judge
+from rangeseg_ros.core.sensing.verdict import Verdict, judge
 
 STATED = SensorModel.from_config(Config())
 """The sensor that the defaults describe."""

@@ -17,21 +17,17 @@ from rangeseg_ros.core.fitting.noise import measured_sensor
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
-from rangeseg_ros.core.runtime.first_use import with_kernels
-from rangeseg_ros.core.runtime.loading import load_lazily
+from rangeseg_ros.core.runtime.kernels import load_lazily, with_kernels
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
-from rangeseg_ros.core.runtime.stopwatch import Stopwatch
-from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.runtime.work import step_within
+from rangeseg_ros.core.runtime.work import Stopwatch, step_within
 from rangeseg_ros.core.segmentation import Labelling, Segmentation
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.bridges import bridge_holes, find_holes
-from rangeseg_ros.core.sensing.grid import GridEdges, weights
+from rangeseg_ros.core.sensing.bridges import bridge_holes
+from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
+from rangeseg_ros.core.sensing.grid import GridEdges, View, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.sensing.verdict import Cells, enlargement
-from rangeseg_ros.core.sensing.view import View
 
 
 class Segmenter:
@@ -168,8 +164,6 @@ def _preprocessed(
 ) -> tuple[View, GridEdges | None]:
     """What is known of an image before planes are looked for, and its jump edges."""
     blocks = Blocks.of(image)
-    # Much of what tells the noise runs on one thread: on another one meanwhile.
-    holes = submit(find_holes, image.inverse)
     sensor = stated = SensorModel.from_config(config, image.shape)
     if config.sensor_model == 'measured':
         sensor = measured_sensor(image, blocks, stated)
@@ -185,7 +179,7 @@ def _preprocessed(
         given = np.full_like(steps.windows, config.edge_step)
         steps = steps._replace(windows=given, pixels=given)
     # Planes are fitted to what was measured; where they end is found with small holes bridged.
-    whole = bridge_holes(image, steps.windows, steps.slopes, holes.result())
+    whole = bridge_holes(image, steps.windows, steps.slopes)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = weights(whole, jumps, config.weighting)
     watch.lap('edges')

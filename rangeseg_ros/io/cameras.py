@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from rangeseg_ros.core.sensing.calibrations import camera_from_calibration
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.yaml_files import YamlError, read_yaml
+from rangeseg_ros.messages.cameras import camera_from_matrices
 
 
 def read_camera(path: Path, raw: bool = False) -> Camera:
@@ -46,6 +47,55 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
         return camera_from_calibration(calibration, raw or None)
     except ValueError as error:
         raise CameraError(f'{path}: {error}') from None
+
+
+def camera_from_calibration(calibration: Mapping[str, Any], raw: bool | None = None) -> Camera:
+    """Camera from the parsed content of a ROS camera-calibration YAML file.
+
+    Parameters
+    ----------
+    calibration : mapping
+    raw : bool, optional
+        As for `camera_from_matrices`.
+
+    Raises
+    ------
+    CameraError
+        A missing or malformed key, named in the message.
+    """
+    if not isinstance(calibration, Mapping):
+        raise CameraError('malformed camera calibration: no mapping')
+    width, height = _entry(calibration, 'image_width'), _entry(calibration, 'image_height')
+    k = _data(calibration, 'camera_matrix')
+    if k is None:
+        raise CameraError("camera calibration lacks 'camera_matrix'")
+    p = _data(calibration, 'projection_matrix')
+    d = _data(calibration, 'distortion_coefficients')
+    model = calibration.get('distortion_model') or ''
+    if not isinstance(model, str):
+        raise CameraError(f'malformed camera calibration: distortion_model {model!r}')
+    try:
+        return camera_from_matrices(
+            width, height, k, p, distortion_model=model, d=() if d is None else d, raw=raw
+        )
+    except (TypeError, OverflowError) as error:
+        raise CameraError(f'malformed camera calibration: {error}') from None
+
+
+def _entry(calibration: Mapping[str, Any], key: str) -> Any:
+    if key not in calibration:
+        raise CameraError(f'camera calibration lacks {key!r}')
+    return calibration[key]
+
+
+def _data(calibration: Mapping[str, Any], key: str) -> Any:
+    """Values of a matrix of a calibration; None when it is not there."""
+    entry = calibration.get(key)
+    if entry is None:
+        return None
+    if not isinstance(entry, Mapping):
+        raise CameraError(f'malformed camera calibration: {key} has no data')
+    return _entry(entry, 'data')
 
 
 def write_camera(path: Path, camera: Camera, name: str = 'depth') -> None:

@@ -17,7 +17,7 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.regions import drop_regions
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.view import View
+from rangeseg_ros.core.sensing.grid import View
 
 
 class Labelling:

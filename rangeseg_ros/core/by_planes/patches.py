@@ -91,10 +91,10 @@ def _pairs(
             if not smooth[i, j]:
                 continue
             if j + 1 < columns and right[i, j] and smooth[i, j + 1]:
-                pairs[count] = here, here + 1
+                pairs[count, 0], pairs[count, 1] = here, here + 1
                 count += 1
             if i + 1 < rows and below[i, j] and smooth[i + 1, j]:
-                pairs[count] = here, here + columns
+                pairs[count, 0], pairs[count, 1] = here, here + columns
                 count += 1
     return pairs[:count]
 

@@ -23,10 +23,10 @@ from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, fit_turnin
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, correlated_residuals
-from rangeseg_ros.core.sensing.verdict import Cells
 from rangeseg_ros.core.significance import SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13

@@ -22,10 +22,10 @@ from rangeseg_ros.core.sensing.moments import (
     SIZE,
     fit,
     plus_pixel,
+    ray_of,
     squares_left,
 )
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.ray_rows import ray_of
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER
 

@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.ground.cells import Cells, CellSize
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.moments import cofactors
+from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.ray_rows import ray_of
 
 # Cells of a block, which is about square.
 _ROWS, _COLUMNS = 4, 2

@@ -1,1 +1,1 @@
-"""Threads and memory: how kernels run, apart from what they compute."""
+"""Compiled kernels, threads and memory: how kernels run, apart from what they compute."""

@@ -1,22 +1,21 @@
 """Where compiled kernels are kept: what is read from there is executed.
 
-numba keeps them beside the sources, or in a folder that it is given. It takes whatever it finds
-there, also where others have put it, and does not notice when what a kernel calls has changed.
+numba keeps them beside the sources, or in a folder that it is given. It does not notice when what
+a kernel calls has changed.
 """
 
 from __future__ import annotations
 
-import ast
 import atexit
 import hashlib
 import json
 import os
+import re
 import shutil
 import stat
 import sys
 import tempfile
 import warnings
-from importlib import metadata
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[2]
@@ -26,6 +25,8 @@ _SOURCES = Path('core', '__pycache__', 'compiled_from.json')
 _TARGET = Path('core', '__pycache__', 'compiled_for.json')
 # Instructions of llvm's processors for which wheels are compiled.
 _FEATURES = {'x86-64-v3': ('avx2', 'bmi', 'bmi2', 'f16c', 'fma', 'lzcnt', 'movbe')}
+# Modules and the names imported from them, which may be modules.
+_IMPORT = re.compile(r'^from (\S+) import (\([^)]*\)|.*)$', re.MULTILINE)
 
 
 class CacheWarning(UserWarning):
@@ -51,36 +52,19 @@ def choose_cache() -> None:
     """
     _choose_processor()
     given = os.environ.pop('NUMBA_CACHE_DIR', None)
-    if given and (folder := _own_folder(Path(given))):
-        _keep_in(folder)
-        return
-    if given:
-        _warn(
-            f'NUMBA_CACHE_DIR: {given} is not used: it cannot be written to, or others can write '
-            'to it, and what is in it would be executed'
-        )
-    if writable(PACKAGE / 'core' / '__pycache__'):
+    folder = _own_folder(Path(given)) if given else None
+    if given and folder is None:
+        _warn(f'NUMBA_CACHE_DIR: {given} is not used: it cannot be written to, or others can')
+    if folder is None and writable(PACKAGE / 'core' / '__pycache__'):
         drop_outdated(PACKAGE)
-        _tell_numba('')
-        return
-    home = os.environ.get('HOME')
-    user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
-    folder = _own_folder(Path(user, 'rangeseg_ros')) if user else None
-    if folder is None:
-        try:
-            folder = Path(tempfile.mkdtemp(prefix='rangeseg_ros-'))
-        except OSError:
-            raise OSError(
-                'no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one'
-            ) from None
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        _warn(
-            'compiled kernels cannot be kept, so that every start compiles them: neither the '
-            'package nor a cache folder can be written to by this user alone; set NUMBA_CACHE_DIR '
-            'to one that can'
-        )
-    _keep_in(folder)
-    _copy_compiled(folder)
+    elif folder is None:
+        folder = _user_folder() or _temporary_folder()
+        _copy_compiled(folder)
+    if folder:
+        # Of processes started from here, too.
+        os.environ['NUMBA_CACHE_DIR'] = os.fspath(folder)
+    if 'numba' in sys.modules:
+        sys.modules['numba'].config.CACHE_DIR = os.fspath(folder or '')
 
 
 def _choose_processor() -> None:
@@ -91,6 +75,8 @@ def _choose_processor() -> None:
         return
     if 'NUMBA_CPU_NAME' in os.environ:
         return
+    from importlib import metadata
+
     from llvmlite import binding
 
     has = binding.get_host_cpu_features()
@@ -114,59 +100,6 @@ def writable(folder: Path) -> bool:
     return True
 
 
-def drop_outdated(package: Path) -> None:
-    """Remove kernels compiled beside sources that have changed, or that import such sources.
-
-    Parameters
-    ----------
-    package : Path
-        With the compiled kernels, and a note of what they were compiled from.
-    """
-    note = package / _SOURCES
-    now = _digests(package)
-    try:
-        before = json.loads(note.read_text())
-    except (OSError, ValueError):
-        before = {}
-    if now == before:
-        return
-    changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
-    for module in _dependents(package, changed):
-        for compiled in (module.parent / '__pycache__').glob(f'{module.stem}.*.nb[ic]'):
-            compiled.unlink(missing_ok=True)
-    part = note.with_name(f'{note.name}.{os.getpid()}')
-    part.write_text(json.dumps(now))
-    os.replace(part, note)
-
-
-def _digests(package: Path) -> dict[str, str]:
-    """Digests of the sources of the core, by name: times of change may be those of an archive."""
-    return {
-        path.relative_to(package).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted((package / 'core').rglob('*.py'))
-    }
-
-
-def _dependents(package: Path, changed: set[str]) -> set[Path]:
-    """The changed modules and all that import one of them, or one that does."""
-    imports = {path: _imported(path) for path in (package / 'core').rglob('*.py')}
-    modules = {package / name for name in changed}
-    while True:
-        names = {'.'.join(p.relative_to(package.parent).with_suffix('').parts) for p in modules}
-        more = {path for path, imported in imports.items() if imported & names} - modules
-        if not more:
-            return modules
-        modules |= more
-
-
-def _imported(path: Path) -> set[str]:
-    """Modules that a source imports; names imported from them, too, as they may be modules."""
-    nodes = ast.walk(ast.parse(path.read_bytes()))
-    found = [node for node in nodes if isinstance(node, ast.ImportFrom) and node.module]
-    names = {f'{node.module}.{item.name}' for node in found for item in node.names}
-    return names | {str(node.module) for node in found}
-
-
 def _own_folder(root: Path) -> Path | None:
     """Folder within `root` for this state of the sources; None where it is not ours alone."""
     state = hashlib.sha256(repr(_digests(PACKAGE)).encode()).hexdigest()
@@ -185,38 +118,88 @@ def _private(folder: Path) -> bool:
 
     A group with the number of its user is taken for that user's own, as Linux gives it.
     """
-    if not hasattr(os, 'getuid'):
-        return True
-    try:
-        real = folder.resolve(strict=True)
-        chain = [path.stat() for path in (real, *real.parents)]
-    except (OSError, RuntimeError):  # the latter of links in a circle
-        return False
-    if folder.is_symlink() or not folder.is_dir() or chain[0].st_uid != os.getuid():
-        return False
-    for found in chain:
+    for path in (folder, *folder.resolve().parents):
+        found = path.lstat()
         others = stat.S_IWOTH if found.st_gid == found.st_uid else stat.S_IWOTH | stat.S_IWGRP
         # Where the sticky bit is set, as for /tmp, nobody can replace what others have in there.
-        sticky = found is not chain[0] and found.st_mode & stat.S_ISVTX
+        sticky = path != folder and found.st_mode & stat.S_ISVTX
         if found.st_uid not in (0, os.getuid()) or (found.st_mode & others and not sticky):
             return False
     return True
 
 
-def _keep_in(folder: Path) -> None:
-    """Have numba, here and in processes started from here, keep kernels in `folder`."""
-    os.environ['NUMBA_CACHE_DIR'] = os.fspath(folder)
-    _tell_numba(os.fspath(folder))
+def _user_folder() -> Path | None:
+    """Folder in the user's cache."""
+    home = os.environ.get('HOME')
+    user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
+    return _own_folder(Path(user, 'rangeseg_ros')) if user else None
 
 
-def _tell_numba(folder: str) -> None:
-    """Where kernels are kept, if numba has read its environment already; '' for the package."""
-    if 'numba' in sys.modules:
-        sys.modules['numba'].config.CACHE_DIR = folder
+def _temporary_folder() -> Path:
+    """Folder that goes with the process."""
+    try:
+        folder = Path(tempfile.mkdtemp(prefix='rangeseg_ros-'))
+    except OSError:
+        raise OSError(
+            'no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one'
+        ) from None
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    _warn(
+        'compiled kernels cannot be kept, so that every start compiles them: neither the package '
+        'nor a cache folder can be written to by this user alone; set NUMBA_CACHE_DIR to one that '
+        'can'
+    )
+    return folder
 
 
-def _warn(text: str) -> None:
-    warnings.warn(text, CacheWarning, stacklevel=3)
+def drop_outdated(package: Path) -> None:
+    """Remove kernels compiled beside sources that have changed, or that import such sources.
+
+    Parameters
+    ----------
+    package : Path
+        With the compiled kernels, and a note of what they were compiled from.
+    """
+    note, now = package / _SOURCES, _digests(package)
+    try:
+        before = json.loads(note.read_text())
+    except (OSError, ValueError):
+        before = {}
+    if now == before:
+        return
+    changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
+    for name in _dependents(package, changed):
+        folder, stem = os.path.split(package.parent / name.replace('.', '/'))
+        for compiled in Path(folder, '__pycache__').glob(f'{stem}.*.nb[ic]'):
+            compiled.unlink(missing_ok=True)
+    part = note.with_name(f'{note.name}.{os.getpid()}')
+    part.write_text(json.dumps(now))
+    os.replace(part, note)
+
+
+def _digests(package: Path) -> dict[str, str]:
+    """Digests of the sources of the core by module: times of change may be those of an archive."""
+    return {
+        '.'.join(path.relative_to(package.parent).with_suffix('').parts): hashlib.sha256(
+            path.read_bytes()
+        ).hexdigest()
+        for path in sorted((package / 'core').rglob('*.py'))
+    }
+
+
+def _dependents(package: Path, changed: set[str]) -> set[str]:
+    """The changed modules and all that import one of them, or one that does."""
+    imports = {}
+    for name in _digests(package):
+        text = (package.parent / name.replace('.', '/')).with_suffix('.py').read_text()
+        found = _IMPORT.findall(text)
+        modules = {
+            f'{module}.{item}' for module, items in found for item in re.findall(r'\w+', items)
+        }
+        imports[name] = modules | {module for module, _ in found}
+    while more := {name for name, found in imports.items() if found & changed} - changed:
+        changed = changed | more
+    return changed
 
 
 def _copy_compiled(folder: Path) -> None:
@@ -232,3 +215,7 @@ def _copy_compiled(folder: Path) -> None:
         part = target.with_name(f'{target.name}.{os.getpid()}')
         shutil.copy2(compiled, part)
         os.replace(part, target)
+
+
+def _warn(text: str) -> None:
+    warnings.warn(text, CacheWarning, stacklevel=3)

@@ -1,6 +1,8 @@
-"""How much of the work is done where there is no time for all of it."""
+"""How much of the work is done where there is no time for all of it, and how long it takes."""
 
 from __future__ import annotations
+
+import time
 
 # Of every n-th row and column that are segmented, the share of the processor time of all pixels on
 # Kinect frames of 640 x 480 (docs/benchmark.md).
@@ -13,3 +15,23 @@ STEPS = tuple(_SHARES.values())
 def step_within(budget: float) -> int:
     """Rows and columns of which one is looked at, for a share `budget` of the full work, 0...1."""
     return next((step for step, share in _SHARES.items() if budget >= share), max(_SHARES))
+
+
+class Stopwatch:
+    """Times the stages of a run.
+
+    Attributes
+    ----------
+    laps : dict
+        Milliseconds per stage.
+    """
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """End the stage that has been running."""
+        now = time.perf_counter()
+        self.laps[stage] = 1000 * (now - self._last)
+        self._last = now

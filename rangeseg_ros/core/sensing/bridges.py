@@ -24,10 +24,7 @@ _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 def bridge_holes(
-    image: RangeImage,
-    steps: NDArray[np.float32],
-    slopes: NDArray[np.float32],
-    holes: NDArray[np.int32] | None = None,
+    image: RangeImage, steps: NDArray[np.float32], slopes: NDArray[np.float32]
 ) -> RangeImage:
     """The image with small holes interpolated.
 
@@ -44,79 +41,55 @@ def bridge_holes(
     steps, slopes : (ceil(H / 4), ceil(W / 4)) float32
         Smallest jump, and the change of the inverse range from pixel to pixel on surfaces, of
         every block, 1/m.
-    holes : (N,) int32, optional
-        See `find_holes`, where they are known.
     """
-    if holes is None:
-        holes = find_holes(image.inverse)
-    if not len(holes):
+    known = image.valid.view(np.uint8)
+    holes = cv2.dilate(known, np.ones((2 * SPAN - 1, 2 * SPAN - 1), np.uint8)) > known
+    if not holes.any():
         return image
-    inverse = np.empty(image.shape, np.float32)
+    inverse = image.inverse.copy()
     # A camera has rays everywhere; those of a cloud lie between its points.
-    known = image.rays if image.camera is None else image.rays[:0]
-    rays = known.copy()
-    run_rows(_bridge, len(inverse), holes, image.inverse, known, steps, slopes, inverse, rays)
+    rays = (image.rays if image.camera is None else image.rays[:0]).copy()
+    run_rows(_bridge, len(inverse), holes, image.inverse, steps, slopes, inverse, rays)
     # Like those it was made from, or every kernel that reads them is compiled twice.
     rays.flags.writeable = False
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
-
-
-def find_holes(measured: NDArray[np.float32]) -> NDArray[np.int32]:
-    """Pixels without measurement that have one less than `SPAN` rows and columns away.
-
-    Parameters
-    ----------
-    measured : (H, W) float32
-        Inverse range, 0 where nothing was measured.
-
-    Returns
-    -------
-    (N,) int32
-        Numbers of the pixels, in raster order.
-    """
-    known = (measured > 0).view(np.uint8)
-    near = cv2.dilate(known, np.ones((2 * SPAN - 1, 2 * SPAN - 1), np.uint8))
-    return np.flatnonzero(near > known).astype(np.int32)
 
 
 @njit(cache=True, nogil=True)
 def _bridge(
     first: int,
     after: int,
-    holes: NDArray[np.int32],
+    holes: NDArray[np.bool_],
     measured: NDArray[np.float32],
-    measured_rays: NDArray[np.float32],
     steps: NDArray[np.float32],
     slopes: NDArray[np.float32],
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
 ) -> None:
-    """Copy some rows and bridge their holes."""
-    width = measured.shape[1]
-    inverse[first:after] = measured[first:after]
-    for place in holes:
-        i, j = place // width, place % width
-        if not first <= i < after:
-            continue
-        step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
-        best = 2 * SPAN
-        for di, dj in _DIRECTIONS:
-            back = _distance(measured, i, j, (-di, -dj), SPAN - 1)
-            ahead = _distance(measured, i, j, (di, dj), SPAN - back) if back > 0 else 0
-            if ahead == 0:
+    """Bridge the holes of some rows."""
+    for i in range(first, after):
+        for j in range(measured.shape[1]):
+            if not holes[i, j]:
                 continue
-            span, share = back + ahead, np.float32(back / (back + ahead))
-            bi, bj, ai, aj = i - back * di, j - back * dj, i + ahead * di, j + ahead * dj
-            one, other = measured[bi, bj], measured[ai, aj]
-            if abs(one - other) > step + slope * span:
-                inverse[i, j] = 0
-                break
-            if span < best:
-                best = span
-                inverse[i, j] = one + share * (other - one)
-                for k in range(3 if rays.size > 0 else 0):
-                    here, there = measured_rays[bi, bj, k], measured_rays[ai, aj, k]
-                    rays[i, j, k] = here + share * (there - here)
+            step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
+            best = 2 * SPAN
+            for di, dj in _DIRECTIONS:
+                back = _distance(measured, i, j, (-di, -dj), SPAN - 1)
+                ahead = _distance(measured, i, j, (di, dj), SPAN - back) if back > 0 else 0
+                if ahead == 0:
+                    continue
+                span, share = back + ahead, np.float32(back / (back + ahead))
+                bi, bj, ai, aj = i - back * di, j - back * dj, i + ahead * di, j + ahead * dj
+                one, other = measured[bi, bj], measured[ai, aj]
+                if abs(one - other) > step + slope * span:
+                    inverse[i, j] = 0
+                    break
+                if span < best:
+                    best = span
+                    inverse[i, j] = one + share * (other - one)
+                    for k in range(3 if rays.size > 0 else 0):
+                        here, there = rays[bi, bj, k], rays[ai, aj, k]
+                        rays[i, j, k] = here + share * (there - here)
 
 
 @njit(cache=True, inline='always')

@@ -1,4 +1,7 @@
-"""The 4-connected grid of pixels and its neighbourhood weights u of eq. 5.1 (thesis 5.5)."""
+"""The 4-connected grid of pixels, its neighbourhood weights u (eq. 5.1, thesis 5.5), and the view.
+
+A `View` is a range image with what is known of it before planes are looked for.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # (H, W-1) and (H-1, W) bool: a jump between a pixel and its right, its lower neighbour.
 GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
@@ -26,6 +31,36 @@ class Grid(NamedTuple):
 
     right: NDArray[np.float32]
     below: NDArray[np.float32]
+
+
+class View(NamedTuple):
+    """A range image, its blocks, neighbourhood and errors.
+
+    Attributes
+    ----------
+    image : RangeImage
+        (H, W), as it was measured.
+    whole : RangeImage
+        (H, W), holes bridged.
+    blocks : Blocks
+        Of 4 x 4 pixels of `image`.
+    grid : Grid
+        Of `whole`.
+    sensor : SensorModel
+        Errors of the image.
+    least : int
+        Pixels of the smallest plane.
+    identified : bool
+        False where the errors were to be measured and the image says too little.
+    """
+
+    image: RangeImage
+    whole: RangeImage
+    blocks: Blocks
+    grid: Grid
+    sensor: SensorModel
+    least: int
+    identified: bool
 
 
 def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform') -> Grid:

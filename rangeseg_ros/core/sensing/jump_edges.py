@@ -203,41 +203,25 @@ def sobel(image: RangeImage) -> GridEdges:
     valid = image.valid
     with np.errstate(divide='ignore'):
         depth = np.where(valid, 1 / image.inverse, 0).astype(np.float32)
-    complete = _complete(valid)
+    complete = cv2.erode(valid.view(np.uint8), np.ones((_WINDOW, _WINDOW), np.uint8)) > 0
     smooth = np.where(complete, cv2.medianBlur(depth, _WINDOW), depth)
-    gx = np.where(complete, cv2.Sobel(smooth, cv2.CV_32F, 1, 0), 0)
-    gy = np.where(complete, cv2.Sobel(smooth, cv2.CV_32F, 0, 1), 0)
+    gx, gy = (np.where(complete, cv2.Sobel(smooth, cv2.CV_32F, *d), 0) for d in ((1, 0), (0, 1)))
     strength = gx * gx + gy * gy
     # Infinite where nothing can be told.
     threshold = 2 * np.sqrt(strength[complete].mean()) if complete.any() else np.float32(np.inf)
-    ridge = _ridges(strength, np.abs(gx) >= np.abs(gy)) & (strength > threshold**2)
+    # Pixels no lower than the one before along the gradient, and higher than the one after.
+    framed = np.pad(strength, 1)
+    across = (strength >= framed[1:-1, :-2]) & (strength > framed[1:-1, 2:])
+    down = (strength >= framed[:-2, 1:-1]) & (strength > framed[2:, 1:-1])
+    ridge = np.where(np.abs(gx) >= np.abs(gy), across, down) & (strength > threshold**2)
     pixels = bridge_edges(ridge | ~valid) & valid
-    horizontal, vertical = edges_of(pixels)
     # A step between two columns or rows responds with the sum of the kernel's one side.
     step = threshold / _SOBEL_GAIN
-    horizontal |= (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
-    vertical |= (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]
+    horizontal = (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
+    vertical = (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]
+    horizontal |= pixels[:, 1:] | pixels[:, :-1]
+    vertical |= pixels[1:] | pixels[:-1]
     return horizontal, vertical
-
-
-def _ridges(strength: NDArray[np.float32], across: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels no lower than the one before and higher than the one after, along the gradient.
-
-    `across` (H, W) says where that runs along the rows, elsewhere along the columns.
-    """
-    framed = np.pad(strength, 1)
-    left, right = framed[1:-1, :-2], framed[1:-1, 2:]
-    upper, lower = framed[:-2, 1:-1], framed[2:, 1:-1]
-    return np.where(
-        across,
-        (strength >= left) & (strength > right),
-        (strength >= upper) & (strength > lower),
-    )
-
-
-def edges_of(pixels: NDArray[np.bool_]) -> GridEdges:
-    """All edges of the given pixels (H, W): edge pixels are disconnected from everything."""
-    return pixels[:, 1:] | pixels[:, :-1], pixels[1:] | pixels[:-1]
 
 
 def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
@@ -247,11 +231,6 @@ def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
     pixels[:, 1:] |= edges[0]
     pixels[1:] |= edges[1]
     return pixels
-
-
-def _complete(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels whose 3 x 3 window, as far as it lies in the image, was measured throughout."""
-    return cv2.erode(valid.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 # The eight neighbours in a circle, as bits, and the offsets of each: (row, column).

@@ -37,6 +37,17 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
 
 
 @njit(cache=True, inline='always')
+def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[Any, Any, Any]:
+    """Ray of a pixel.
+
+    Of a pinhole camera x is the same in all rows and y in all columns: two rows' worth of numbers
+    stay in cache then, and the rest of an image of rays is not read.
+    """
+    row, column = (0, 0) if pinhole else (i, j)
+    return rays[row, j, 0], rays[i, column, 1], rays[row, j, 2]
+
+
+@njit(cache=True, inline='always')
 def plus_pixel(
     sums: tuple[float, ...], x: float, y: float, z: float, inverse: float, weight: float
 ) -> tuple[float, ...]:
@@ -107,6 +118,23 @@ def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
     return x, y, z, left if left > 0 else 0.0
 
 
+@njit(cache=True, inline='always')
+def sums_of(moments: NDArray[np.float64], k: int) -> tuple[float, ...]:
+    """The first ten sums of one of N moment vectors (N, 13)."""
+    return (
+        moments[k, 0],
+        moments[k, 1],
+        moments[k, 2],
+        moments[k, 3],
+        moments[k, 4],
+        moments[k, 5],
+        moments[k, 6],
+        moments[k, 7],
+        moments[k, 8],
+        moments[k, CHI2],
+    )
+
+
 @njit(cache=True, error_model='numpy')
 def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     """Least-squares plane of a moment vector.
@@ -122,9 +150,7 @@ def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     float
         Weighted sum of the squared residuals.
     """
-    matrix = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    right = moments[6], moments[7], moments[8], moments[CHI2]
-    theta[0], theta[1], theta[2], left = plane_of(matrix + right)
+    theta[0], theta[1], theta[2], left = plane_of(sums_of(moments.reshape(1, -1), 0))
     return left
 
 

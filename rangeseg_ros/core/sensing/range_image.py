@@ -213,10 +213,14 @@ class RangeImage:
             )
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
-    def _doubt_unit(self, measured: str) -> None:
-        """Warn where more than half of what was measured is beyond any depth camera's reach."""
+    @property
+    def beyond_reach(self) -> bool:
+        """Whether more than half of what was measured is beyond any depth camera's reach."""
         far = self.valid & (self.inverse < 1 / FAR)
-        if 2 * np.count_nonzero(far) > np.count_nonzero(self.valid):
+        return bool(2 * np.count_nonzero(far) > np.count_nonzero(self.valid))
+
+    def _doubt_unit(self, measured: str) -> None:
+        if self.beyond_reach:
             warnings.warn(
                 f'more than half of the {measured} are beyond {FAR:.0f} m: are they in metres?',
                 UnitWarning,

@@ -37,21 +37,24 @@ def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.b
     """
     valid = image.valid
     steps = [max(size // _GRID, 1) for size in image.shape]
-    rows, columns = np.nonzero(valid[:: steps[0], :: steps[1]])
-    rows, columns = rows * steps[0], columns * steps[1]
-    if len(rows) < 10 * (_DEGREE + 1) ** 2:
+    rows, columns = (
+        places * step
+        for places, step in zip(np.nonzero(valid[:: steps[0], :: steps[1]]), steps, strict=True)
+    )
+    neighbours = valid[:, 1:] & valid[:, :-1]
+    if len(rows) < 10 * (_DEGREE + 1) ** 2 or not neighbours.any():
         return None
     known = image.rays[rows, columns].astype(np.float64)
     basis = _basis(rows, columns, image.shape)
     coefficients = np.linalg.lstsq(basis, known, rcond=None)[0]
     error = np.linalg.norm(basis @ coefficients - known, axis=1)
-    neighbours = valid[:, 1:] & valid[:, :-1]
-    if not neighbours.any():
-        return None
     pixel = np.median(np.linalg.norm(np.diff(image.rays, axis=1)[neighbours], axis=1))
     if np.quantile(error, 0.95) > _SMOOTH * pixel:
         return None
-    between = _between(valid) | _between(valid.T).T
+    between = np.zeros_like(valid)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(valid, axis)
+        between |= before & np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis), axis)
     rows, columns = np.nonzero(between & ~valid)
     rays = image.rays.copy()
     found = _basis(rows, columns, image.shape) @ coefficients
@@ -61,14 +64,8 @@ def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.b
 
 def _basis(
     rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
-) -> NDArray[np.float64]:
+) -> NDArray[np.floating]:
     """(N, M) Chebyshev polynomials of both coordinates."""
     v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
-    basis = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
-    return basis.astype(np.float64, copy=False)
-
-
-def _between(valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels with valid ones on either side in their row."""
-    after = np.logical_or.accumulate(valid[:, ::-1], axis=1)[:, ::-1]
-    return np.logical_or.accumulate(valid, axis=1) & after
+    basis: NDArray[np.floating] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis

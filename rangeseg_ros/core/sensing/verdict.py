@@ -1,19 +1,17 @@
 """Whether an image is what it is taken for: enlarged, filled, range for depth, a wrong unit.
 
-Each of these leaves exact traces in the image itself. Replicated pixels are also undone here.
+Each of these leaves exact traces in the image itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.enlargement import enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
 
 _SIGNIFICANT = 5.0
@@ -24,10 +22,8 @@ _SPREAD = 0.2
 """By which the bends of real planes differ, of that of a plane whose range is taken for depth."""
 _FEWEST = 40
 """Pixels that tell the bend of a plane."""
-_LINES, _FEW, _SAMPLE = 60, 24, 5000
-"""Rows or columns, those whose spectrum is looked at, and pixels, that stand for an image."""
-_LARGEST = 16
-"""Enlargement that is looked for."""
+_SAMPLE = 5000
+"""Pixels that stand for an image."""
 _KINECT_STEP = 1 / (8 * 580 * 0.075)
 """Step of the inverse depth of a Kinect, 1/m: an eighth of a pixel at 580 px and 75 mm."""
 _WRONG_UNITS = (5.0, 0.2, 10.0, 0.1, 1000.0, 0.001)
@@ -103,7 +99,7 @@ def judge(
             'Surfaces are flat only if the values are distances from the camera, not along its '
             'axis: multiply them by 1 / |ray|.'
         )
-    if 2 * np.count_nonzero(image.inverse[image.valid] < 1 / FAR) > np.count_nonzero(image.valid):
+    if image.beyond_reach:
         found['millimetres in floats'] = (
             f'More than half of the image is beyond {FAR:.0f} m: the values are not in metres.'
         )
@@ -124,140 +120,6 @@ def judge(
             'parameters are used.'
         )
     return Verdict(tuple(found), tuple(found.values()))
-
-
-class Cells(NamedTuple):
-    """Squares of pixels that hold one measurement each.
-
-    Attributes
-    ----------
-    factor : int
-        Pixels along a side.
-    rows, columns : int
-        How many of the first cell are cropped.
-    """
-
-    factor: int
-    rows: int
-    columns: int
-
-    def reduced(self, image: RangeImage) -> RangeImage:
-        """The image with a pixel for each cell, the cropped ones included."""
-        k, (height, width) = self.factor, image.shape
-        v = np.clip(np.arange(k // 2 - self.rows, height + k // 2, k), 0, height - 1)
-        u = np.clip(np.arange(k // 2 - self.columns, width + k // 2, k), 0, width - 1)
-        v, u = v[: -(-(height + self.rows) // k)], u[: -(-(width + self.columns) // k)]
-        picked = np.ix_(v, u)
-        camera = _camera_of_cells(self, image.camera) if image.camera else None
-        rays = image.rays[picked] if camera is None else camera.rays
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
-        body = None if image.body is None else image.body[picked]
-        return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
-
-    def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
-        """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""
-        v = (np.arange(shape[0]) + self.rows) // self.factor
-        u = (np.arange(shape[1]) + self.columns) // self.factor
-        return array[np.ix_(v, u)]
-
-
-@lru_cache(maxsize=4)
-def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
-    # Kept, as its rays are worked out only once. A cell's measurement is of its centre.
-    k, middle = cells.factor, (cells.factor - 1) / 2
-    return replace(
-        camera,
-        width=-(-(camera.width + cells.columns) // k),
-        height=-(-(camera.height + cells.rows) // k),
-        fx=camera.fx / k,
-        fy=camera.fy / k,
-        cx=(camera.cx + cells.columns - middle) / k,
-        cy=(camera.cy + cells.rows - middle) / k,
-        skew=camera.skew / k,
-    )
-
-
-def enlargement(image: RangeImage) -> Cells | None:
-    """Cells of one measurement each, where an image was enlarged; None where it was not."""
-    return replication(image) or interpolation(image)
-
-
-def replication(image: RangeImage) -> Cells | None:
-    """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
-
-    Neighbours differ at the borders of the cells only, so that the columns at which any differ are
-    multiples of the factor apart, and so are the rows. At least half of the borders must show it:
-    a few edges of an exact scene may lie at multiples by chance.
-    """
-    inverse = image.inverse
-    columns = _period(inverse[:: max(len(inverse) // _LINES, 1)])
-    if columns is None:
-        return None
-    rows = _period(inverse[:, :: max(inverse.shape[1] // _LINES, 1)].T)
-    if rows is None or rows[0] != columns[0]:
-        return None
-    return Cells(columns[0], rows[1], columns[1])
-
-
-def _period(lines: NDArray[np.float32]) -> tuple[int, int] | None:
-    """Distance of the columns at which values change, and what the first one lacks."""
-    before, after = lines[:, :-1], lines[:, 1:]
-    changes = np.flatnonzero(((before != after) & (before > 0) & (after > 0)).any(axis=0)) + 1
-    if len(changes) < 2:
-        return None
-    period = int(np.gcd.reduce(np.diff(changes)))
-    few = 2 * len(changes) * period < lines.shape[1]
-    if few or not 2 <= period <= _LARGEST:
-        return None
-    return period, int(-changes[0] % period)
-
-
-def interpolation(image: RangeImage) -> Cells | None:
-    """Cells between whose centres the depth is linear; None where it is not.
-
-    Second differences along a line vanish but beside the centres, at every k-th pixel: their
-    mean size per column has a line in its spectrum (Fisher, Tests of significance in harmonic
-    analysis, 1929). For k = 2, third differences have one. Which pixels are the centres does not
-    matter: one of every k x k pixels is as good as another.
-    """
-    for order, least in ((2, 3), (3, 2)):
-        both = np.full(_LARGEST + 1, np.inf)
-        for lines in (image.inverse, image.inverse.T):
-            some = lines[:: max(len(lines) // _FEW, 1)]
-            if (both[least:] > _SIGNIFICANT).any():
-                both = np.minimum(both, _spectrum(some, order))
-        periods = [k for k in range(least, _LARGEST + 1) if both[k] > _SIGNIFICANT]
-        if periods and (order == 2 or 2 in periods):
-            # Of a period all divisors show.
-            return Cells(max(periods) if order == 2 else 2, 0, 0)
-    return None
-
-
-def _spectrum(lines: NDArray[np.float32], order: int) -> NDArray[np.float64]:
-    """Amplitude of the differences' size at each period 0..._LARGEST, in standard errors."""
-    amplitude = np.zeros(_LARGEST + 1)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        size = np.abs(np.diff(1 / lines.astype(np.float64), order))
-        distance = 1 / lines[:, : size.shape[1]]
-    known = np.isfinite(size)
-    # Of float32, and of sensors whose steps are wide, many are 0.
-    changes = size[known & (size > 1e-5 * distance)]
-    if not len(changes):
-        return amplitude
-    # Edges of objects are no part of it.
-    size = np.where(known, np.minimum(size, 2 * np.median(changes)), 0)
-    counts = known.sum(axis=0)
-    columns = np.flatnonzero(counts)
-    means = size.sum(axis=0)[columns] / counts[columns]
-    if len(columns) < 2 * _LARGEST or not means.std():
-        return amplitude
-    periods = np.arange(2, _LARGEST + 1)
-    waves = np.exp(2j * np.pi * columns / periods[:, None])
-    amplitude[2:] = np.abs((waves * (means - means.mean())).sum(axis=1)) / (
-        means.std() * len(columns) ** 0.5
-    )
-    return amplitude
 
 
 def filled_share(image: RangeImage) -> float:
@@ -307,16 +169,13 @@ def shows_range(
     if image.camera is None:
         return False
     step = max(round((labels.size / _SAMPLE) ** 0.5), 1)
-    measured = image.inverse[::step, ::step].ravel()
-    some = np.where(measured > 0, labels[::step, ::step].ravel(), 0)
-    order = np.argsort(some, kind='stable')
-    ends = np.searchsorted(some[order], (0, *planes), side='right')
-    rays = image.rays[::step, ::step].reshape(-1, 3)
+    inverse, labels = image.inverse[::step, ::step], labels[::step, ::step]
     odds = 0.0
-    for first, after, theta in zip(ends[:-1], ends[1:], planes.values(), strict=True):
-        if after - first > _FEWEST:
-            seen = order[first:after]
-            share, variance = _share_of_range(rays[seen].astype(float), measured[seen], theta)
+    for label, theta in planes.items():
+        seen = (labels == label) & (inverse > 0)
+        if np.count_nonzero(seen) > _FEWEST:
+            rays = image.rays[::step, ::step][seen].astype(float)
+            share, variance = _share_of_range(rays, inverse[seen], theta)
             # Real planes differ by more than their noise tells.
             variance += _SPREAD**2
             odds += np.log1p(share**2 / variance) - np.log1p((share - 1) ** 2 / variance)
@@ -327,14 +186,12 @@ def _share_of_range(
     rays: NDArray[np.float64], inverse: NDArray[np.float32], theta: NDArray[np.float64]
 ) -> tuple[float, float]:
     """Share of the bend in one plane, and its variance; what does not fit is left out."""
-    bend = (rays @ theta) * (1 / np.sqrt(np.einsum('ij,ij->i', rays, rays)) - 1)
+    bend = (rays @ theta) * (1 / np.linalg.norm(rays, axis=1) - 1)
     terms = np.column_stack([rays, bend])
     kept = np.ones(len(rays), np.bool_)
-    for _ in range(3):
-        used = terms[kept]
-        matrix = used.T @ used
-        covariance = np.linalg.inv(matrix + 1e-12 * np.trace(matrix) * np.eye(4))
-        solution = covariance @ (used.T @ inverse[kept])
+    for _ in range(2):
+        covariance = np.linalg.pinv(terms[kept].T @ terms[kept], hermitian=True)
+        solution = covariance @ (terms[kept].T @ inverse[kept])
         left = np.abs(inverse - terms @ solution)
         variance = np.mean(left[kept] ** 2) * covariance[3, 3]
         kept = left < 3 * 1.4826 * np.median(left) + 1e-9

@@ -1,0 +1,150 @@
+"""Images with fewer measurements than pixels, because somebody enlarged them: found and undone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+
+_SIGNIFICANT = 5.0
+"""Standard errors by which a line of a spectrum differs from chance in any image."""
+_LINES, _FEW = 60, 24
+"""Rows or columns, and those whose spectrum is looked at, that stand for an image."""
+_LARGEST = 16
+"""Enlargement that is looked for."""
+
+
+class Cells(NamedTuple):
+    """Squares of pixels that hold one measurement each.
+
+    Attributes
+    ----------
+    factor : int
+        Pixels along a side.
+    rows, columns : int
+        How many of the first cell are cropped.
+    """
+
+    factor: int
+    rows: int
+    columns: int
+
+    def reduced(self, image: RangeImage) -> RangeImage:
+        """The image with a pixel for each cell, the cropped ones included."""
+        k, (height, width) = self.factor, image.shape
+        v = np.clip(np.arange(k // 2 - self.rows, height + k // 2, k), 0, height - 1)
+        u = np.clip(np.arange(k // 2 - self.columns, width + k // 2, k), 0, width - 1)
+        v, u = v[: -(-(height + self.rows) // k)], u[: -(-(width + self.columns) // k)]
+        picked = np.ix_(v, u)
+        camera = _camera_of_cells(self, image.camera) if image.camera else None
+        rays = image.rays[picked] if camera is None else camera.rays
+        # Like those of cameras, or every kernel that reads them is compiled twice.
+        rays.flags.writeable = False
+        body = None if image.body is None else image.body[picked]
+        return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
+
+    def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
+        """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""
+        v = (np.arange(shape[0]) + self.rows) // self.factor
+        u = (np.arange(shape[1]) + self.columns) // self.factor
+        return array[np.ix_(v, u)]
+
+
+@lru_cache(maxsize=4)
+def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
+    # Kept, as its rays are worked out only once. A cell's measurement is of its centre.
+    k, middle = cells.factor, (cells.factor - 1) / 2
+    return replace(
+        camera,
+        width=-(-(camera.width + cells.columns) // k),
+        height=-(-(camera.height + cells.rows) // k),
+        fx=camera.fx / k,
+        fy=camera.fy / k,
+        cx=(camera.cx + cells.columns - middle) / k,
+        cy=(camera.cy + cells.rows - middle) / k,
+        skew=camera.skew / k,
+    )
+
+
+def enlargement(image: RangeImage) -> Cells | None:
+    """Cells of one measurement each, where an image was enlarged; None where it was not."""
+    return replication(image) or interpolation(image)
+
+
+def replication(image: RangeImage) -> Cells | None:
+    """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
+
+    Neighbours differ at the borders of the cells only, so that the columns at which any differ are
+    multiples of the factor apart, and so are the rows. At least half of the borders must show it:
+    a few edges of an exact scene may lie at multiples by chance.
+    """
+    inverse = image.inverse
+    columns = _period(inverse[:: max(len(inverse) // _LINES, 1)])
+    if columns is None:
+        return None
+    rows = _period(inverse[:, :: max(inverse.shape[1] // _LINES, 1)].T)
+    if rows is None or rows[0] != columns[0]:
+        return None
+    return Cells(columns[0], rows[1], columns[1])
+
+
+def _period(lines: NDArray[np.float32]) -> tuple[int, int] | None:
+    """Distance of the columns at which values change, and what the first one lacks."""
+    before, after = lines[:, :-1], lines[:, 1:]
+    changes = np.flatnonzero(((before != after) & (before > 0) & (after > 0)).any(axis=0)) + 1
+    if len(changes) < 2:
+        return None
+    period = int(np.gcd.reduce(np.diff(changes)))
+    few = 2 * len(changes) * period < lines.shape[1]
+    if few or not 2 <= period <= _LARGEST:
+        return None
+    return period, int(-changes[0] % period)
+
+
+def interpolation(image: RangeImage) -> Cells | None:
+    """Cells between whose centres the depth is linear; None where it is not.
+
+    Second differences along a line vanish but beside the centres, at every k-th pixel: their
+    mean size per column has a line in its spectrum (Fisher, Tests of significance in harmonic
+    analysis, 1929). For k = 2, third differences have one. Which pixels are the centres does not
+    matter: one of every k x k pixels is as good as another.
+    """
+    amplitude = np.full(_LARGEST + 1, np.inf)
+    for lines in (image.inverse, image.inverse.T):
+        some = lines[:: max(len(lines) // _FEW, 1)]
+        found = _spectrum(some, 2)
+        found[2] = _spectrum(some, 3)[2]
+        amplitude = np.minimum(amplitude, found)
+        # Of a period all divisors show.
+        periods = np.flatnonzero(amplitude > _SIGNIFICANT)
+        if not len(periods):
+            return None
+    return Cells(int(periods[-1]), 0, 0)
+
+
+def _spectrum(lines: NDArray[np.float32], order: int) -> NDArray[np.float64]:
+    """Amplitude of the differences' size at each period 0..._LARGEST, in standard errors."""
+    amplitude = np.zeros(_LARGEST + 1)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        size = np.abs(np.diff(1 / lines.astype(np.float64), order))
+        distance = 1 / lines[:, : size.shape[1]]
+    known = np.isfinite(size)
+    # Of float32, and of sensors whose steps are wide, many are 0.
+    changes = size[known & (size > 1e-5 * distance)]
+    columns = np.flatnonzero(known.any(axis=0))
+    if not len(changes) or len(columns) < 2 * _LARGEST:
+        return amplitude
+    # Edges of objects are no part of it.
+    size = np.where(known, np.minimum(size, 2 * np.median(changes)), 0)
+    means = size.sum(axis=0)[columns] / known.sum(axis=0)[columns]
+    if means.std() > 0:
+        waves = np.exp(2j * np.pi * columns / np.arange(2, _LARGEST + 1)[:, None])
+        sums = np.abs((waves * (means - means.mean())).sum(axis=1))
+        amplitude[2:] = sums / (means.std() * len(columns) ** 0.5)
+    return amplitude
