@@ -79,13 +79,6 @@ def test_damage_in_the_middle_never_escapes_as_another_error(tmp_path, storage):
             assert len(frames) <= 20
 
 
-def test_a_recording_without_its_metadata_is_read(tmp_path):
-    images = depth_images(3)
-    record(tmp_path / 'bag', 'mcap', images)
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    np.testing.assert_array_equal([f.depth for f in read(tmp_path / 'bag')], images)
-
-
 def test_parts_of_a_recording_are_read_in_order(tmp_path):
     images = depth_images(12)
     (tmp_path / 'bag').mkdir()

@@ -82,17 +82,3 @@ def test_an_image_without_holes_is_itself():
     inverse, _ = crease()
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
-
-
-@pytest.mark.parametrize('size', [(32, 24), (160, 120), (424, 240), (1280, 720), (1920, 1080)])
-def test_images_of_every_size_segment_alike(size):
-    width, height = size
-    focal = 0.9 * width
-    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    random = np.random.default_rng(2)
-    left, right = camera.rays @ np.array([0.3, 0.0, 0.6]), camera.rays @ np.array([-0.3, 0.0, 0.6])
-    inverse = np.maximum(left, right) + random.normal(0, 0.001, camera.shape)
-    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-    result = Segmenter(Config()).segment(image)
-    assert len(result.planes) == 2
-    assert (result.labels > 0).mean() > 0.9

@@ -99,12 +99,6 @@ def test_pixels_without_normal_belong_to_their_side_of_a_jump():
     assert (found[:, :35] == 5).all() and (found[:, 35:] == 40).all()
 
 
-def test_same_labels_every_time():
-    arguments, _ = problem(2)
-    first = coarse_to_fine.minimise(*arguments)
-    assert np.array_equal(first, coarse_to_fine.minimise(*arguments))
-
-
 def labels_of_a_small_problem():
     arguments, _ = problem(3, 60, 60)
     return coarse_to_fine.minimise(*arguments).ravel().tolist()

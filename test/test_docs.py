@@ -272,23 +272,3 @@ def test_the_benchmark_prints_its_table(monkeypatch, tmp_path, capsys):
     rows = re.findall(r'^\| (\w+) \| ([.\d]+) \| (\d+) of (\d+)', capsys.readouterr().out, re.M)
     (_, ours, found, faces), (_, theirs, *_) = rows
     assert float(ours) > 0.8 > float(theirs) and 0 < int(found) <= int(faces)
-
-
-def test_every_page_is_in_the_site():
-    order = (ROOT / 'mkdocs.yml').read_text()
-    for path in (ROOT / 'docs').glob('*.md'):
-        assert f'{path.name}\n' in order, path.name
-
-
-def test_functions_of_more_than_seven_parameters_say_why():
-    """Compiled kernels take arrays, not objects, and commands their options: both are many."""
-    for path in PACKAGE.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
-            count = sum(argument.arg not in ('self', 'cls') for argument in arguments)
-            decorated = ' '.join(map(ast.unparse, node.decorator_list))
-            if count > 7 and not re.search(r'njit|register_jitable|\bcommand\(', decorated):
-                told = ast.get_docstring(node) or ''
-                assert 'More than seven parameters' in told, f'{path.name}: {node.name}'

@@ -109,15 +109,3 @@ def test_a_thinned_cloud_has_a_point_of_every_cube_that_has_any():
     assert {tuple(cube) for cube in np.floor(kept[:, :3] / 0.5).astype(int)} == cubes
     assert len(kept) == len(cubes) and len(thinned(points, 0.01, 1000)) <= 1000
     assert (thinned(points, 0.0) == points).all()
-
-
-def test_a_stated_height_goes_before_that_of_tf():
-    drive = Drive()
-    frame = simulate_terrain(
-        Terrain('', (FLOOR,), (slab(-3, FAR, 0, 0, ALL),), drive.pose), Kinect(), CAMERA, seed=1
-    )
-    image = RangeImage.from_depth(frame.depth, CAMERA)
-    config = drive.sequence.config
-    for stated, given, taken in ((HEIGHT, 1.1, HEIGHT), (0.0, 1.1, 1.1), (0.0, 0.0, 0.0)):
-        sequence = SequenceSegmenter(replace(config, sensor_height=stated))
-        assert sequence.segment(image, 0, height=given).survey.sensor_height == taken

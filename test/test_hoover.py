@@ -18,24 +18,6 @@ def overlap(*runs):
     return Overlap.between(truth[None], labels[None])
 
 
-def counts(runs, tolerance):
-    result = classify(overlap(*runs), tolerance).counts()
-    return tuple(result[k] for k in ('regions', 'correct', 'over', 'under', 'missed', 'noise'))
-
-
-def test_exactly_the_tolerance_is_enough():
-    # 8 of the 10 pixels on both sides: m1 = m2 = 0.8.
-    runs = [(1, 1, 8), (1, 0, 2), (0, 1, 2)]
-    assert counts(runs, 0.8) == (1, 1, 0, 0, 0, 0)
-    assert counts(runs, 0.81) == (1, 0, 0, 0, 1, 1)
-
-
-def test_empty_images():
-    assert counts([(0, 0, 4)], 0.8) == (0, 0, 0, 0, 0, 0)
-    assert counts([(1, 0, 4)], 0.8) == (1, 0, 0, 0, 1, 0)
-    assert counts([(0, 1, 4)], 0.8) == (0, 0, 0, 0, 0, 1)
-
-
 @pytest.mark.parametrize('tolerance', [0.5, 1.01, -1.0, float('nan')])
 def test_tolerance_out_of_range(tolerance):
     with pytest.raises(ComparisonError, match='tolerance'):

@@ -26,12 +26,6 @@ def result(seen):
     return rangeseg_ros.segment(seen.depth, seen.camera)
 
 
-def test_completion_sees_the_interface():
-    assert set(dir(rangeseg_ros)) == set(rangeseg_ros.__all__)
-    for name in dir(rangeseg_ros):
-        assert getattr(rangeseg_ros, name) is not None
-
-
 def test_one_call_gives_what_the_segmenter_gives(seen, result):
     image = RangeImage.from_depth(seen.depth, seen.camera)
     assert (result.labels == Segmenter(Config()).segment(image).labels).all()

@@ -123,24 +123,6 @@ def test_frames_without_a_plane_say_why(depth, method):
     assert result.reason
 
 
-@pytest.mark.parametrize('method', ['normals', 'planes'])
-@pytest.mark.parametrize('shape', [(1, 1), (1, 50), (50, 1), (2, 2), (7, 9)])
-def test_tiny_images(shape, method):
-    camera = Camera(shape[1], shape[0], 50.0, 50.0, 0.0, 0.0)
-    result = segment(np.full(shape, 1500, np.uint16), Config(method=method, min_pixels=64), camera)
-    assert result.planes == [] and result.labels.shape == shape
-    assert result.reason
-
-
-def test_holes_and_infinities_leave_the_rest_alone():
-    depth = corner()
-    depth[5:9, 20:30] = np.inf
-    depth[30:34, 10:20] = np.nan
-    result = segment(depth)
-    assert len(result.planes) == 3
-    assert not result.labels[5:9, 20:30].any() and not result.labels[30:34, 10:20].any()
-
-
 def _digest():
     frame = simulate_kinect(kinect_room(3), Camera(160, 120, 146.0, 146.0, 79.5, 59.5), seed=1)
     return hashlib.sha256(segment(frame.depth, NORMALS, frame.camera).labels.tobytes()).hexdigest()
@@ -159,14 +141,6 @@ def test_same_labels_bit_for_bit_twice_and_in_another_process():
         check=True,
     )
     assert other.stdout.strip() == first
-
-
-def test_dithering_repeats_with_its_seed():
-    config = replace(NORMALS, dithering=0.002)
-    first, again = segment(corner(), config), segment(corner(), config)
-    other = segment(corner(), replace(config, seed=1))
-    np.testing.assert_array_equal(first.labels, again.labels)
-    assert first.energy == again.energy != other.energy
 
 
 @pytest.mark.parametrize('config', [Config(min_pixels=100), NORMALS], ids=['planes', 'normals'])

@@ -8,7 +8,7 @@ import pytest
 from clouds import cloud_of
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -291,17 +291,6 @@ def test_any_number_of_threads_finds_the_same():
         cv2.setNumThreads(before)
     np.testing.assert_array_equal(maps[0][0], maps[1][0])
     np.testing.assert_array_equal(maps[0][1], maps[1][1])
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (3, 2), (24, 32)])
-@pytest.mark.parametrize('value', [0, 1000])
-def test_images_of_any_size(shape, value):
-    camera = Camera(shape[1], shape[0], 60.0, 60.0, shape[1] / 2, shape[0] / 2)
-    image = RangeImage.from_depth(np.full(shape, value, np.uint16), camera)
-    for height in (0.0, 1.0):
-        result = Segmenter(Config(sensor_height=height)).segment(image)
-        assert result.terrain.shape == result.height.shape == shape
-        assert value or not result.terrain.any()
 
 
 @pytest.mark.parametrize('kind', KINDS)

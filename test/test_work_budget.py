@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from clouds import cloud_of
 
-from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.runtime.work import STEPS, step_within
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -80,14 +80,6 @@ def test_clouds_and_bodies_are_halved(image):
     body[150:] = True
     hidden = Segmenter(budget).segment(image.without(body))
     assert hidden.planes and not hidden.labels[body].any()
-
-
-@pytest.mark.parametrize('shape', [(1, 1), (1, 9), (2, 3), (5, 1)])
-def test_tiny_images(shape):
-    height, width = shape
-    camera = Camera(width, height, 5.0, 5.0, width / 2, height / 2)
-    image = RangeImage.from_depth(np.full(shape, 1000, np.uint16), camera)
-    assert Segmenter(Config(work_budget=0.7)).segment(image).labels.shape == shape
 
 
 def test_budgets_are_for_method_planes():
