@@ -10,7 +10,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-from recordings import SUFFIXES, Recording, depth_images, record
+from recordings import Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bag_formats import Lost, Record, unpack
@@ -18,7 +18,6 @@ from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.recordings import BagError, unpacked
 
-STORAGES = tuple(SUFFIXES)
 START, STEP = 10**18, 33_333_333
 
 

@@ -17,8 +17,6 @@ from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
 
-COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
-
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):

@@ -205,33 +205,6 @@ def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
     assert list((out / 'bag').glob('*.mcap'))
 
 
-KILLED = """
-import os, shutil, sys
-from rangeseg_ros.cli.main import main
-rmtree = shutil.rmtree
-def killed(path, *rest, **more):
-    if str(path).endswith('.bag'):
-        os.remove(path / 'metadata.yaml')
-        os.kill(os.getpid(), 9)
-    rmtree(path, *rest, **more)
-shutil.rmtree = killed
-sys.argv[0] = 'rangeseg'
-main()
-"""
-
-
-def test_a_kill_while_old_results_are_cleared_is_repaired(walls, run):
-    recording, out = walls
-    run('replay', recording, '--output', out)
-    expected = results(out)
-    options = ('replay', recording, '--output', out)
-    (out.parent / 'other.yaml').write_text('min_pixels: 50')
-    command = [sys.executable, '-c', KILLED, *options, '--params', out.parent / 'other.yaml']
-    assert subprocess.run(command, check=False).returncode == -9
-    assert run(*options)[0] == 0
-    assert results(out) == expected
-
-
 def test_two_replays_do_not_write_into_one_folder(walls, run):
     import fcntl
 

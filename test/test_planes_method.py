@@ -1,12 +1,7 @@
-"""Method planes as a whole: accuracy, determinism, any size, whatever there is not."""
+"""Method planes as a whole: accuracy, any size, whatever there is not."""
 
-import json
-import os
-import subprocess
-import sys
 from contextlib import nullcontext
 
-import cv2
 import numpy as np
 import pytest
 
@@ -83,48 +78,6 @@ def test_small_images_show_the_same_faces(width, height, noise, mean_iou, share)
     assert correct >= share * sum(len(overlap.truth) for overlap in overlaps)
 
 
-def small_fingerprint():
-    """Labels and planes of a small room, bit for bit."""
-    frame = room(903, 'measured', 160, 120)
-    result = segmented(frame.depth, frame.camera, min_pixels=100)
-    planes = [(p.label, p.count, *map(float, p.normal), float(p.distance)) for p in result.planes]
-    return json.loads(json.dumps([result.labels.tolist(), planes]))
-
-
-@pytest.fixture(scope='module')
-def fingerprint():
-    labels, planes = small_fingerprint()
-    assert len(planes) >= 5
-    return labels, planes
-
-
-def in_another_process(**environment):
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **environment}
-    text = subprocess.check_output([sys.executable, __file__], env=environment, text=True)
-    return json.loads(text)
-
-
-def test_two_processes_agree_bit_for_bit(fingerprint):
-    assert in_another_process(PYTHONHASHSEED='7') == [*fingerprint]
-
-
-@pytest.mark.parametrize('threads', [1, 2, 5])
-def test_any_number_of_threads_agrees_bit_for_bit(fingerprint, threads):
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(threads)
-    try:
-        assert small_fingerprint() == [*fingerprint]
-    finally:
-        cv2.setNumThreads(before)
-
-
-def test_compiled_code_gives_the_labels_of_the_plain_python(fingerprint):
-    """The planes are the same but for the order in which floating-point sums are taken."""
-    labels, planes = in_another_process(NUMBA_DISABLE_JIT='1')
-    assert labels == fingerprint[0]
-    np.testing.assert_allclose(planes, fingerprint[1], rtol=1e-6, atol=1e-9)
-
-
 @pytest.mark.parametrize('size', [(424, 240), (212, 120), (101, 67), (37, 61)])
 def test_any_size(size):
     """Also those that blocks do not divide."""
@@ -190,7 +143,3 @@ def test_faces_of_twenty_pixels_are_planes_of_their_own():
     result = segmented(depth, camera)
     assert [int(result.labels[205, left]) > 1 for left in (105, 305, 505)] == [True, True, False]
     assert len(result.planes) == 3
-
-
-if __name__ == '__main__':
-    print(json.dumps(small_fingerprint()))

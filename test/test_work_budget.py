@@ -2,7 +2,6 @@
 
 from itertools import pairwise
 
-import cv2
 import numpy as np
 import pytest
 from clouds import cloud_of
@@ -38,18 +37,6 @@ def test_less_is_never_more():
     assert [step_within(budget) for budget in STEPS] == [1, 2, 4]
     assert steps[0] == 1 and steps[-1] == 4
     assert all(before <= after for before, after in pairwise(steps))
-
-
-@pytest.mark.parametrize('budget', BUDGETS)
-def test_results_do_not_depend_on_the_number_of_threads(image, results, budget):
-    before = cv2.getNumThreads()
-    try:
-        for threads in (1, 3):
-            cv2.setNumThreads(threads)
-            again = Segmenter(Config(work_budget=budget)).segment(image)
-            assert (again.labels == results[budget].labels).all()
-    finally:
-        cv2.setNumThreads(before)
 
 
 @pytest.mark.parametrize('budget', BUDGETS)
