@@ -146,6 +146,13 @@ def test_time_of_flight_is_offset_where_stray_light_is():
     assert 0.005 < abs(error) < 0.15
 
 
+@pytest.mark.parametrize(('distance', 'low', 'high'), [(3, 0.98, 1), (6, 0.7, 0.95), (16, 0, 0.1)])
+def test_time_of_flight_fades_with_the_square_of_the_distance(distance, low, high):
+    """Lost below 0.015 of the light that comes back from 1 m, which at 8.2 m is half of all."""
+    frame = simulate(in_camera_frame(wall(distance)), TimeOfFlight(), seed=0)
+    assert low <= (frame.depth > 0).mean() <= high
+
+
 def test_slopes_and_shadows_of_a_depth_image():
     camera = Camera(160, 120, 146.0, 146.0, 79.5, 59.5)
     angle = np.radians(50)

@@ -118,6 +118,15 @@ def test_bars_break_where_a_plane_is_out_of_sight():
     assert charts.runs(np.arange(10)) == [(0, 9)]
 
 
+def test_each_plane_of_a_chart_has_a_fifth_of_an_inch():
+    def height(count):
+        seen = sightings(*((0, number, 1.0, 2.0) for number in range(count)))
+        picture = charts.id_bars(seen, np.array([0.0]))
+        return float(re.search(r'<svg [^>]*height="([.\d]+)pt"', picture)[1])
+
+    assert height(30) - height(10) == pytest.approx(20 * 0.2 * 72)
+
+
 def test_replay_of_a_damaged_recording_says_so(tmp_path):
     file = next(record_walls(tmp_path / 'bag', 16).glob('*.mcap'))
     with file.open('r+b') as stream:
