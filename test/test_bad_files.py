@@ -206,32 +206,3 @@ def test_errors_are_one_line_of_printable_characters():
     assert one_line(ValueError('a\nb\x00\x1b[31m')) == 'a\\nb\\x00\\x1b[31m'
     assert one_line(MemoryError()) == 'not enough memory'
     assert one_line(FileNotFoundError(2, 'No such file', 'x')) == 'x: No such file'
-
-
-def test_links_in_a_circle_are_told(tmp_path, monkeypatch, run):
-    monkeypatch.chdir(tmp_path)
-    for one, other in (('a', 'b'), ('b', 'a')):
-        os.symlink(one, other)
-    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
-    write_image(tmp_path / 'depth' / '1.png', np.ones((48, 64), np.uint16))
-    for command in (
-        ('segment', 'depth/1.png', '--camera', 'camera.yaml', '--output', 'a'),
-        ('pack', 'depth', '--camera', 'camera.yaml', '--output', 'a'),
-        ('compare', 'depth', 'depth', '--json', 'a'),
-    ):
-        code, _, error = run(*command)
-        assert code and 'symbolic links' in error and error.count('\n') == 1, command
-    assert (tmp_path / 'a').is_symlink()
-
-
-def test_an_output_that_is_another_name_of_an_input_leaves_the_input(tmp_path, monkeypatch, run):
-    monkeypatch.chdir(tmp_path)
-    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
-    depth = np.full((48, 64), 1000, np.uint16)
-    write_image(tmp_path / 'depth.png', depth)
-    os.link('depth.png', 'depth_labels.png')
-    arguments = ('--camera', 'camera.yaml', '--output', '.', '--overwrite')
-    code, _, error = run('segment', 'depth.png', *arguments)
-    assert (code, error) == (0, '')
-    assert (read_depth(tmp_path / 'depth.png') == depth).all()
-    assert (read_depth(tmp_path / 'depth_labels.png') == 1).any()

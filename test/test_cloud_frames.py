@@ -208,18 +208,6 @@ def test_no_place_is_made_up(points):
     np.testing.assert_allclose(image.points[known], moved[known], rtol=1e-5)
 
 
-def test_walls_without_noise_tell_no_place():
-    # The fewer the pixels, the more cameras there are that are off by less than is let pass.
-    camera = Camera(32, 24, 29.0, 29.1, 15.8, 12.1)
-    random, rays = np.random.default_rng(3), camera.rays.astype(float)
-    for _ in range(100):
-        normal = random.normal(size=3) * (0.5, 0.5, 0.2) - (0, 0, 1)
-        depth = -2 / (rays @ normal)
-        points = np.where(depth > 0, depth, np.nan)[..., None] * rays
-        frame = rotation_by(random.normal(size=3)), random.normal(size=3)
-        assert not cloud_in(frame, points).place.any()
-
-
 def test_a_sequence_is_followed_as_that_of_the_depth_images():
     config = Config(odometry=True, **stated((0, 0, 1)))
     seen, moved = SequenceSegmenter(config), SequenceSegmenter(config)

@@ -40,7 +40,7 @@ class Drive:
         pose = replace_position(self.pose, (x, 0, HEIGHT))
         scene = Terrain('', tuple(pieces), (slab(-3, FAR, 0, 0, ALL),), pose)
         frame = simulate_terrain(scene, Kinect(), CAMERA, seed=int(second))
-        told = Transform(pose.rotation, pose.position + (0, 0, GROUND_IN_MAP))
+        told = Transform(pose.rotation, pose.position + np.array([0, 0, GROUND_IN_MAP]))
         at = told if self.sequence.config.map_frame else None
         image = RangeImage.from_depth(frame.depth, CAMERA)
         return self.sequence.segment(image, int(1e9 * second), pose=at).grid

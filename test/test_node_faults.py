@@ -66,12 +66,6 @@ def test_camera_info_that_comes_late_or_never(bench):
     assert_segments(bench)
 
 
-def test_impossible_focal_length(bench, focal=float('nan')):
-    bench.camera_info.publish(bench.info(k=[focal, 0.0, 80.0, 0.0, focal, 60.0, 0.0, 0.0, 1.0]))
-    error_about(bench, 'unusable camera_info', bench.image())
-    assert_segments(bench)
-
-
 def test_camera_info_of_another_frame_is_used_with_a_warning(bench):
     info = bench.info()
     info.header.frame_id = 'elsewhere'

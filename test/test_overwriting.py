@@ -205,18 +205,6 @@ def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
     assert list((out / 'bag').glob('*.mcap'))
 
 
-def test_two_replays_do_not_write_into_one_folder(walls, run):
-    import fcntl
-
-    recording, out = walls
-    out.mkdir()
-    with (out / MARK).open('a') as mark:
-        fcntl.flock(mark, fcntl.LOCK_EX)
-        code, _, error = run('replay', recording, '--output', out)
-    assert code == 2 and 'another replay writes there' in error
-    assert run('replay', recording, '--output', out)[0] == 0
-
-
 def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run):
     monkeypatch.chdir(tmp_path)
     for name in ('set/a/b', 'set/a_b', 'set/c'):

@@ -134,16 +134,6 @@ def test_the_camera_may_be_rolled(roll):
     assert share(result, frame, DROP, GROUND) < 0.002
 
 
-def test_clouds_of_any_sensor():
-    image, result, frame = found(scene(*drop_of(0.15)))
-    cloud = cloud_of(image.points)
-    up = Rotation.from_euler('xyz', [1, -1, 1], degrees=True).apply(scene().up)
-    config = Config(up_x=up[0], up_y=up[1], up_z=up[2], sensor_height=HEIGHT)
-    again = Segmenter(config).segment(cloud)
-    assert (again.terrain == result.terrain).mean() > 0.99
-    assert share(again, frame, DROP, GROUND) < 0.001
-
-
 def test_crossings_lie_on_the_ground_continued():
     terrain = scene(*drop_of(0.3))
     image, result, _ = found(terrain)
