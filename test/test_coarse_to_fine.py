@@ -73,12 +73,6 @@ def test_any_size_of_image(shape):
     assert (coarse_to_fine.minimise(normals, DIRECTIONS, connected(*shape), 40.0) == 5).all()
 
 
-def test_no_normal_at_all():
-    normals = np.full((20, 30, 3), np.nan, np.float32)
-    found = coarse_to_fine.minimise(normals, DIRECTIONS, connected(20, 30), 40.0)
-    assert len(np.unique(found)) == 1
-
-
 def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
     cosines = np.append(np.linspace(-1, 1, 501), [1 + 1e-7, -1 - 1e-7]).astype(np.float32)
     found = [degrees(cosine) for cosine in cosines]

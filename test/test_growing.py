@@ -149,16 +149,6 @@ def test_clutter_is_no_surface():
     assert (labels[:9] > 0).mean() > 0.9 and (labels[21:] > 0).mean() > 0.9
 
 
-def test_nothing_to_grow_from():
-    links = np.ones((5, 6), bool), np.ones((4, 7), bool)
-    nodes = Nodes(np.zeros((5, 7, 13)), np.zeros((5, 7)), *links)
-    sensor = SensorModel.from_config(Config())
-    patches = Patches.of(nodes, 4, sensor)
-    labels, moments = join_surfaces(patches, nodes, 4, sensor, SMOOTHNESS, CAMERA.rays)
-    assert not labels.any() and labels.shape == (5, 7)
-    assert moments.shape == (1, 13) and not moments.any()
-
-
 @pytest.mark.parametrize('seed', range(4))
 @pytest.mark.parametrize(('fold', 'faces'), [(0, 1), (8 * NOISE, 4)])
 def test_strong_noise_leaves_no_face_in_parts(fold, faces, seed):

@@ -145,13 +145,6 @@ def test_links_are_the_weights_on_all_four_sides(shape):
             assert found == pytest.approx(expected[side].flat[p], rel=1e-6)
 
 
-def test_weights_are_inverse_variances():
-    problem, _, _ = random_case(0, 9, 11)
-    measured = problem.inverse > 0
-    np.testing.assert_allclose(problem.weight[measured], 1 / NOISE**2, rtol=1e-5)
-    assert not problem.weight[~measured].any()
-
-
 def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     white = SENSOR._replace(correlation=0.0)

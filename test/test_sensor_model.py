@@ -1,7 +1,5 @@
 """The sensor model measured in simulated images whose errors are known."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,10 +20,8 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
-from rangeseg_ros.evaluation.datasets import find_cases
 from rangeseg_ros.simulation.kinect import smooth_field
 
-SCAN = Path(__file__).resolve().parents[2] / 'shared' / 'data' / 'synpeb_noisy'
 CAMERA = Camera(640, 480, 580.0, 580.0, 319.5, 239.5)
 STATED = SensorModel.from_config(Config())
 
@@ -196,20 +192,6 @@ def test_what_noise_hides_is_not_made_more_of(seed):
     sensor = sensor_of(1 / (depth + noise))
     assert sensor.range_noise == pytest.approx(0.02, rel=0.05)
     assert sensor.distortion < 1.5 * (creases / depth**2).std()
-
-
-@pytest.mark.skipif(not SCAN.exists(), reason='the scan is not here')
-@pytest.mark.parametrize('turns', range(4))
-@pytest.mark.parametrize('mirrored', [False, True])
-def test_a_scan_shows_the_same_errors_turned_and_mirrored(turns, mirrored):
-    (case,) = find_cases(SCAN)
-    points = np.rot90(case.load().image.points, turns)
-    image = RangeImage.from_points(points[:, ::-1] if mirrored else points)
-    sensor = measured_sensor(
-        image, Blocks.of(image), SensorModel.from_config(Config(), image.shape)
-    )
-    assert sensor.range_noise == pytest.approx(0.02, rel=0.1)
-    assert max(sensor.distortion, sensor.range_distortion) < 0.02
 
 
 def test_holes_hide_no_distortion():

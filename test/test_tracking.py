@@ -68,16 +68,6 @@ def test_ids_follow_the_planes_not_the_labels():
     assert ids(tracker, frame(*stay()[::-1])) == [3, 2, 1]
 
 
-@pytest.mark.parametrize(('hidden', 'same'), [(5, True), (6, False)])
-def test_memory_is_exact(hidden, same):
-    tracker = Tracker(Config(track_time=5.5 / 30))
-    whole = frame(*stay(), (*MIDDLE, BOX))
-    assert ids(tracker, whole) == [1, 2, 3, 4]
-    for _ in range(hidden):
-        assert ids(tracker, frame(*stay())) == [1, 2, 3]
-    assert ids(tracker, whole) == [1, 2, 3, 4 if same else 5]
-
-
 def test_a_hidden_plane_moves_along_with_the_camera():
     # Over 20 frames the camera turns 20 degrees and comes 0.4 m nearer, so that the equation of
     # the hidden box becomes another one altogether.
