@@ -70,6 +70,17 @@ def test_what_is_bridged_lies_between_its_neighbours():
     np.testing.assert_array_equal(whole.inverse[~holes], image.inverse[~holes])
 
 
+@pytest.mark.parametrize('step', [(0, 1), (1, 0), (1, 1), (1, -1)])
+def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(step):
+    inverse = np.zeros(CAMERA.shape, np.float32)
+    for side in (-1, 1):
+        inverse[60 + side * step[0], 80 + side * step[1]] = 0.5
+    whole = bridge_holes(RangeImage(CAMERA.rays, inverse, CAMERA), *steps_and_slopes(0.01, 0.01))
+    expected = inverse.copy()
+    expected[60, 80] = 0.5
+    np.testing.assert_array_equal(whole.inverse, expected)
+
+
 def test_wide_holes_stay():
     inverse, _ = crease(0.0)
     inverse[40:60, 20:40] = 0
