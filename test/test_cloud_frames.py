@@ -8,9 +8,7 @@ from scanner_points import scanned
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.classes import GROUND
 from rangeseg_ros.core.ground.points import drops, outlines
-from rangeseg_ros.core.mapping.evidence import may_be_in_sight
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
-from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.solids import cast
@@ -148,24 +146,6 @@ def test_which_way_a_scanner_looks(turn, around):
     points = 3 * rays @ turn.T
     points[:9, :40] = np.nan
     np.testing.assert_array_equal(RangeImage.from_points(points).axes, turn)
-
-
-def test_spheres_are_in_sight_where_the_camera_looks():
-    image = RangeImage.from_points((CAMERA.rays * 2.0) @ BODY.T)
-    ahead = np.array([(3.0, 0, 0), (3, 1.4, 0), (3, 0, 1), (0, 0, 3), (-3, 0, 0)])
-    seen = may_be_in_sight(ahead, np.full(5, 0.01), image)
-    assert seen.tolist() == [True, True, True, False, False]
-
-
-@pytest.mark.parametrize('form', ['camera', 'scanner'])
-def test_the_distortion_is_along_the_axis_that_the_cloud_looks_along(form):
-    rays = CAMERA.rays if form == 'camera' else scanned(CAMERA)
-    offset = np.random.default_rng(2).normal(0, 0.01, CAMERA.shape).astype(np.float32)
-    distortion = DistortionMap(offset, None, 3 * offset)
-    images = [RangeImage.from_points(2 * rays @ turn.T) for turn in (np.eye(3), BODY)]
-    first, second = (distortion.corrected(image) for image in images)
-    np.testing.assert_allclose(first.inverse, second.inverse, rtol=1e-5)
-    assert np.abs(first.inverse - images[0].inverse).max() > 0.01
 
 
 @pytest.mark.parametrize('size', [(32, 24), (160, 120), (1280, 720)])

@@ -64,15 +64,6 @@ def test_depth_images_with_known_planes(simulated, evaluate):
     assert out.splitlines()[2].split()[:3] == ['0.8', '2.00', '2.00']
 
 
-def test_small_true_regions_do_not_count(simulated, evaluate):
-    path = simulated / 'truth' / '000002.png'
-    truth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    truth[40:43, 5:8] = 3
-    assert cv2.imwrite(str(path), truth)
-    assert evaluate(simulated)[1]['tolerances']['0.8']['regions'] == 4
-    assert evaluate(simulated, '--min-pixels', 9)[1]['tolerances']['0.8']['regions'] == 5
-
-
 def test_pictures(simulated, evaluate, tmp_path):
     output = tmp_path / 'out'
     assert evaluate(simulated, '--output', output)[0] == 0

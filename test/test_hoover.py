@@ -31,15 +31,6 @@ def test_images_that_cannot_be_compared():
         Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
 
 
-def test_judged_pixels_only():
-    truth = np.array([[1, 1, 1, 0, 0, 2]])
-    labels = np.array([[4, 4, 4, 4, 9, 0]])
-    result = Overlap.between(truth, labels, judged=truth > 0)
-    # Found region 9 lies only where nothing is judged: it does not exist. Region 4 has 3 pixels.
-    assert result.labels.tolist() == [4] and result.label_sizes.tolist() == [3]
-    assert classify(result, 1.0).counts()['correct'] == 1
-
-
 def literal(truth, labels, tolerance):
     """The five metrics as the reference tool is described, pixel by pixel and in its order."""
     gts = sorted({int(v) for v in truth.flat} - {0})

@@ -156,14 +156,6 @@ def test_parts_of_one_plane_share_a_surface_and_steps_do_not():
     assert [p.surface for p in planes] == [1, 1, 3]
 
 
-def test_camera_of_another_size():
-    camera = Camera(64, 48, 60.0, 50.0, 20.0, 30.0)
-    labels = np.ones(camera.shape, np.uint16)
-    (plane,) = fit_planes(labels, plane_image(camera=camera), KINECT)
-    np.testing.assert_allclose(plane.normal, NORMAL, atol=1e-6)
-    assert polygon_area(plane.hull, NORMAL) == pytest.approx(plane.area, rel=5e-3)
-
-
 @pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
 @pytest.mark.parametrize('shape', [(40, 52), (43, 55)])
 def test_areas_are_those_of_the_pixels(shape, form):

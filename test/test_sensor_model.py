@@ -194,18 +194,6 @@ def test_what_noise_hides_is_not_made_more_of(seed):
     assert sensor.distortion < 1.5 * (creases / depth**2).std()
 
 
-def test_holes_hide_no_distortion():
-    """Of every second row, and of a third of all pixels, that are missing."""
-    random = np.random.default_rng(7)
-    bent = 0.002 * smooth_field(CAMERA.shape, (35.0, 35.0), random)
-    inverse = three_planes() + bent + 0.001 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
-    whole = sensor_of(inverse)
-    for holes in (np.arange(480)[:, None] % 2 > 0, random.random(CAMERA.shape) < 0.33):
-        sensor = sensor_of(np.where(holes, 0, inverse))
-        assert sensor.distortion == pytest.approx(whole.distortion, rel=0.3)
-        assert sensor.noise == pytest.approx(0.001, rel=0.3)
-
-
 @pytest.mark.parametrize('step', [0.005, 0.02])
 def test_depth_rounded_to_steps_tells_the_step(step):
     inverse = three_planes()

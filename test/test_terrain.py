@@ -11,7 +11,6 @@ from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose
-from rangeseg_ros.simulation.sensors.ideal import Ideal
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.solids import box
@@ -81,13 +80,6 @@ def test_a_mirage_in_the_floor_is_a_drop():
     _, result, frame = found(scene(mirror, Piece(FLOOR, GROUND), ceiling, wall))
     assert share(result, frame, GROUND, GROUND) > 0.99
     assert share(result, frame, DROP, DROP) > 0.98
-
-
-def test_a_table_in_front_is_no_floor():
-    table = Piece(box((0.5, 0.6, 0.03), np.eye(3), (1.05, 0, 0.5)), OBSTACLE, 0.5)
-    _, result, frame = found(scene(Piece(FLOOR, GROUND), table))
-    assert share(result, frame, GROUND, GROUND) > 0.98
-    assert share(result, frame, OBSTACLE, OBSTACLE) > 0.98
 
 
 def test_a_whole_object_is_an_obstacle_and_has_its_height():
@@ -162,18 +154,6 @@ def test_crossings_leave_no_cell_of_a_costmap_free_beyond_an_edge(edge, find):
     lethal = {(x + n, y) for x, y in np.floor(world[:, :2] / 0.05).astype(int) for n in (-1, 0, 1)}
     first = round(edge / 0.05) + 2
     assert {(x, y) for x in range(first, first + 6) for y in range(-10, 10)} <= lethal
-
-
-def test_a_low_camera_leaves_no_gap_of_two_cells_beyond_an_edge():
-    """Rows of rays are up to 7 cm apart, 3.5 m away and seen from 0.3 m above."""
-    sensor, low = Ideal(), 0.3
-    terrain = Terrain('', drop_of(0.3, 3.0), (FLOOR,), Pose.looking((0, 0, low), 0, 10, 0))
-    image = RangeImage.from_depth(simulate_terrain(terrain, sensor).depth, sensor.camera)
-    up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, terrain.up), strict=True))
-    points = drops(image, Segmenter(Config(**up, sensor_height=low)).segment(image).ground)[:, :3]
-    world = points @ terrain.pose.rotation.T + terrain.pose.position
-    lethal = {(x + n, y) for x, y in np.floor(world[:, :2] / 0.05).astype(int) for n in (-1, 0)}
-    assert {(x, y) for x in range(60, 69) for y in range(-10, 10)} <= lethal
 
 
 def test_a_pit_without_a_measurement_is_unseen_and_no_ground():
