@@ -8,7 +8,7 @@ from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.kinect import NOISES, simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene
-from rangeseg_ros.simulation.sensors.kinect import BASELINE, QUANTUM, kinect_camera, sensor_pattern
+from rangeseg_ros.simulation.sensors.kinect import BASELINE, QUANTUM, kinect_camera
 from rangeseg_ros.simulation.solids import box, half_space
 
 
@@ -95,16 +95,6 @@ def test_pattern_belongs_to_the_sensor():
     # Real frames of one sensor share 0.74 (median over planes) with the mean of the others.
     assert same > 0.74
     assert abs(other) < 0.5
-
-
-def test_bands_are_steps_at_fixed_columns():
-    for seed in range(4):
-        steps = np.diff(np.median(sensor_pattern((480, 640), seed), axis=0))
-        jumps = np.nonzero(np.abs(steps) > 0.3)[0]
-        assert 1 <= len(jumps) <= 9
-        assert (np.abs(steps[jumps]) < 1.05).all()
-        spacing = np.diff(jumps)
-        assert len(jumps) == 1 or (spacing.min() >= 75 and spacing.max() <= 106)
 
 
 @pytest.mark.parametrize('sigma', [None, (2.0, 2.0), (3.0, 8.0)])
