@@ -218,17 +218,6 @@ def small_room(seed=900):
     return problem, (found[0], nodes.moments, found[1]), sensor
 
 
-def test_expansions_lower_the_energy_of_the_labels_of_blocks():
-    problem, (surface, blocks, moments), sensor = small_room()
-    width, height = problem.width, len(problem.inverse) // problem.width
-    begin = np.kron(surface, np.ones((BLOCK, BLOCK), np.int32))[:height, :width]
-    begin = begin.ravel() * (problem.weight > 0)
-    labels, models = refine(problem, surface, blocks, moments, sensor)
-    values = energies(np.stack([begin, labels]).reshape(2, height, width), problem, models)
-    assert values[1] < 0.9 * values[0]
-    assert energy(labels, problem, models) == pytest.approx(values[1], rel=1e-5)
-
-
 def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
     """Of every label, from anywhere, until none helps."""
     problem, (surface, blocks, moments), sensor = small_room()
