@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.calibrations import CameraWarning
@@ -157,6 +158,8 @@ def test_what_is_packed_comes_back_with_its_lens(tmp_path, lens):
         assert [frame.camera for frame in bag] == [camera]
     write_camera(tmp_path / 'camera.yaml', camera)
     assert read_camera(tmp_path / 'camera.yaml') == camera
+    told = yaml.safe_load((tmp_path / 'camera.yaml').read_text())
+    assert told['rectification_matrix']['data'] == np.eye(3).ravel().tolist()
 
 
 def test_camera_changes_on_the_way(tmp_path):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from message_classes import cloud, header, make_rosbags, needs_rclpy
+from message_classes import STORE, cloud, header, make_rosbags, needs_rclpy
 
 from rangeseg_ros import CameraError, RangeImage, planes_from_message
 from rangeseg_ros.messages.cameras import camera_from_message
-from rangeseg_ros.messages.clouds import CloudError, points_from_message
+from rangeseg_ros.messages.clouds import _POINT_FIELD_TYPES, CloudError, points_from_message
 
 
 def camera_info(make=make_rosbags, **changes):
@@ -75,6 +75,13 @@ def test_organised_cloud_of_any_layout(order, dtype):
     read = points_from_message(cloud(points, order, padding=5))
     np.testing.assert_array_equal(read, points)
     assert read.dtype == dtype and RangeImage.from_points(read).valid.sum() == 11
+
+
+def test_numbers_of_fields_are_those_of_the_message():
+    kind = STORE.types['sensor_msgs/msg/PointField']
+    names = {'i': 'INT', 'u': 'UINT', 'f': 'FLOAT'}
+    for number, name in _POINT_FIELD_TYPES.items():
+        assert getattr(kind, f'{names[name[0]]}{8 * int(name[1])}') == number
 
 
 @pytest.mark.parametrize(
