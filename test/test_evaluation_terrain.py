@@ -200,17 +200,3 @@ def test_pieces_are_detected_by_size_and_distance(run, evaluate, tmp_path):
     assert sum(row['scenes'] for row in rows) > 40
     # Of a set without noise every confidence is right.
     assert all(row['right'] == 1 for row in figures['reliability'])
-
-
-def test_a_simulated_set_is_measured(run, evaluate, tmp_path):
-    """Without noise, ground, obstacles and drops are told; of each kind of scene by itself."""
-    folder = tmp_path / 'simulated'
-    size = '--width', 160, '--height', 120
-    words = 'simulate', 'terrain', '--sensor', 'ideal', '--scenes', 6, *size, '--output', folder
-    assert run(*words)[0] == 0
-    code, figures, out, _ = evaluate(folder)
-    assert code == 0 and f'{folder}: 6 images' in out
-    assert list(figures['per_image']) == [f'{number:06d}' for number in range(6)]
-    assert list(figures['by_kind']) == ['clutter', 'drop', 'hole', 'low boxes', 'room', 'waves']
-    pooled = figures['pooled']
-    assert min(pooled[name] for name in ('ground_kept', 'obstacle_found', 'drop_found')) > 0.98
