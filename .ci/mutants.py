@@ -177,7 +177,7 @@ class Selection:
             uses = {test: sum(map(test.read_text().count, names)) for test in near}
             near = sorted(set(near) - set(chosen), key=lambda test: (-uses[test], test))
             # Those named alike, or that name the function, are about it.
-            near.sort(key=lambda test: path.stem not in test.stem)
+            near.sort(key=lambda test: path.stem.rstrip('s') not in test.stem)
             near.sort(key=lambda test: function not in test.read_text())
             chosen += near[: self._most - len(chosen)]
             seen |= ring
@@ -188,7 +188,9 @@ class Selection:
 
 def run(tests: list[str], limit: float, mutant: Mutant | None = None) -> tuple[str, str]:
     """What tests say within `limit` seconds of a copy, perhaps changed, and which failed first."""
-    with tempfile.TemporaryDirectory(prefix='mutant-') as folder:
+    # Workers that compile may still write.
+    place = tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True)
+    with place as folder:
         left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
         shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
         if mutant:
