@@ -182,8 +182,11 @@ class Selection:
             chosen += near[: self._most - len(chosen)]
             seen |= ring
             ring = {user for module in ring for user in self._users[module]} - seen
-        # Tests of the node start processes of it.
-        return chosen or sorted((ROOT / 'test').glob('test_node_[fs]*.py'))
+        # What nothing imports is a command, or what one needs, or the node: a process of it.
+        alike = [test for test in self._tests if path.stem.rstrip('s') in test.stem]
+        return (chosen or alike or sorted((ROOT / 'test').glob('test_node_[fs]*.py')))[
+            : self._most
+        ]
 
 
 def run(tests: list[str], limit: float, mutant: Mutant | None = None) -> tuple[str, str]:
