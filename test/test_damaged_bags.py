@@ -1,6 +1,7 @@
 """Damage costs what is damaged: a frame, a chunk, the end; and small files cost little."""
 
 import bz2
+import os
 import struct
 import zlib
 
@@ -9,7 +10,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
-from recordings import Recording, depth_images, record
+from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bag_formats import Lost, Record, unpack
@@ -17,6 +18,7 @@ from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.recordings import BagError, unpacked
 
+STORAGES = tuple(SUFFIXES)
 START, STEP = 10**18, 33_333_333
 
 
@@ -261,6 +263,23 @@ def test_messages_that_declare_far_more_than_they_store_are_lost():
     packed = zstandard.compress(bytes(2**27))
     lost = unpacked(Record('topic', 'type', 1, packed))
     assert isinstance(lost, Lost) and 'compressed bytes declare' in lost.reason
+
+
+@pytest.mark.parametrize('name', ['data', 'metadata.yaml'])
+def test_a_pipe_in_a_bag_is_not_waited_for(packed, name, run):
+    (file,) = packed.glob('*.mcap')
+    path = file if name == 'data' else packed / name
+    path.unlink()
+    os.mkfifo(path)
+    for bag in {packed, path if name == 'data' else packed}:
+        code, _, error = run('replay', bag, '--output', packed.parent / 'out')
+        assert code and 'not a regular file' in error and error.count('\n') == 1
+
+
+def test_metadata_that_would_take_for_ever(packed, run):
+    (packed / 'metadata.yaml').write_text('[' + '1, ' * 2_000_000 + '1]')
+    code, _, error = run('replay', packed, '--output', packed.parent / 'out')
+    assert code and 'metadata.yaml: too large' in error and error.count('\n') == 1
 
 
 def test_a_stamp_that_ros_2_cannot_tell_costs_the_frame(tmp_path, run):

@@ -168,6 +168,15 @@ def test_edge_pixels_lose_all_their_edges():
     assert vertical.T.tolist() == [[False] * 2, [True] * 2, [False] * 2]
 
 
+@pytest.mark.parametrize('shape', [(1, 1), (1, 7), (2, 2), (5, 3)])
+def test_small_images(shape):
+    image = RangeImage(np.ones((*shape, 3), np.float32), np.ones(shape, np.float32))
+    for edges in (plane_deviation(image, STEP), sobel(image)):
+        assert edges[0].shape == (shape[0], shape[1] - 1)
+        assert edges[1].shape == (shape[0] - 1, shape[1])
+        assert not edges[0].any() and not edges[1].any()
+
+
 @pytest.mark.parametrize('seed', range(3))
 @pytest.mark.parametrize('slope', [0.004, 0.012])
 def test_a_steep_face_whose_directions_err_reaches_the_jump_beside_it(slope, seed):

@@ -2,6 +2,10 @@
 
 import csv
 import re
+import signal
+import subprocess
+import sys
+import time
 
 import cv2
 import numpy as np
@@ -14,6 +18,8 @@ from rangeseg_ros.cli import segment
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
+
+COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 
 
 @pytest.fixture
@@ -208,3 +214,35 @@ def test_bad_input_of_replay_leaves_nothing(folder, run):
         assert (code, output, error.count('\n')) == (2, '', 1)
         assert message in error
         assert not (folder / 'out').exists()
+
+
+def test_an_interrupted_replay_leaves_whole_files(folder):
+    record(folder / 'bag', 'mcap', np.full((1000, 48, 64), 1500, np.uint16))
+    replay = subprocess.Popen(
+        [*COMMAND, 'replay', 'bag', '--output', 'out'],
+        start_new_session=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        deadline = time.monotonic() + 120
+        while len(list(folder.glob('out/[0-9]*_labels.png'))) < 3:
+            assert replay.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        replay.send_signal(signal.SIGINT)
+        _, error = replay.communicate(timeout=60)
+    finally:
+        replay.kill()
+    assert replay.returncode == 130, error
+    assert b'Traceback' not in error
+    labels = sorted(folder.glob('out/[0-9]*_labels.png'))
+    assert 3 <= len(labels) < 1000
+    for path in labels:
+        assert read_labels(path).shape == (48, 64)
+    with (folder / 'out/planes.csv').open() as file:
+        rows = list(csv.DictReader(file))
+    assert all(None not in row and None not in row.values() for row in rows)
+    frames = {int(row['frame']) for row in rows}
+    assert frames <= set(range(len(labels)))
+    assert not [path for path in (folder / 'out').iterdir() if path.name.startswith('.')]

@@ -250,3 +250,19 @@ def test_simulated_rooms_keep_their_ids(seed):
     assert figures['faces'] >= 5
     assert figures['coverage'] == 1
     assert figures['switches'] == figures['transfers'] == 0
+
+
+def test_a_room_seen_again_from_elsewhere():
+    """The truth of a scene is one frame, then far from it: nothing may be mistaken."""
+    scene, other = kinect_room(1), kinect_room(7)
+    tracker, found = Tracker(), []
+    for k, room in enumerate((scene, other)):
+        view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(160, 120))
+        planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, view.camera), KINECT)
+        found.append(tracker.track(view.labels, planes, k))
+    assert len(found[0]) > 3 and len(found[1]) > 3
+    for b in found[1]:
+        for a in found[0]:
+            if a.id == b.id:
+                assert a.normal @ b.normal > 0.9
+                assert abs(a.normal @ b.centroid + a.distance) < 0.3
