@@ -16,7 +16,7 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.tracker import Tracker
 from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.scenes import Scene, kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 KINECT = SensorModel.from_config(Config())
