@@ -1,5 +1,6 @@
 """Settings of every test."""
 
+import json
 import os
 import signal
 import sys
@@ -35,5 +36,17 @@ def run(monkeypatch, capsys):
         with pytest.raises(SystemExit) as done:
             main()
         return done.value.code or 0, *capsys.readouterr()
+
+    return run_command
+
+
+@pytest.fixture
+def figures_of(run, tmp_path):
+    """Run a command with --json: exit code, figures (or None), standard output and error."""
+
+    def run_command(*arguments):
+        path = tmp_path / 'figures.json'
+        code, output, error = run(*arguments, '--json', path)
+        return code, json.loads(path.read_text()) if path.exists() else None, output, error
 
     return run_command

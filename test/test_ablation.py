@@ -48,28 +48,6 @@ def test_every_mechanism_is_in_the_code(ablate):
             Config(**parameters)
 
 
-def test_lines_and_constants_of_a_module_and_of_its_functions(ablate, monkeypatch, tmp_path):
-    (tmp_path / 'a.py').write_text(
-        'ONE, TWO = 1, 2\n_THREE = 3\nlower = 4\n\n\n@decorated\ndef f():\n    return ONE\n\n\n'
-        'def g():\n    return 0\n'
-    )
-    monkeypatch.setattr(ablate, 'CORE', tmp_path)
-    assert ablate.source_of('a.py') == (12, 3)
-    assert ablate.source_of('a.py:f') == (3, 1)
-    assert ablate.source_of('a.py:f,g') == (5, 1)
-
-
-def test_what_is_switched_off_is_on_again(ablate):
-    module = importlib.import_module('rangeseg_ros.core.by_planes.method')
-    before = module.unite_regions
-    with ablate.switched({'by_planes.method.unite_regions': lambda _: abs, 'seed': 2}) as given:
-        assert module.unite_regions is abs
-        assert given == {'seed': 2}
-    assert module.unite_regions is before
-    with pytest.raises(AttributeError), ablate.switched({'by_planes.method.gone': 1}):
-        pass
-
-
 def test_without_any_plane_all_of_the_accuracy_is_lost_and_without_a_change_none(ablate, frame):
     nothing = ablate.Mechanism('nothing', '', {'seed': Config().seed})
     planes = ablate.Mechanism('planes', '', {'min_pixels': 10**8})
@@ -105,12 +83,6 @@ def test_verdicts_ask_for_more_than_chance(ablate, gains, expected):
     assert ablate.verdict(gains) == expected
 
 
-def test_scenes_in_which_a_hazard_becomes_ground_are_named(ablate):
-    row = {'drop called ground': {'hole': [-0.03, 0.0], 'kerb': [-0.01], 'stairs': [np.nan]}}
-    assert ablate.needed_for(row) == 'safety: hole'
-    assert ablate.needed_for({'drop found': {'hole': [1.0]}}) == ''
-
-
 def test_borders_match_within_two_pixels(frames):
     def halves(column):
         return np.tile(np.where(np.arange(20) < column, 1, 2), (10, 1))
@@ -119,16 +91,6 @@ def test_borders_match_within_two_pixels(frames):
     assert frames.border_f(halves(8), halves(10), valid) == 1.0
     assert frames.border_f(halves(8), halves(11), valid) == 0.0
     assert frames.border_f(halves(8), halves(20), valid) == 0.0
-
-
-def test_holes_and_enlargement_are_the_same_in_image_and_truth(frame):
-    holes, enlarged = frame.damaged('holes'), frame.damaged('enlarged')
-    lost = 1 - holes.image.valid.sum() / frame.image.valid.sum()
-    assert lost == pytest.approx(0.3, abs=0.01)
-    assert not holes.truth.labels[~holes.image.valid].any()
-    for array in (enlarged.image.inverse, enlarged.truth.labels):
-        np.testing.assert_array_equal(array[::2], array[1::2])
-        np.testing.assert_array_equal(array[:, ::2], array[:, 1::2])
 
 
 def test_the_page_has_a_row_for_each_mechanism(ablate, frame, monkeypatch, tmp_path):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import yaml
 from recordings import SUFFIXES, Recording, depth_images, record
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraWarning
@@ -75,13 +76,6 @@ def test_damage_in_the_middle_never_escapes_as_another_error(tmp_path, storage):
             assert str(file) in str(error)
         else:
             assert len(frames) <= 20
-
-
-def test_a_recording_without_its_metadata_is_read(tmp_path):
-    images = depth_images(3)
-    record(tmp_path / 'bag', 'mcap', images)
-    (tmp_path / 'bag' / 'metadata.yaml').unlink()
-    np.testing.assert_array_equal([f.depth for f in read(tmp_path / 'bag')], images)
 
 
 def test_parts_of_a_recording_are_read_in_order(tmp_path):
@@ -162,6 +156,8 @@ def test_what_is_packed_comes_back_with_its_lens(tmp_path, lens):
         assert [frame.camera for frame in bag] == [camera]
     write_camera(tmp_path / 'camera.yaml', camera)
     assert read_camera(tmp_path / 'camera.yaml') == camera
+    told = yaml.safe_load((tmp_path / 'camera.yaml').read_text())
+    assert told['rectification_matrix']['data'] == np.eye(3).ravel().tolist()
 
 
 def test_camera_changes_on_the_way(tmp_path):
@@ -193,27 +189,13 @@ def test_errors_list_the_topics(tmp_path):
         DepthBag(tmp_path / 'both', None, '/nowhere')
 
 
-def test_errors_name_encoding_size_and_focal_length(tmp_path):
+def test_errors_name_the_encodings(tmp_path):
     colour = Recording()
     colour.add_camera(1)
     colour.add_image(1, np.zeros((48, 64), np.uint8), '8UC1')
     colour.write(tmp_path / 'colour')
-    with pytest.raises(BagError, match="'8UC1'"):
-        DepthBag(tmp_path / 'colour', '/camera/depth/image_rect')
     with pytest.raises(BagError, match=r'no depth image \(/camera/depth/image_rect: 8UC1\)'):
         DepthBag(tmp_path / 'colour')
-    sizes = Recording()
-    sizes.add_camera(1, width=32)
-    sizes.add_image(1, depth_images(1)[0])
-    sizes.write(tmp_path / 'sizes')
-    with pytest.raises(BagError, match=r'64x48, its camera 32x48'):
-        DepthBag(tmp_path / 'sizes')
-    focal = Recording()
-    focal.add_camera(1, focal=0.0)
-    focal.add_image(1, depth_images(1)[0])
-    focal.write(tmp_path / 'focal')
-    with pytest.raises(BagError, match='focal length fx'):
-        DepthBag(tmp_path / 'focal')
 
 
 def test_what_is_no_bag(tmp_path):

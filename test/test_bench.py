@@ -55,14 +55,6 @@ def test_figures_of_given_frames(frames, tmp_path):
         assert name in result.output
 
 
-def test_simulated_frames_of_a_size(tmp_path):
-    path = tmp_path / 'figures.json'
-    arguments = ('--size', 96, 72, '--scenes', 1, '--rounds', 1, '--json', path)
-    assert run(*arguments).exit_code == 0
-    figures = json.loads(path.read_text())
-    assert (figures['width'], figures['height'], figures['method']) == (96, 72, 'planes')
-
-
 def test_bad_input(frames, tmp_path):
     assert 'belong together' in run(frames[0]).output
     other = tmp_path / 'other.png'

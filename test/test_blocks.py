@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -77,6 +77,13 @@ def test_blocks_of_any_size_add_up(shape, size):
     for i, j in np.ndindex(whole.squared.shape):
         parts = blocks.moments[2 * i : 2 * i + 2, 2 * j : 2 * j + 2].reshape(-1, SIZE)
         np.testing.assert_allclose(whole.moments[i, j], parts.sum(axis=0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ('shape', 'size'), [((120, 160), 2), ((240, 320), 3), ((480, 640), 4), ((720, 1280), 8)]
+)
+def test_larger_images_have_larger_blocks(shape, size):
+    assert block_size(shape) == size
 
 
 def test_blocks_that_jumps_cross_are_left_out():

@@ -70,6 +70,17 @@ def test_what_is_bridged_lies_between_its_neighbours():
     np.testing.assert_array_equal(whole.inverse[~holes], image.inverse[~holes])
 
 
+@pytest.mark.parametrize('step', [(0, 1), (1, 0), (1, 1), (1, -1)])
+def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(step):
+    inverse = np.zeros(CAMERA.shape, np.float32)
+    for side in (-1, 1):
+        inverse[60 + side * step[0], 80 + side * step[1]] = 0.5
+    whole = bridge_holes(RangeImage(CAMERA.rays, inverse, CAMERA), *steps_and_slopes(0.01, 0.01))
+    expected = inverse.copy()
+    expected[60, 80] = 0.5
+    np.testing.assert_array_equal(whole.inverse, expected)
+
+
 def test_wide_holes_stay():
     inverse, _ = crease(0.0)
     inverse[40:60, 20:40] = 0
@@ -82,17 +93,3 @@ def test_an_image_without_holes_is_itself():
     inverse, _ = crease()
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
-
-
-@pytest.mark.parametrize('size', [(32, 24), (160, 120), (424, 240), (1280, 720), (1920, 1080)])
-def test_images_of_every_size_segment_alike(size):
-    width, height = size
-    focal = 0.9 * width
-    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    random = np.random.default_rng(2)
-    left, right = camera.rays @ np.array([0.3, 0.0, 0.6]), camera.rays @ np.array([-0.3, 0.0, 0.6])
-    inverse = np.maximum(left, right) + random.normal(0, 0.001, camera.shape)
-    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
-    result = Segmenter(Config()).segment(image)
-    assert len(result.planes) == 2
-    assert (result.labels > 0).mean() > 0.9

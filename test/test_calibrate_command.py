@@ -5,6 +5,7 @@ import pytest
 import yaml
 from calibration_frames import CAMERA, frames, rms, true_map
 from click.testing import CliRunner
+from message_classes import cloud
 from rosbags.typesys import Stores
 
 from rangeseg_ros import Config, RangeImage
@@ -14,7 +15,7 @@ from rangeseg_ros.io.bag_writer import BagWriter, DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.io.message_types import CLOUD, make_rosbags, message_types
+from rangeseg_ros.io.message_types import CLOUD, message_types
 
 
 def run(*arguments):
@@ -62,27 +63,13 @@ def test_command_writes_map_parameters_and_report(folder, tmp_path):
 def test_bags_of_clouds_give_the_map_that_images_give(tmp_path):
     images = [image for _, image in frames(22, true_map(0.004), noise=0.0006)]
     store = message_types(Stores.ROS2_JAZZY)
-    header = make_rosbags(
-        'std_msgs/msg/Header',
-        stamp=make_rosbags('builtin_interfaces/msg/Time', sec=1, nanosec=0),
-        frame_id='camera_depth_optical_frame',
-    )
-    fields = [
-        make_rosbags('sensor_msgs/msg/PointField', name=name, offset=4 * k, datatype=7, count=1)
-        for k, name in enumerate('xyz')
-    ]
     (tmp_path / 'depth').mkdir()
     write_camera(tmp_path / 'camera.yaml', CAMERA)
     with BagWriter(tmp_path / 'bag') as bag:
         topic = bag.add_connection('/points', CLOUD, typestore=store)
         for number, image in enumerate(images):
             points = np.asarray(image.points, '<f4')
-            cloud = make_rosbags(
-                CLOUD, header=header, height=60, width=80, fields=fields, is_bigendian=False,
-                point_step=12, row_step=960, data=points.reshape(-1).view(np.uint8),
-                is_dense=True,
-            )  # fmt: skip
-            bag.write(topic, number, store.serialize_cdr(cloud, CLOUD))
+            bag.write(topic, number, store.serialize_cdr(cloud(points), CLOUD))
             depth = np.ascontiguousarray(points[..., 2])
             write_image(tmp_path / 'depth' / f'{number:02d}.tiff', depth)
     result = run(tmp_path / 'bag', '--output', tmp_path / 'clouds.tiff', '--jobs', 1)

@@ -8,9 +8,7 @@ from scanner_points import scanned
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.classes import GROUND
 from rangeseg_ros.core.ground.points import drops, outlines
-from rangeseg_ros.core.mapping.evidence import may_be_in_sight
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
-from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.solids import cast
@@ -150,24 +148,6 @@ def test_which_way_a_scanner_looks(turn, around):
     np.testing.assert_array_equal(RangeImage.from_points(points).axes, turn)
 
 
-def test_spheres_are_in_sight_where_the_camera_looks():
-    image = RangeImage.from_points((CAMERA.rays * 2.0) @ BODY.T)
-    ahead = np.array([(3.0, 0, 0), (3, 1.4, 0), (3, 0, 1), (0, 0, 3), (-3, 0, 0)])
-    seen = may_be_in_sight(ahead, np.full(5, 0.01), image)
-    assert seen.tolist() == [True, True, True, False, False]
-
-
-@pytest.mark.parametrize('form', ['camera', 'scanner'])
-def test_the_distortion_is_along_the_axis_that_the_cloud_looks_along(form):
-    rays = CAMERA.rays if form == 'camera' else scanned(CAMERA)
-    offset = np.random.default_rng(2).normal(0, 0.01, CAMERA.shape).astype(np.float32)
-    distortion = DistortionMap(offset, None, 3 * offset)
-    images = [RangeImage.from_points(2 * rays @ turn.T) for turn in (np.eye(3), BODY)]
-    first, second = (distortion.corrected(image) for image in images)
-    np.testing.assert_allclose(first.inverse, second.inverse, rtol=1e-5)
-    assert np.abs(first.inverse - images[0].inverse).max() > 0.01
-
-
 @pytest.mark.parametrize('size', [(32, 24), (160, 120), (1280, 720)])
 @pytest.mark.parametrize('scale', [1, 3])
 def test_where_the_camera_is(size, scale):
@@ -206,27 +186,6 @@ def test_no_place_is_made_up(points):
     assert image.camera is None and not image.place.any()
     known, moved = np.isfinite(points).all(axis=2), points @ BASE.rotation.T + BASE.shift
     np.testing.assert_allclose(image.points[known], moved[known], rtol=1e-5)
-
-
-@pytest.mark.parametrize('budget', [0.9, 0.5])
-def test_less_work_does_as_well_wherever_the_camera_is(budget):
-    points = room()[0].points
-    clouds = (cloud_in((BASE.rotation, place), points) for place in (ORIGIN, BASE.shift))
-    config = Config(work_budget=budget, **stated((0, 0, 1)))
-    level, moved = (Segmenter(config).segment(cloud).labels for cloud in clouds)
-    assert level.any() and (level == moved).mean() > 0.999
-
-
-def test_walls_without_noise_tell_no_place():
-    # The fewer the pixels, the more cameras there are that are off by less than is let pass.
-    camera = Camera(32, 24, 29.0, 29.1, 15.8, 12.1)
-    random, rays = np.random.default_rng(3), camera.rays.astype(float)
-    for _ in range(100):
-        normal = random.normal(size=3) * (0.5, 0.5, 0.2) - (0, 0, 1)
-        depth = -2 / (rays @ normal)
-        points = np.where(depth > 0, depth, np.nan)[..., None] * rays
-        frame = rotation_by(random.normal(size=3)), random.normal(size=3)
-        assert not cloud_in(frame, points).place.any()
 
 
 def test_a_sequence_is_followed_as_that_of_the_depth_images():

@@ -111,18 +111,3 @@ def test_hulls_become_meshes_and_go_with_their_planes(example, room):
                 point.z += shift
         example['CollisionObjects'].on_markers(scene, moved)
     assert [(o.id, o.operation) for o in scene] == [(f'plane {planes[1].id}', b'\x00')]
-
-
-def test_the_floor_becomes_a_plane(example, room):
-    messages, _ = room
-    scene = Scene()
-    example['CollisionObjects'].on_planes(scene, messages['planes'])
-    (floor,) = scene
-    assert floor.id == 'floor' and len(floor.plane_poses) == 1
-    np.testing.assert_allclose(floor.planes[0].coef, (0, -1, 0, 0.8), atol=2e-3)
-    scene.clear()
-    empty = OUTPUTS['planes'].message(
-        make_rclpy, Header(), None, type('Nothing', (), {'planes': []})
-    )
-    example['CollisionObjects'].on_planes(scene, empty)
-    assert not scene

@@ -1,29 +1,17 @@
 """`rangeseg compare`: figures of known label images, pairing of folders, and refusals."""
 
-import json
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 from segcomp_files import raster
 
-from rangeseg_ros.cli.main import main
-
 
 @pytest.fixture
-def compare(tmp_path, monkeypatch, capsys):
-    """Run `rangeseg compare`; returns exit code, figures (or None), and what went to stderr."""
-
-    def run(*args):
-        output = tmp_path / 'figures.json'
-        words = ['rangeseg', 'compare', *map(str, args), '--json', str(output)]
-        monkeypatch.setattr('sys.argv', words)
-        with pytest.raises(SystemExit) as end:
-            main()
-        figures = json.loads(output.read_text()) if output.exists() else None
-        return end.value.code or 0, figures, capsys.readouterr().err
-
-    return run
+def compare(figures_of):
+    """Run `rangeseg compare`; exit code, figures (or None), standard output and error."""
+    return partial(figures_of, 'compare')
 
 
 def write(path, labels):
@@ -40,29 +28,13 @@ def test_two_png_files(tmp_path, compare):
     # Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
     truth = write(tmp_path / 'truth.png', [[1, 1, 1, 1, 2, 2, 2, 0]])
     labels = write(tmp_path / 'labels.png', [[5, 5, 5, 5, 5, 6, 6, 0]])
-    code, figures, _ = compare(truth, labels, '--tolerance', '0.8', '0.9')
+    code, figures, *_ = compare(truth, labels, '--tolerance', '0.8', '0.9')
     assert code == 0
+    names = 'regions', 'correct', 'over', 'under', 'missed', 'noise', 'mean_iou', 'pixel_accuracy'
+    shares = pytest.approx((4 / 5 + 2 / 3) / 2), pytest.approx(6 / 7)
     assert figures['tolerances'] == {
-        '0.8': {
-            'regions': 2,
-            'correct': 1,
-            'over': 0,
-            'under': 0,
-            'missed': 1,
-            'noise': 1,
-            'mean_iou': pytest.approx((4 / 5 + 2 / 3) / 2),
-            'pixel_accuracy': pytest.approx(6 / 7),
-        },
-        '0.9': {
-            'regions': 2,
-            'correct': 0,
-            'over': 0,
-            'under': 0,
-            'missed': 2,
-            'noise': 2,
-            'mean_iou': pytest.approx((4 / 5 + 2 / 3) / 2),
-            'pixel_accuracy': pytest.approx(6 / 7),
-        },
+        '0.8': dict(zip(names, (2, 1, 0, 0, 1, 1, *shares), strict=True)),
+        '0.9': dict(zip(names, (2, 0, 0, 0, 2, 2, *shares), strict=True)),
     }
 
 
@@ -70,7 +42,7 @@ def test_rasters_count_regions_from_ten(tmp_path, compare):
     # 0-3 are no regions on either side, so nothing is noise.
     truth = write(tmp_path / 'abw.test.1.gt-seg', [[10, 10, 2, 3], [11, 11, 0, 1]])
     labels = write(tmp_path / 'abw.test.1.ms-seg', [[12, 12, 3, 2], [10, 10, 1, 0]])
-    code, figures, _ = compare(truth, labels)
+    code, figures, *_ = compare(truth, labels)
     assert code == 0
     assert list(figures['tolerances']) == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
     row = figures['tolerances']['0.95']
@@ -83,7 +55,7 @@ def test_folders_are_paired_by_name_and_summed(tmp_path, compare):
     write(tmp_path / 'ms/2_depth_labels.png', [[1, 1, 0]])
     write(tmp_path / 'ms/10_depth_labels.png', [[0, 2, 3]])
     write(tmp_path / 'ms/10_depth_overlay.png', [[9, 9, 9]])
-    code, figures, _ = compare(tmp_path / 'gt', tmp_path / 'ms', '--tolerance', '0.8')
+    code, figures, *_ = compare(tmp_path / 'gt', tmp_path / 'ms', '--tolerance', '0.8')
     assert code == 0
     assert figures['images'] == 2
     row = figures['tolerances']['0.8']
@@ -134,7 +106,7 @@ def test_undefined_figures_are_null(tmp_path, compare):
 
 
 def refuse(result, *parts):
-    code, figures, err = result
+    code, figures, _, err = result
     assert code == 2 and figures is None
     assert err.count('\n') == 1
     for part in parts:

@@ -82,6 +82,9 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
     write_ply(tmp_path / 'unsized.ply', points, size=False)
     (tmp_path / 'cut.ply').write_bytes((tmp_path / 'unsized.ply').read_bytes()[:5000])
     (tmp_path / 'text.ply').write_text('hello')
+    for name, field in (('list', 'list uchar int x'), ('kind', 'float99 x')):
+        head = f'ply\nformat ascii 1.0\nelement vertex 1\nproperty {field}\nend_header\n'
+        (tmp_path / f'{name}.ply').write_text(head)
     (tmp_path / 'text.npy').write_text('hello')
     (tmp_path / 'text.npz').write_text('hello')
     (tmp_path / 'record.bag').write_text('hello')
@@ -91,6 +94,8 @@ def test_what_is_none_is_refused_in_one_line(depth, tmp_path):
         ('unsized.ply', 'not an organised cloud'),
         ('cut.ply', 'truncated'),
         ('text.ply', 'not a PLY file'),
+        ('list.ply', 'vertices with lists'),
+        ('kind.ply', 'vertices with lists'),
         ('text.npy', 'not a readable file of NumPy'),
         ('text.npz', 'not a readable file of NumPy'),
         ('empty.npz', 'not a readable file of NumPy'),

@@ -12,7 +12,6 @@ from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.sensor import resize, slopes, unseen_from_the_right
 from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense
-from rangeseg_ros.simulation.sensors.time_of_flight import TimeOfFlight
 from rangeseg_ros.simulation.solids import box, half_space
 
 
@@ -124,26 +123,6 @@ def test_stereo_sees_nothing_left_of_an_object_and_at_the_left_border():
     assert (rows[:, int(left - shadow) + 3 : int(left) - 3] == 0).mean() > 0.95
     right = 424 + 424 * 0.2 / near
     assert (rows[:, int(right) + 5 : int(right + shadow)] == 0).mean() < 0.3
-
-
-def test_flying_pixels_lie_between_the_surfaces():
-    frame = simulate(in_camera_frame(wall(3.0), plate(1.0)), TimeOfFlight(), seed=0)
-    depth = metres(frame.depth)
-    flying = (depth > 1.2) & (depth < 2.6)
-    rim = 4 * 0.4 * frame.camera.fx
-    assert 0.5 * rim < flying.sum() < 3 * rim
-
-
-def test_time_of_flight_is_offset_where_stray_light_is():
-    scene = in_camera_frame(half_space((-1, 0, 0), (0.5, 0, 0)), wall(3.0))
-    error = np.median(
-        [
-            metres(simulate(scene, TimeOfFlight(), seed=seed).depth)[60:120, 20:100] - 3
-            for seed in range(4)
-        ]
-    )
-    # Up to centimetres: the light of the near side wall pulls the back wall closer.
-    assert 0.005 < abs(error) < 0.15
 
 
 def test_slopes_and_shadows_of_a_depth_image():

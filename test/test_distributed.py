@@ -9,8 +9,6 @@ import time
 import pytest
 from replays import record_walls, replay, results
 
-from rangeseg_ros.cli.main import main
-
 pytestmark = pytest.mark.slow
 
 COMMAND = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
@@ -70,18 +68,3 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
     for name in names:
         assert results(tmp_path / 'out' / name) == results(tmp_path / 'local' / name)
         assert not list((tmp_path / 'out' / name).glob('.*'))
-
-
-def test_without_distributed_replay_says_what_is_missing(tmp_path, monkeypatch, capsys):
-    record_walls(tmp_path / 'a', 1)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr('rangeseg_ros.cli.recordings.find_spec', lambda name: None)
-    arguments = ['replay', 'a', '--output', 'out', '--scheduler', 'tcp://127.0.0.1:1']
-    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert capsys.readouterr().err == (
-        'rangeseg: --scheduler needs distributed: install the extra dask\n'
-    )
-    assert not (tmp_path / 'out').exists()

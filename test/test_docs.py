@@ -6,7 +6,6 @@ import itertools
 import json
 import re
 import shlex
-import sys
 import textwrap
 from contextlib import suppress
 from pathlib import Path
@@ -244,51 +243,3 @@ def numeric(value):
     if type(value) is tuple:
         return len(value) > 0 and all(map(numeric, value))
     return isinstance(value, int | float) and not isinstance(value, bool)
-
-
-def test_the_comparison_is_drawn_by_the_present_code(monkeypatch, seen):
-    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
-    figures, benchmark = map(importlib.import_module, ('figures', 'benchmark'))
-    image = RangeImage.from_depth(seen.depth, seen.camera)
-    ransac = benchmark.ransac(seen.depth / 1000, seen.camera)
-    assert 5 < ransac.max() < 60 and (np.bincount(ransac.ravel())[1:] >= benchmark.LEAST).all()
-    assert figures.coloured(image, ransac).shape == (480, 640, 3)
-    text = ''.join(path.read_text() for path in PAGES)
-    for path in (ROOT / 'docs/figures').glob('*.png'):
-        assert f'figures/{path.name}' in text, path.name
-
-
-def test_the_benchmark_prints_its_table(monkeypatch, tmp_path, capsys):
-    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
-    benchmark = importlib.import_module('benchmark')
-    assert {benchmark.planes, benchmark.normals, benchmark.ransac} <= {
-        *benchmark.programs().values()
-    }
-    two = {'planes': benchmark.planes, 'ransac': benchmark.ransac}
-    monkeypatch.setattr(benchmark, 'programs', lambda: two)
-    run(['simulate', 'kinect', '--scenes', '1', '--output', str(tmp_path / 'rooms')])
-    monkeypatch.setattr(sys, 'argv', ['benchmark.py', str(tmp_path / 'rooms')])
-    benchmark.main()
-    rows = re.findall(r'^\| (\w+) \| ([.\d]+) \| (\d+) of (\d+)', capsys.readouterr().out, re.M)
-    (_, ours, found, faces), (_, theirs, *_) = rows
-    assert float(ours) > 0.8 > float(theirs) and 0 < int(found) <= int(faces)
-
-
-def test_every_page_is_in_the_site():
-    order = (ROOT / 'mkdocs.yml').read_text()
-    for path in (ROOT / 'docs').glob('*.md'):
-        assert f'{path.name}\n' in order, path.name
-
-
-def test_functions_of_more_than_seven_parameters_say_why():
-    """Compiled kernels take arrays, not objects, and commands their options: both are many."""
-    for path in PACKAGE.rglob('*.py'):
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not isinstance(node, ast.FunctionDef):
-                continue
-            arguments = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
-            count = sum(argument.arg not in ('self', 'cls') for argument in arguments)
-            decorated = ' '.join(map(ast.unparse, node.decorator_list))
-            if count > 7 and not re.search(r'njit|register_jitable|\bcommand\(', decorated):
-                told = ast.get_docstring(node) or ''
-                assert 'More than seven parameters' in told, f'{path.name}: {node.name}'

@@ -48,6 +48,12 @@ def test_colours_follow_ids_not_labels():
     assert (overlay(inverse, one, [plane]) != overlay(inverse, one)).any()
 
 
+def test_what_is_near_is_bright_between_the_extremes():
+    found = grey(np.linspace(1, 2, 1001)[None].astype(np.float32))[0]
+    assert found[0] == found[20] == 60 and found[-1] == found[980] == 235
+    assert (np.diff(found.astype(int)) >= 0).all() and found[500] in (147, 148)
+
+
 @pytest.mark.parametrize('shape', [(1, 1), (1, 7), (424, 3)])
 @pytest.mark.parametrize('value', [0.0, 1.0])
 def test_any_size_and_no_measurement(shape, value):

@@ -5,13 +5,10 @@ import importlib
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from corner_set import segcomp_set
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.evaluation.measure import Measurement
-from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.params import read_config, read_params
 
 ROOT = Path(__file__).parents[1]
@@ -34,28 +31,6 @@ def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
         rows = list(csv.DictReader(file))
     assert len(rows) == count
     assert (tmp_path / f'out/{name}.png').stat().st_size > 10_000
-
-
-def measurement(found):
-    """One region of ten pixels, of which `found` were found."""
-    truth = np.ones((1, 10), np.uint16)
-    labels = truth.copy()
-    labels[0, found:] = 0
-    return Measurement('x', Overlap.between(truth, labels), [], {}, {}, {})
-
-
-def test_lambda_with_most_correct_regions_wins_the_lowest_of_equals(experiments):
-    good, bad = [measurement(9)], [measurement(5)]
-    assert experiments.best_lambda({100.0: good, 50.0: good, 20.0: bad}) == 50.0
-    assert experiments.best_lambda({100.0: good, 50.0: bad}) == 100.0
-    row = experiments.averages([*good, *bad], 0.8)
-    assert (row['regions'], row['correct'], row['missed']) == (1.0, 0.5, 0.5)
-
-
-def test_each_image_is_left_out_of_its_own_training(experiments):
-    """Two images disagree on the best lambda: each gets that of the other."""
-    results = {20.0: [measurement(9), measurement(5)], 50.0: [measurement(5), measurement(9)]}
-    assert experiments.left_out(results) == [results[50.0][0], results[20.0][1]]
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,13 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-import yaml
-from hypothesis import given
-from hypothesis import strategies as st
 from rosbags.typesys import Stores
 
-from rangeseg_ros import Camera, CameraError, Config, ConfigError, Plane
+from rangeseg_ros import CameraError, Config, ConfigError, Plane
 from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.io.cameras import read_camera, write_camera
-from rangeseg_ros.io.files import natural_order, replacing
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import (
     ImageFileError,
     read_depth,
@@ -44,6 +41,8 @@ def test_what_is_no_depth_image_is_named(tmp_path):
     for name, image, message in (
         ('colour.png', np.zeros((4, 5, 3), np.uint16), 'one channel, not 3'),
         ('eight.png', np.zeros((4, 5), np.uint8), '16-bit or float, not uint8'),
+        ('a.bmp', np.ones((8, 8), np.uint8), 'PNG or TIFF'),
+        ('a.pfm', np.ones((8, 8), np.float32), 'PNG or TIFF'),
     ):
         cv2.imwrite(str(tmp_path / name), image)
         with pytest.raises(ImageFileError, match=f'{name}: .*{message}'):
@@ -97,11 +96,6 @@ def test_where_there_is_no_room_the_file_is_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@given(st.text(min_size=1), st.text(min_size=1))
-def test_natural_order_compares_any_names(one, other):
-    sorted([Path(one), Path(other)], key=natural_order)
-
-
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
@@ -129,31 +123,16 @@ def test_what_is_no_camera_is_named(tmp_path, content, message):
         read_camera(tmp_path / 'none.yaml')
 
 
-@given(
-    st.recursive(
-        st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=3),
-        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=2), inner),
-        max_leaves=6,
-    ),
-    st.sampled_from(['image_width', 'image_height', 'camera_matrix', 'projection_matrix']),
-)
-def test_any_calibration_is_a_camera_or_the_declared_error(tmp_path_factory, value, key):
-    path = tmp_path_factory.mktemp('camera') / 'camera.yaml'
-    write_camera(path, Camera(4, 3, 5.0, 5.0, 1.5, 1.0))
-    calibration = yaml.safe_load(path.read_text())
-    calibration[key] = value
-    path.write_text(yaml.safe_dump(calibration))
-    try:
-        read_camera(path)
-    except CameraError as error:
-        assert '\n' not in str(error).strip()
-
-
 def test_flat_and_ros_parameter_files_say_the_same(tmp_path):
     path = tmp_path / 'params.yaml'
     for content in (
         'smoothness: 12.5',
         'segment_planes: {ros__parameters: {smoothness: 12.5}}',
+        '/*: {ros__parameters: {smoothness: 12.5}}',
+        '/robot/*: {ros__parameters: {smoothness: 12.5}}',
+        'robot: {segment_planes: {ros__parameters: {smoothness: 12.5}}}',
+        '/robot: {front: {segment_planes: {ros__parameters: {smoothness: 12.5}}}}',
+        '/**/segment_planes: {ros__parameters: {smoothness: 12.5}}',
         '/**: {ros__parameters: {smoothness: 1.0}}\n'
         'other_node: {ros__parameters: {nonsense: 3}}\n'
         '/robot/segment_planes: {ros__parameters: {smoothness: 12.5}}',
@@ -201,6 +180,12 @@ def test_the_parameter_files_of_the_package_are_valid():
         ('smoothness: soft', 'smoothness must be of type float'),
         ('3: 4', 'unknown parameter 3'),
         ('node: {ros__parameters: {smoothness: 1.0}}', 'no ros__parameters of segment_planes'),
+        ('segment_planes: {ros__parameters: [1, 2]}', 'no mapping'),
+        ('segment_planes: {ros__parameters: "ab"}', 'no mapping'),
+        ('segment_planes: 3\nother: {ros__parameters: {}}', 'no section'),
+        ('min_pixels: 3\nsegment_planes: {ros__parameters: {}}', 'no section'),
+        ('noise: 1' + '0' * 400, 'noise must be in'),
+        ('min_pixels: 1' + '0' * 400, 'min_pixels must be in'),
     ],
 )
 def test_bad_parameters_are_named(tmp_path, content, message):
@@ -208,7 +193,7 @@ def test_bad_parameters_are_named(tmp_path, content, message):
     path.write_text(content)
     with pytest.raises(ConfigError, match=message) as caught:
         read_config(path)
-    assert str(path) in str(caught.value)
+    assert str(path) in str(caught.value) and len(str(caught.value)) < 200 + len(str(path))
     with pytest.raises(ConfigError, match='No such file'):
         read_params(tmp_path / 'none.yaml')
 

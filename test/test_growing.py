@@ -10,7 +10,7 @@ from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import weights
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
-from rangeseg_ros.core.sensing.moments import COUNT, fit_all
+from rangeseg_ros.core.sensing.moments import fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -57,14 +57,6 @@ def test_a_plane_is_one_surface(noise):
     assert moments.shape == (2, 13)
     assert not moments[0].any()
     np.testing.assert_allclose(fit_all(moments)[0][1], WALL, atol=3e-4)
-
-
-def test_moments_are_those_of_the_blocks_of_a_surface():
-    inverse = np.where(COLUMNS < 80, plane(WALL), plane([0, 0, 0.7]))
-    labels, moments = grown(inverse, noise=0.0)
-    assert len(moments) == 3
-    for label in (1, 2):
-        assert moments[label, COUNT] == 16 * (labels == label).sum()
 
 
 @pytest.mark.parametrize('turn', [0.4, -0.4, 0.15])
@@ -147,16 +139,6 @@ def test_clutter_is_no_surface():
     labels, _ = grown(inverse)
     assert not labels[11:19].any()
     assert (labels[:9] > 0).mean() > 0.9 and (labels[21:] > 0).mean() > 0.9
-
-
-def test_nothing_to_grow_from():
-    links = np.ones((5, 6), bool), np.ones((4, 7), bool)
-    nodes = Nodes(np.zeros((5, 7, 13)), np.zeros((5, 7)), *links)
-    sensor = SensorModel.from_config(Config())
-    patches = Patches.of(nodes, 4, sensor)
-    labels, moments = join_surfaces(patches, nodes, 4, sensor, SMOOTHNESS, CAMERA.rays)
-    assert not labels.any() and labels.shape == (5, 7)
-    assert moments.shape == (1, 13) and not moments.any()
 
 
 @pytest.mark.parametrize('seed', range(4))

@@ -18,24 +18,6 @@ def overlap(*runs):
     return Overlap.between(truth[None], labels[None])
 
 
-def counts(runs, tolerance):
-    result = classify(overlap(*runs), tolerance).counts()
-    return tuple(result[k] for k in ('regions', 'correct', 'over', 'under', 'missed', 'noise'))
-
-
-def test_exactly_the_tolerance_is_enough():
-    # 8 of the 10 pixels on both sides: m1 = m2 = 0.8.
-    runs = [(1, 1, 8), (1, 0, 2), (0, 1, 2)]
-    assert counts(runs, 0.8) == (1, 1, 0, 0, 0, 0)
-    assert counts(runs, 0.81) == (1, 0, 0, 0, 1, 1)
-
-
-def test_empty_images():
-    assert counts([(0, 0, 4)], 0.8) == (0, 0, 0, 0, 0, 0)
-    assert counts([(1, 0, 4)], 0.8) == (1, 0, 0, 0, 1, 0)
-    assert counts([(0, 1, 4)], 0.8) == (0, 0, 0, 0, 0, 1)
-
-
 @pytest.mark.parametrize('tolerance', [0.5, 1.01, -1.0, float('nan')])
 def test_tolerance_out_of_range(tolerance):
     with pytest.raises(ComparisonError, match='tolerance'):
@@ -47,15 +29,6 @@ def test_images_that_cannot_be_compared():
         Overlap.between(np.zeros((2, 2), int), np.zeros((2, 3), int))
     with pytest.raises(ComparisonError, match='integers'):
         Overlap.between(np.zeros((2, 2)), np.zeros((2, 2), int))
-
-
-def test_judged_pixels_only():
-    truth = np.array([[1, 1, 1, 0, 0, 2]])
-    labels = np.array([[4, 4, 4, 4, 9, 0]])
-    result = Overlap.between(truth, labels, judged=truth > 0)
-    # Found region 9 lies only where nothing is judged: it does not exist. Region 4 has 3 pixels.
-    assert result.labels.tolist() == [4] and result.label_sizes.tolist() == [3]
-    assert classify(result, 1.0).counts()['correct'] == 1
 
 
 def literal(truth, labels, tolerance):

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from message_classes import header, make_rosbags, needs_rclpy
+from message_classes import STORE, cloud, header, make_rosbags, needs_rclpy
 
 from rangeseg_ros import CameraError, RangeImage, planes_from_message
 from rangeseg_ros.messages.cameras import camera_from_message
-from rangeseg_ros.messages.clouds import CloudError, points_from_message
+from rangeseg_ros.messages.clouds import _POINT_FIELD_TYPES, CloudError, points_from_message
 
 
 def camera_info(make=make_rosbags, **changes):
@@ -39,45 +39,6 @@ def region(make=make_rosbags, x_offset=0, y_offset=0, height=0, width=0):
         width=width,
         do_rectify=False,
     )
-
-
-def cloud(points, order='<', padding=0, names='xyz', **changes):
-    """PointCloud2 of points (H, W, 3), each with a byte before and padding after it."""
-    size = points.dtype.itemsize
-    dtype = np.dtype(
-        {
-            'names': list(names),
-            'formats': [points.dtype.newbyteorder(order)] * 3,
-            'offsets': [1, 1 + size, 1 + 2 * size],
-            'itemsize': 1 + 3 * size + padding,
-        }
-    )
-    records = np.zeros(points.shape[:2], dtype)
-    for index, name in enumerate(names):
-        records[name] = points[..., index]
-    rows = records.view(np.uint8).reshape(len(records), -1)
-    rows = np.pad(rows, ((0, 0), (0, padding)))
-    fields = {
-        'header': header(),
-        'height': points.shape[0],
-        'width': points.shape[1],
-        'fields': [
-            make_rosbags(
-                'sensor_msgs/msg/PointField',
-                name=name,
-                offset=dtype.fields[name][1],
-                datatype={4: 7, 8: 8}[size],
-                count=1,
-            )
-            for name in names
-        ],
-        'is_bigendian': order == '>',
-        'point_step': dtype.itemsize,
-        'row_step': rows.shape[1],
-        'data': rows.ravel(),
-        'is_dense': False,
-    }
-    return make_rosbags('sensor_msgs/msg/PointCloud2', **{**fields, **changes})
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])
@@ -114,6 +75,13 @@ def test_organised_cloud_of_any_layout(order, dtype):
     read = points_from_message(cloud(points, order, padding=5))
     np.testing.assert_array_equal(read, points)
     assert read.dtype == dtype and RangeImage.from_points(read).valid.sum() == 11
+
+
+def test_numbers_of_fields_are_those_of_the_message():
+    kind = STORE.types['sensor_msgs/msg/PointField']
+    names = {'i': 'INT', 'u': 'UINT', 'f': 'FLOAT'}
+    for number, name in _POINT_FIELD_TYPES.items():
+        assert getattr(kind, f'{names[name[0]]}{8 * int(name[1])}') == number
 
 
 @pytest.mark.parametrize(

@@ -114,13 +114,6 @@ def test_planes_read_back_as_they_were():
         np.testing.assert_array_equal(planes[column], [value, value])
 
 
-@pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])
-def test_no_planes_are_an_empty_cloud(make):
-    make = make() if make is needs_rclpy else make
-    planes = planes_from_message(planes_message(make, header(make), []))
-    assert planes.shape == (0,) and 'distance' in planes.dtype.names
-
-
 @pytest.mark.parametrize('planes', [[], [plane(1), plane(2), plane(3, hull=())]])
 @pytest.mark.parametrize('name', OUTPUTS)
 def test_node_and_replay_write_the_same_bytes(name, planes):

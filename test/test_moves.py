@@ -129,10 +129,3 @@ def test_minimise_stops_after_the_rounds_it_is_given():
         many.expand(alpha)
     np.testing.assert_array_equal(few.image, many.image)
     assert any(few.expand(alpha) for alpha in range(5))
-
-
-def test_energy_counts_each_edge_once():
-    data = np.array([[1.0, 2.0], [4.0, 8.0]])
-    labels = np.array([[0, 1], [0, 0]])
-    horizontal, vertical = np.array([[3.0], [100.0]]), np.array([[50.0, 7.0]])
-    assert energy(data, labels, Grid(horizontal, vertical), 2.0) == 15 + 2 * (3 + 7)

@@ -219,19 +219,6 @@ def test_a_change_of_parameters_takes_effect_on_the_next_frame(bench, expected):
     np.testing.assert_array_equal(bench.segment(), expected)
 
 
-def test_bad_parameters_are_refused_with_the_reason(bench, expected):
-    bench.in_use()
-    (result,) = bench.set_parameters(method='magic')
-    assert not result.successful and 'method' in result.reason and 'planes' in result.reason
-    (result,) = bench.set_parameters(distortion_map='/none.tiff')
-    assert not result.successful and 'distortion_map: /none.tiff' in result.reason
-    (result,) = bench.set_parameters(smoothness=-1.0)
-    assert not result.successful and 'smoothness' in result.reason
-    result = bench.set_parameters(atomically=True, min_pixels=160 * 120, method='magic')
-    assert not result.successful and 'method' in result.reason
-    np.testing.assert_array_equal(bench.segment(), expected)
-
-
 def test_namespace_and_remapping_take_the_camera_info_along(expected):
     topics = '/robot/camera/depth/image_raw', '/robot/camera/depth/camera_info'
     with (

@@ -13,11 +13,9 @@ from ros_bench import DEPTH, FRAME, INFO, Bench
 from rosbags import rosbag2
 from sensor_msgs.msg import Imu
 
-from rangeseg_ros import Camera, Config, RangeImage, Segmenter, planes_from_message
+from rangeseg_ros import Camera, Config, planes_from_message
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.ground.roles import ROLES
-from rangeseg_ros.messages.clouds import points_from_message
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
@@ -101,33 +99,6 @@ def test_ids_outlive_a_change_of_parameters_and_end_with_time_running_back(bench
     bench.segment(early)
     planes = planes_from_message(bench.until(lambda: bench.find('planes', early)))
     assert len(planes) == 2 and min(planes['id']) > max(plane['id'] for plane in after.values())
-
-
-def test_ground_and_obstacles_share_out_the_points(bench):
-    depth = room(bench.camera)
-    depth[:, :3] = 0
-    with bench.listening('ground', 'obstacles'):
-        _, message = planes_of(bench, depth)
-        ground, obstacles = (
-            bench.until(lambda name=name: bench.find(name, message))
-            for name in ('ground', 'obstacles')
-        )
-    image = RangeImage.from_depth(depth, bench.camera)
-    terrain = Segmenter(Config()).segment(image).terrain
-    for cloud, class_, fields in ((ground, GROUND, 'xyz '), (obstacles, OBSTACLE, 'xyz ')):
-        assert cloud.header == message.header
-        step = 4 * len(fields)
-        assert (cloud.height, cloud.point_step, cloud.is_dense) == (1, step, True)
-        assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'height'][: len(fields)]
-        # One row is not organised; as a column it can be read like one that is.
-        cloud.height, cloud.width, cloud.row_step = cloud.width, 1, step
-        np.testing.assert_array_equal(
-            points_from_message(cloud)[:, 0], image.points[terrain == class_]
-        )
-    down = bench.camera.rays[..., 1]
-    on_floor = (depth > 0) & (down > 0) & (HEIGHT / np.where(down > 0, down, 1) < WALL)
-    assert (terrain == GROUND)[on_floor].mean() > 0.98
-    assert (terrain == OBSTACLE)[(depth > 0) & ~on_floor].mean() > 0.98
 
 
 def test_node_and_replay_say_the_same_of_a_recording(tmp_path):

@@ -94,16 +94,6 @@ def test_tangents_do_not_cross_disconnected_edges():
     assert found[11, 3:-3].all() and found[13, 3:-3].all()
 
 
-@pytest.mark.parametrize('shape', [(1, 1), (2, 5), (6, 6)])
-@pytest.mark.parametrize('method', METHODS)
-def test_images_too_small_have_no_normals_or_right_ones(shape, method):
-    camera = Camera(shape[1], shape[0], 50.0, 50.0, 1.0, 1.0)
-    found = method(plane_image((0, 0, -1), 1.0, camera))
-    assert found.shape == (*shape, 3)
-    defined = found[np.isfinite(found[..., 0])]
-    np.testing.assert_allclose(defined, np.tile([0, 0, -1], (len(defined), 1)), atol=1e-3)
-
-
 def test_orthogonal_fit_is_the_plane_of_least_distances():
     depth = np.random.default_rng(3).uniform(1.9, 2.1, CAMERA.shape)
     image = RangeImage.from_depth(depth, CAMERA)

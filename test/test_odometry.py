@@ -145,16 +145,6 @@ def test_stamps_that_do_not_tell_and_gaps_are_no_trouble():
         assert np.linalg.eigvalsh(motion.covariance).min() > -1e-12
 
 
-def test_frames_without_planes_are_no_trouble():
-    camera = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
-    sequence = SequenceSegmenter(Config(odometry=True))
-    nothing, wall = np.zeros(camera.shape, np.uint16), np.full(camera.shape, 2000, np.uint16)
-    for number, depth in enumerate((nothing, wall, nothing, wall)):
-        result = sequence.segment(RangeImage.from_depth(depth, camera), 10**9 + number * 10**8)
-        assert len(result.planes) == (depth is wall)
-        assert sequence.motion is not None
-
-
 def test_the_message_has_pose_and_twist_in_their_frames():
     labels, planes = planes_of(Scene(kinect_room(2).solids, kinect_room(2).poses), 0, 2)
     view = views(labels, planes, CONFIG.distortion_length)

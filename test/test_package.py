@@ -48,32 +48,6 @@ def test_setup_package_xml_and_citation_agree(setup_arguments):
         assert aliases.get(name, name) in keys
 
 
-@pytest.mark.skipif(not shutil.which('make'), reason='make is not installed')
-def test_the_names_of_a_release_are_in_every_file(tmp_path):
-    for name in ('Makefile', 'package.xml', 'CITATION.cff', 'setup.py', 'README.md'):
-        shutil.copy(ROOT / name, tmp_path)
-    (tmp_path / 'rangeseg_ros').mkdir()
-    shutil.copy(ROOT / 'rangeseg_ros/__init__.py', tmp_path / 'rangeseg_ros')
-    names = 'MAINTAINER=A Name', 'EMAIL=a@b.example', 'URL=https://b.example/c'
-    for _ in range(2):
-        subprocess.run(['make', '-C', tmp_path, 'release-names', *names], check=True)
-    package = ElementTree.parse(tmp_path / 'package.xml').getroot()
-    assert [each.text for each in package.iter('url')] == ['https://b.example/c']
-    citation = yaml.safe_load((tmp_path / 'CITATION.cff').read_text())
-    assert citation['repository-code'] == 'https://b.example/c'
-    text = (tmp_path / 'README.md').read_text()
-    assert text.count('(https://b.example/c/actions/workflows/ci.yml/badge.svg)') == 1
-    assert text.replace(text.splitlines()[1] + '\n', '') == (ROOT / 'README.md').read_text()
-    done = subprocess.run(
-        [sys.executable, 'setup.py', '--maintainer', '--maintainer-email', '--url'],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stdout.splitlines()[-3:] == ['A Name', 'a@b.example', 'https://b.example/c']
-
-
 def test_every_library_that_may_be_missing_is_in_its_extra(setup_arguments):
     extras = setup_arguments['extras_require']
     packages = {'rclpy': 'ros-jazzy-rclpy'}
@@ -204,29 +178,9 @@ def build_as_colcon_does(folder, *options, **environment):
     return done.stderr
 
 
-def test_setup_runs_where_colcon_makes_links(tmp_path):
-    """For --symlink-install: to the package and what is installed, not to the README."""
-    for name in ('setup.py', 'setup.cfg', 'rangeseg_ros'):
-        (tmp_path / name).symlink_to(ROOT / name)
-    command = [sys.executable, 'setup.py', '--version']
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.split()[-1] == __version__
-
-
 def test_colcon_builds_without_numba_and_says_that_nothing_is_compiled(tmp_path):
     errors = build_as_colcon_does(tmp_path)
     (line,) = (line for line in errors.splitlines() if 'kernels' in line)
     assert line == (
         'kernels are left for the first start to compile: ImportError: numba is not for this test'
     )
-
-
-@pytest.mark.parametrize(
-    'options, environment',
-    [
-        pytest.param((), {'RANGESEG_COMPILE': '0'}, id='where it is switched off'),
-        pytest.param(('--root', '/'), {}, id='into packages for other machines'),
-    ],
-)
-def test_nothing_is_compiled(tmp_path, options, environment):
-    assert 'kernels' not in build_as_colcon_does(tmp_path, *options, **environment)

@@ -85,6 +85,9 @@ def test_damaged_lzf_is_refused(data):
         (lambda d: d.replace(b'WIDTH 3', b'WIDTH 0'), 'empty'),
         (lambda d: d.replace(b'DATA binary', b'DATA zipped'), 'unknown DATA'),
         (lambda d: d[:-1], 'truncated'),
+        (lambda d: d.replace(b'WIDTH 3', b'WIDTH 10000000000'), 'truncated'),
+        (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 1 99999999999'), 'malformed'),
+        (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 1 ' + b'9' * 5000), 'malformed'),
     ],
 )
 def test_malformed(tmp_path, change, fault):

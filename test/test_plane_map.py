@@ -180,41 +180,6 @@ def test_what_rays_pass_through_is_gone_within_seconds():
     assert shapely.Polygon(floor.hull[:, :2]).contains(shapely.Point(2.3, 0))
 
 
-def test_a_map_keeps_so_many_planes_and_those_seen_last():
-    room = kinect_room(0)
-    scene = Scene(room.solids, room.poses * 8)
-    plane_map, random = PlaneMap(Config(map_planes=3)), np.random.default_rng(0)
-    for k in range(8):
-        add(plane_map, scene, k, random)
-        assert len(plane_map.planes) <= 3
-    assert len(plane_map.planes) == 3
-    stamps = [plane.last_stamp for plane in plane_map.planes]
-    assert max(stamps) == 10**9 + 7 * 10**9 // 30
-
-
-def test_a_map_begun_anew_gives_other_ids():
-    room = kinect_room(0)
-    scene = Scene(room.solids, room.poses * 5)
-    plane_map = mapped(scene, range(4))
-    ids = {plane.id for plane in plane_map.planes}
-    assert ids
-    plane_map.clear()
-    assert plane_map.planes == []
-    for k in range(4):
-        add(plane_map, scene, k, np.random.default_rng(1))
-    assert not ids & {plane.id for plane in plane_map.planes}
-
-
-def test_the_same_frames_give_the_same_map():
-    room = kinect_room(2)
-    scene = Scene(room.solids, walk(room.poses[0], 2, 40), room.dark)
-    one, two = (mapped(scene, range(0, 40, 8)).planes for _ in range(2))
-    assert [plane.id for plane in one] == [plane.id for plane in two]
-    for a, b in zip(one, two, strict=True):
-        assert np.array_equal(a.covariance, b.covariance)
-        assert np.array_equal(a.hull, b.hull)
-
-
 @pytest.mark.parametrize('turn', [0.0, 25.0])
 def test_a_jump_of_the_fixed_frame_does_not_double_the_map(turn):
     room = kinect_room(4)

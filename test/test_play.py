@@ -75,19 +75,6 @@ def test_the_clock_of_the_recording(tmp_path):
     assert min(times) >= 1.0 and max(times) == 2.0
 
 
-@pytest.mark.parametrize(
-    'name, content, words',
-    [('missing', None, 'missing'), ('empty', b'', 'not a readable'), ('x.mcap', b'abc', 'x.mcap')],
-)
-def test_bad_bag_ends_with_one_line(tmp_path, name, content, words):
-    path = tmp_path / name
-    if content is not None:
-        path.write_bytes(content)
-    run = subprocess.run([*RANGESEG, 'play', path], capture_output=True, text=True)
-    assert run.returncode == 2
-    assert words in run.stderr and run.stderr.strip().count('\n') == 0
-
-
 def test_no_large_image_is_lost_with_the_profile(tmp_path, monkeypatch):
     """The counterpart of the test of the node in which, without the profile, images are lost."""
     publisher = """

@@ -1,7 +1,5 @@
 """Reconstructed normals and jump edges as outputs: Segmentation, files, messages, report."""
 
-import pickle
-
 import cv2
 import numpy as np
 import pytest
@@ -53,13 +51,6 @@ def test_method_normals_gives_its_directions(room):
     known = directions('platonic', 73).astype(np.float32)
     found = np.unique(result.normals[result.labels > 0], axis=0)
     assert all((known == normal).all(axis=1).any() for normal in found)
-
-
-def test_a_pickled_result_keeps_its_normals_and_energy(room):
-    _, result = segmented(room, method='normals')
-    copy = pickle.loads(pickle.dumps(result))
-    np.testing.assert_array_equal(copy.normals, result.normals)
-    assert copy.energy == result.energy
 
 
 def test_edges_lie_on_both_sides_of_jumps():

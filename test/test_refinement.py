@@ -145,13 +145,6 @@ def test_links_are_the_weights_on_all_four_sides(shape):
             assert found == pytest.approx(expected[side].flat[p], rel=1e-6)
 
 
-def test_weights_are_inverse_variances():
-    problem, _, _ = random_case(0, 9, 11)
-    measured = problem.inverse > 0
-    np.testing.assert_allclose(problem.weight[measured], 1 / NOISE**2, rtol=1e-5)
-    assert not problem.weight[~measured].any()
-
-
 def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     white = SENSOR._replace(correlation=0.0)
@@ -223,17 +216,6 @@ def small_room(seed=900):
     )
     problem = Problem.of(image, sensor, edges, BLOCK, LAMBDA)
     return problem, (found[0], nodes.moments, found[1]), sensor
-
-
-def test_expansions_lower_the_energy_of_the_labels_of_blocks():
-    problem, (surface, blocks, moments), sensor = small_room()
-    width, height = problem.width, len(problem.inverse) // problem.width
-    begin = np.kron(surface, np.ones((BLOCK, BLOCK), np.int32))[:height, :width]
-    begin = begin.ravel() * (problem.weight > 0)
-    labels, models = refine(problem, surface, blocks, moments, sensor)
-    values = energies(np.stack([begin, labels]).reshape(2, height, width), problem, models)
-    assert values[1] < 0.9 * values[0]
-    assert energy(labels, problem, models) == pytest.approx(values[1], rel=1e-5)
 
 
 def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():

@@ -7,7 +7,7 @@ from urllib.parse import unquote
 
 import numpy as np
 import pytest
-from replays import record_walls, replay, walls
+from replays import record_walls, walls
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.batch.frame_files import write_frame
@@ -118,15 +118,13 @@ def test_bars_break_where_a_plane_is_out_of_sight():
     assert charts.runs(np.arange(10)) == [(0, 9)]
 
 
-def test_replay_of_a_damaged_recording_says_so(tmp_path):
-    file = next(record_walls(tmp_path / 'bag', 16).glob('*.mcap'))
-    with file.open('r+b') as stream:
-        stream.truncate(file.stat().st_size - 100)
-    outcome = replay(tmp_path / 'bag', tmp_path / 'out')
-    page = Page(tmp_path / 'out/report.html')
-    assert outcome.damage
-    assert f'Damage: {outcome.damage}' in page.text
-    assert f'{outcome.frames} frames in' in page.text
+def test_each_plane_of_a_chart_has_a_fifth_of_an_inch():
+    def height(count):
+        seen = sightings(*((0, number, 1.0, 2.0) for number in range(count)))
+        picture = charts.id_bars(seen, np.array([0.0]))
+        return float(re.search(r'<svg [^>]*height="([.\d]+)pt"', picture)[1])
+
+    assert height(30) - height(10) == pytest.approx(20 * 0.2 * 72)
 
 
 def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch):

@@ -122,18 +122,6 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
     assert curved.mean() > 0.01 if build is scenes.curved_scene else not curved.any()
 
 
-def test_same_seed_same_scene_and_motion_continues():
-    short, long = scenes.kinect_room(5, frames=3), scenes.kinect_room(5, frames=60)
-    for one, other in zip(short.poses, long.poses[:3], strict=True):
-        assert np.array_equal(one.rotation, other.rotation)
-        assert np.array_equal(one.position, other.position)
-    for one, other in zip(short.solids, long.solids, strict=True):
-        assert np.array_equal(one.planes, other.planes)
-    steps = np.diff([pose.position for pose in long.poses], axis=0)
-    speed = 30 * np.linalg.norm(steps, axis=1)
-    assert 0.01 < speed.max() < 0.4
-
-
 def test_truth_ids_persist_while_the_camera_moves():
     room = scenes.kinect_room(5, frames=30)
     camera = kinect_camera(160, 120)

@@ -167,15 +167,6 @@ def test_abw_points_are_the_published_ones(number, split, constants):
         assert point * 1000 == pytest.approx((x, -y, centre - z), rel=1e-6)
 
 
-def test_abw_range_image():
-    values = np.full((512, 512), 128)
-    values[:3] = 0
-    image = geometry.abw_range_image(values, geometry.ABW_FIRST)
-    assert not image.valid[:3].any() and image.valid[3:].all()
-    expected = abw_points(values, geometry.ABW_FIRST)
-    assert np.allclose(image.points, expected, rtol=1e-5, equal_nan=True)
-
-
 def published_perceptron(v, r, c):
     h1, h2, delta, r0 = 3.0, 5.5, 0.20236, 830.3
     alpha = math.radians(51.65 * (255.5 - c) / 512)
@@ -198,9 +189,3 @@ def test_perceptron_points_are_the_published_ones():
     for r, c in ((0, 0), (511, 511), (0, 511), (37, 402), (256, 255)):
         x, y, z = published_perceptron(values[r, c], r, c)
         assert points[r, c] * 100 == pytest.approx((-x, -y, z))
-
-
-def test_perceptron_range_image():
-    values = np.full((512, 512), 700)
-    image = geometry.perceptron_range_image(values)
-    assert np.allclose(image.points, geometry.perceptron_points(values), atol=1e-5)

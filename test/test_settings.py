@@ -12,26 +12,34 @@ from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.ros.settings import Settings
 
 
-def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
-    came, release = [], Event()
+class Compilation:
+    """Takes the place of the compiler: of more than the first outputs once it is released."""
 
-    def prepare(config, kinds, report, outputs):
+    def __init__(self, monkeypatch):
+        self.came, self.release = [], Event()
+        monkeypatch.setattr(settings, 'prepare', self.prepare)
+
+    def prepare(self, config, kinds, report, outputs):
         if outputs != FIRST:
-            release.wait()
-        came.append(outputs)
+            self.release.wait()
+        self.came.append(outputs)
+
+
+def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
+    compilation = Compilation(monkeypatch)
+    came = compilation.came
 
     def publish():
         came.append(used.ready_for('labels'))
         came.append(used.ready_for('terrain'))
 
-    monkeypatch.setattr(settings, 'prepare', prepare)
     config = NodeConfig()
     used = Settings(config, lambda progress: None, lambda: None)
     assert used.in_use() is config
     publication = Thread(target=publish)
     publication.start()
     publication.join(0.2)  # it must not end by itself
-    release.set()
+    compilation.release.set()
     publication.join()
     used.close()
     assert came[0] == FIRST and came[1] is True
@@ -39,13 +47,7 @@ def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(mo
 
 
 def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
-    release = Event()
-
-    def prepare(config, kinds, report, outputs):
-        if outputs != FIRST:
-            release.wait()
-
-    monkeypatch.setattr(settings, 'prepare', prepare)
+    compilation = Compilation(monkeypatch)
     used = Settings(NodeConfig(), lambda progress: None, lambda: None)
     first = used.in_use()
     other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
@@ -53,7 +55,7 @@ def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
     assert used.in_use() is other is not first and not used.pending
     used.want(normals)
     assert used.in_use() is other and used.pending
-    release.set()
+    compilation.release.set()
     used.close()
 
 
@@ -95,18 +97,12 @@ def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
 
 
 def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypatch):
-    came, release = Event(), Event()
-
-    def prepare(config, kinds, report, outputs):
-        if outputs != FIRST:
-            release.wait()
-
-    monkeypatch.setattr(settings, 'prepare', prepare)
-    used = Settings(NodeConfig(), lambda progress: None, came.set)
+    compilation = Compilation(monkeypatch)
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
     assert used.in_use()
     names = ['labels', 'normals', 'drops']
     assert used.in_order(names, ['drops']) == names
-    release.set()
+    compilation.release.set()
     assert used.ready_for('drops')
     assert used.in_order(names, ['drops']) == ['drops', 'labels', 'normals']
     used.close()

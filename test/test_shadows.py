@@ -93,15 +93,3 @@ def test_no_region_holds_a_board_and_the_wall_behind_it(side, detector, method):
             judged = labels > 0
             assert mixed(labels, front & judged, judged) <= 30, (step, shadow)
             assert len(np.unique(labels[front & judged])) >= 1, (step, shadow)
-
-
-def test_a_wall_with_a_shadow_stays_whole():
-    """A shadow by itself is no edge, nor is the noise beside it."""
-    depth = 2.0 + 0.002 * np.random.default_rng(0).standard_normal(CAMERA.shape)
-    depth[:, 100:] = 1.5
-    depth[20:100, 30:60] = 0
-    image = RangeImage.from_depth(depth.astype(np.float32), CAMERA)
-    found = flooded(image, Config(jump_edges='sobel'))
-    wall = image.valid.copy()
-    wall[:, 97:] = False
-    assert len(np.unique(found[wall])) == 1

@@ -68,25 +68,6 @@ def test_ids_follow_the_planes_not_the_labels():
     assert ids(tracker, frame(*stay()[::-1])) == [3, 2, 1]
 
 
-def test_the_rest_of_a_plane_is_as_it_was():
-    labels, planes = frame(*stay())
-    before = labels.copy()
-    tracked = Tracker().track(labels, planes, 0)
-    assert [p.label for p in tracked] == [1, 2, 3]
-    assert all(a.normal is b.normal for a, b in zip(tracked, planes, strict=True))
-    assert np.array_equal(labels, before)
-
-
-@pytest.mark.parametrize(('hidden', 'same'), [(5, True), (6, False)])
-def test_memory_is_exact(hidden, same):
-    tracker = Tracker(Config(track_time=5.5 / 30))
-    whole = frame(*stay(), (*MIDDLE, BOX))
-    assert ids(tracker, whole) == [1, 2, 3, 4]
-    for _ in range(hidden):
-        assert ids(tracker, frame(*stay())) == [1, 2, 3]
-    assert ids(tracker, whole) == [1, 2, 3, 4 if same else 5]
-
-
 def test_a_hidden_plane_moves_along_with_the_camera():
     # Over 20 frames the camera turns 20 degrees and comes 0.4 m nearer, so that the equation of
     # the hidden box becomes another one altogether.
@@ -219,15 +200,6 @@ def test_another_image_size_begins_anew():
     labels, planes = frame(*stay())
     assert ids(tracker, (labels, planes)) == [1, 2, 3]
     assert ids(tracker, (labels[::2, ::2], planes)) == [4, 5, 6]
-
-
-def test_frames_without_planes():
-    tracker = Tracker()
-    nothing = np.zeros(CAMERA.shape, np.uint16), []
-    assert ids(tracker, nothing) == []
-    assert ids(tracker, frame(*stay())) == [1, 2, 3]
-    assert ids(tracker, nothing) == []
-    assert ids(tracker, frame(*stay())) == [1, 2, 3]
 
 
 REGION = st.tuples(

@@ -36,11 +36,12 @@ def enlarged(depth, camera, factor, crop, interpolation=cv2.INTER_NEAREST):
 
 @pytest.mark.parametrize('factor', FACTORS)
 def test_replicated_pixels_are_undone_whatever_is_cropped(seen, factor):
-    original = RangeImage.from_depth(seen.depth, seen.camera)
+    depth, camera = seen.depth[:240, :320], replace(seen.camera, width=320, height=240)
+    original = RangeImage.from_depth(depth, camera)
     rng = np.random.default_rng(factor)
-    for _ in range(5):
+    for _ in range(3):
         crop = rng.integers(0, factor, 4)
-        image = RangeImage.from_depth(*enlarged(seen.depth, seen.camera, factor, crop))
+        image = RangeImage.from_depth(*enlarged(depth, camera, factor, crop))
         cells = replication(image)
         assert cells == (factor, crop[0], crop[1])
         reduced = cells.reduced(image)
@@ -85,8 +86,9 @@ def test_clouds_and_their_own_body_are_reduced_as_well(seen):
 
 @pytest.mark.parametrize('factor', FACTORS)
 def test_linear_enlargement_is_found(seen, factor):
-    depth = seen.depth.astype(np.float32) / 1000
-    frame = enlarged(depth, seen.camera, factor, (1, 1, 0, 0), cv2.INTER_LINEAR)
+    depth = seen.depth[:240, :320].astype(np.float32) / 1000
+    camera = replace(seen.camera, width=320, height=240)
+    frame = enlarged(depth, camera, factor, (1, 1, 0, 0), cv2.INTER_LINEAR)
     assert interpolation(RangeImage.from_depth(*frame)).factor == factor
 
 

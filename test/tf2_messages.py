@@ -13,21 +13,10 @@ import tempfile
 from importlib.util import find_spec
 from pathlib import Path
 
-GENERATORS = [
-    f'ros-jazzy-{name}'
-    for name in (
-        'rosidl-default-generators',
-        'rosidl-core-generators',
-        'python-cmake-module',
-        'ament-package',
-        'ament-cmake',
-        'ament-cmake-ros',
-        'ament-cmake-include-directories',
-        'ament-cmake-gmock',
-        'ament-cmake-gtest',
-        'ament-cmake-pytest',
-    )
-]
+AMENT = 'package cmake cmake-ros cmake-include-directories cmake-gmock cmake-gtest cmake-pytest'
+GENERATORS = ['rosidl-default-generators', 'rosidl-core-generators', 'python-cmake-module']
+GENERATORS += [f'ament-{name}' for name in AMENT.split()]
+GENERATORS = [f'ros-jazzy-{name}' for name in GENERATORS]
 TOOLS = ['catkin_pkg', 'lark', 'empy==3.3.4']
 CMAKE = """
 cmake_minimum_required(VERSION 3.8)
