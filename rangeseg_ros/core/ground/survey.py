@@ -96,6 +96,8 @@ class Survey:
             config.obstacle_height,
             config.drop_height,
             float(np.radians(config.up_sd)),
+            config.ground_gap,
+            config.robot_radius,
         )
         if up is None:
             up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)

@@ -17,7 +17,7 @@ from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
-from rangeseg_ros.core.ground.reach import reach
+from rangeseg_ros.core.ground.reach import Passable, reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -46,12 +46,16 @@ class Limits(NamedTuple):
         What lies so deep is a drop, metres.
     tilt : float
         Standard deviation of the direction that is up, radians.
+    gap, radius : float
+        See `Passable`.
     """
 
     slope: float
     obstacle: float
     drop: float
     tilt: float = float(np.radians(Config().up_sd))
+    gap: float = Config().ground_gap
+    radius: float = Config().robot_radius
 
     @property
     def least(self) -> float:
@@ -175,7 +179,14 @@ def _upright(
     height = height or _nearest(place[0], turned)
     place[0] += height
     steepest, highest = limits.slope + limits.tilt, HIGHEST if height_sd > 0 else np.inf
-    reached = reach(place, variance, highest, limits.least, float(np.tan(steepest)), turned)
+    reached = reach(
+        place,
+        variance,
+        cells.shared,
+        highest,
+        Passable(limits.least, float(np.tan(steepest)), 0.15, 0.25),
+        turned,
+    )
     if not reached.any():
         return _without_ground(image, cells, size, None, up, known, limits)
     slope = float(np.tan(limits.slope))
