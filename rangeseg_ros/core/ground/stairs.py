@@ -78,8 +78,6 @@ def stairs_of(terrain: Terrain) -> list[Stairs]:
     if cells is None:
         return []
     found = []
-    if not cells.turned:
-        cells = cells.turned_over()
     for sign in (1, -1):
         # Nobody sees a tread from below.
         highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST

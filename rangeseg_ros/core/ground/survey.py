@@ -121,7 +121,7 @@ class Survey:
             # A robot nods and a floor undulates, by less than an obstacle is high.
             known = (remembered, self.limits.least) if remembered else (0.0, 0.0)
         found = terrain_of(self.image, self.sensor, self.up, known, self.limits)
-        if self.memory and found.stand.surface:
+        if self.memory and found.stand.found:
             self.memory.remember(found.stand.height(self.up), self.stamp)
         return found
 

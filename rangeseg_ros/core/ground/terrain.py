@@ -64,7 +64,7 @@ class Limits(NamedTuple):
 
 
 class CellTerrain(NamedTuple):
-    """What the cells of an image are, (rows, columns).
+    """What the cells of an image are, (rows, columns), with the nearest row first.
 
     Attributes
     ----------
@@ -78,8 +78,6 @@ class CellTerrain(NamedTuple):
         The noise of a pixel's height, metres.
     crossing : (2, ...) float32
         Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
-    turned : bool
-        Whether up is down along the columns.
     """
 
     place: NDArray[np.float32]
@@ -87,13 +85,6 @@ class CellTerrain(NamedTuple):
     kind: NDArray[np.int8]
     unsure: NDArray[np.float32]
     crossing: NDArray[np.float32]
-    turned: bool
-
-    def turned_over(self) -> CellTerrain:
-        """With the rows in the other order."""
-        place, crossing = self.place[:, ::-1], self.crossing[:, ::-1]
-        height, kind, unsure = self.height[::-1], self.kind[::-1], self.unsure[::-1]
-        return CellTerrain(place, height, kind, unsure, crossing, not self.turned)
 
 
 class Terrain(NamedTuple):
@@ -121,7 +112,7 @@ class Terrain(NamedTuple):
 
     def __str__(self) -> str:
         """Where the ground is and how sure that is, in a few words."""
-        if not self.stand.surface:
+        if not self.stand.found:
             return '; '.join(['no ground in view', *self.stand.reasons])
         height, confidence = self.stand.height(self.field.up), self.stand.confidence
         return f'ground {height:.2f} m below, confidence {confidence:.2f}'
@@ -176,41 +167,31 @@ def _upright(
     cells = cells_of(image, size, up, sensor)
     place, variance = cells.place.astype(np.float64), cells.variance
     height, height_sd = known
-    height = height or _nearest(place[0], turned)
+    height = height or _nearest(place[0, :: 1 if turned else -1])
     place[0] += height
-    steepest, highest = limits.slope + limits.tilt, HIGHEST if height_sd > 0 else np.inf
-    reached = reach(
-        place,
-        variance,
-        cells.shared,
-        highest,
-        Passable(limits.least, float(np.tan(steepest)), 0.15, 0.25),
-        turned,
-    )
-    if not reached.any():
-        return _without_ground(image, cells, size, None, up, known, limits)
     slope = float(np.tan(limits.slope))
-    found = continued(place[:, reached], 4 * variance[reached], height_sd, slope, limits.least)
+    passable = Passable(limits.least, slope, limits.gap, limits.radius)
+    found = None
+    # Where nothing is near the stated height, what is elsewhere tells how wrong that is.
+    for highest in (HIGHEST, np.inf) if height_sd > 0 else (np.inf,):
+        reached = reach(place, variance, cells.shared, highest, passable, turned)
+        if reached.any():
+            near = place[:, reached], 4 * variance[reached]
+            found = continued(*near, height_sd, slope, limits.least)
+            break
     # Without a height the ground is what the camera stands on: a table tells by its size.
-    if found.confidence < SURE if height_sd > 0 else found.size < FURNITURE:
+    if not found or (found.confidence < SURE if height_sd > 0 else found.size < FURNITURE):
         return _without_ground(image, cells, size, found, up, known, limits)
-    stand = Stand(1, _theta(found, height, up), found.confidence)
+    a, b, c = found.plane
+    lean = np.array([b, c]) @ axes_of(up)[1:]
+    stand = Stand(-(up - lean) / (height - a), found.confidence)
     return _with_ground(image, cells, size, reached, stand, up, limits, turned)
 
 
-def _nearest(above: NDArray[np.float64], turned: bool) -> float:
+def _nearest(above: NDArray[np.float64]) -> float:
     """How far below the sensor the nearest cells are, metres, where no height is stated."""
-    rows = above if turned else above[::-1]
-    nearest = rows[np.isfinite(rows).argmax(axis=0), np.arange(rows.shape[1])]
+    nearest = above[np.isfinite(above).argmax(axis=0), np.arange(above.shape[1])]
     return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
-
-
-def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The plane of the ground under the robot: theta . ray is its inverse range."""
-    a, b, c = found.plane
-    lean = np.array([b, c]) @ axes_of(up)[1:]
-    theta: NDArray[np.float64] = -(up - lean) / (height - a)
-    return theta
 
 
 def _with_ground(
@@ -254,7 +235,10 @@ def _with_ground(
         flat_axes = axes_of(up)[1:].astype(np.float32)
         along[along <= 0] = np.nan
         crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
-    below = CellTerrain(cells.place, height, kind, sure, crossing, turned)
+    order = slice(None, None, 1 if turned else -1)
+    below = CellTerrain(
+        cells.place[:, order], height[order], kind[order], sure[order], crossing[:, order]
+    )
     return Terrain(classes, heights, stand, field, below)
 
 
@@ -307,5 +291,5 @@ def _without_ground(
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
     nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
-    stand = Stand(0, np.zeros(3), confidence, reasons)
+    stand = Stand(np.zeros(3), confidence, reasons)
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
