@@ -13,19 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
+from rangeseg_ros.core.ground.cells import WINDOW, Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import Passable, reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.significance import OUTLIER
 
-# Standard deviations of the noise within which the ground is the ground, and beyond which it is
-# known to be none.
-_CERTAIN = 3.0
-# Cells over which the relief of the ground is measured.
-_RELIEF = (9, 25)
 _SQUARE = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
@@ -211,17 +207,17 @@ def _with_ground(
     field = ground_field(cells, reached, stand.theta, size, up)
     height = field.heights(cells)
     # Relief counts as noise: what the cells of the ground scatter by.
-    count = cv2.blur(reached.astype(np.float32), _RELIEF)
-    squares = cv2.blur(np.where(reached, height, 0) ** 2, _RELIEF)
+    count = cv2.blur(reached.astype(np.float32), (WINDOW, WINDOW))
+    squares = cv2.blur(np.where(reached, height, 0) ** 2, (WINDOW, WINDOW))
     with np.errstate(divide='ignore', invalid='ignore'):
         relief = np.where(count > 0, squares / count, 0)
-    noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
+    noise = np.float32(OUTLIER) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
     # Among cells that a chain leads to, noise keeps some out of it.
     closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
     reached, beside = closed > 0, cv2.dilate(closed, _SQUARE[1:-1, 1:-1]) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
-    sure = np.float32(_CERTAIN) * cells.error
+    sure = np.float32(OUTLIER) * cells.error
     bounds = np.empty((3, *reached.shape), np.float32)
     bounds[0] = np.where(beside, np.clip(noise, limits.least / 4, share * limits.least), -1)
     bounds[1] = -np.maximum(share * limits.drop, sure)
@@ -249,7 +245,7 @@ def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
         return steep
     rise = np.abs(cells.place[0, 2:] - cells.place[0, :-2])
     way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
-    noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
+    noise = np.float32(2**0.5 * OUTLIER) * cells.error[1:-1]
     # Three times as steep as any ground, as what is hidden behind an edge is not.
     steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
     steep[0], steep[-1] = steep[1], steep[-2]
@@ -273,14 +269,14 @@ def _without_ground(
         # What is higher than any step is none, nor the ground by a wrong height.
         apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
         distance = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
+        bound = limits.obstacle + apart + OUTLIER * (height_sd + limits.tilt * distance)
         obstacle |= cells.place[0] + height > bound
     wide = size.enlarged(obstacle, image.shape)
     classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
     if seen and height > 0:
         off, below = abs(seen.plane[0]), height - seen.plane[0]
         why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
-        if off > _CERTAIN * seen.error:
+        if off > OUTLIER * seen.error:
             why += f', {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
         else:
             why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
