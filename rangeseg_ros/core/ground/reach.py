@@ -110,7 +110,7 @@ def _without_steps(
                     x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
                     way = np.sqrt(x * x + y * y)
                     # Beyond an edge the ground is hidden: what is next is farther than it is deep.
-                    beside = e == 0 or (axis == 0 and way < step)
+                    beside = e == 0 or way < step
                     if beside and abs(up) > slope * way + OUTLIER * noise + step / 8:
                         even[i, c] = even[k, m] = False
                     p, q = k + down, m + right
