@@ -81,7 +81,8 @@ def _without_distortion_length(original: Any) -> Any:
 
 
 def _near_height_zero(_: Any) -> Any:
-    def near(place: Any, variance: Any, shared: Any, highest: float, passable: Any, *_: Any) -> Any:
+    def near(place: Any, variance: Any, *rest: Any) -> Any:
+        passable = rest[2]
         return (variance > 0) & (np.abs(place[0]) < passable.step / 2)
 
     return near
@@ -167,7 +168,8 @@ MECHANISMS = (
               {'ground.terrain.reach': _near_height_zero}, 'terrain'),
     Mechanism('slopes in any direction', 'ground/reach.py:_find_slopes,_find_steep',
               {'ground.reach._find_slopes':
-               lambda _: lambda place, variance, *rest: np.zeros(variance.shape, bool)}, 'terrain'),
+               lambda _: lambda place, variance, *rest: np.zeros(variance.shape, bool)},
+              'terrain'),
     Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
               {'ground.terrain.ground_field':
                lambda original: lambda cells, ground, *rest: original(
