@@ -235,7 +235,7 @@ def _evidence(
     rays cross the ground continued.
     """
     place = cells.place[[1, 2, 0]].astype(np.float64)
-    variance = (cells.unsure.astype(np.float64) / OUTLIER) ** 2
+    variance = cells.error.astype(np.float64) ** 2
     ground = cells.kind == GROUND
     both = ground[1:] & ground[:-1]
     share = np.arange(_BETWEEN) / _BETWEEN

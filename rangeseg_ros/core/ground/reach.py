@@ -21,9 +21,8 @@ from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Columns on either side whose ground leads to a cell.
 _BESIDE = 4
-# Cells, as powers of two, over which a slope is measured along rows and columns, and those over
-# which what is nearer than a step is high is beside a cell.
-_BASELINES, _NEXT = 6, 2
+# Cells, as powers of two, over which a slope is measured along rows and columns.
+_BASELINES = 6
 
 
 class Passable(NamedTuple):
@@ -111,7 +110,7 @@ def _without_steps(
                     x, y = place[1, k, m] - place[1, i, c], place[2, k, m] - place[2, i, c]
                     way = np.sqrt(x * x + y * y)
                     # Beyond an edge the ground is hidden: what is next is farther than it is deep.
-                    beside = e == 0 or (e <= _NEXT and way < step)
+                    beside = e == 0 or way < step
                     if beside and abs(up) > slope * way + OUTLIER * noise + step / 8:
                         even[i, c] = even[k, m] = False
                     p, q = k + down, m + right

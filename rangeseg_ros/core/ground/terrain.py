@@ -20,8 +20,10 @@ from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import Passable, reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.significance import OUTLIER
 
+# Standard deviations of the noise within which the ground is the ground, and beyond which it is
+# known to be none.
+_CERTAIN = 3.0
 _SQUARE = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
@@ -70,8 +72,8 @@ class CellTerrain(NamedTuple):
         Above the ground, metres; NaN where not measured.
     kind : (...) int8
         See `classes`.
-    unsure : (...) float32
-        The noise of a pixel's height, metres.
+    error : (...) float32
+        See `Cells`.
     crossing : (2, ...) float32
         Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     """
@@ -79,7 +81,7 @@ class CellTerrain(NamedTuple):
     place: NDArray[np.float32]
     height: NDArray[np.float32]
     kind: NDArray[np.int8]
-    unsure: NDArray[np.float32]
+    error: NDArray[np.float32]
     crossing: NDArray[np.float32]
 
 
@@ -211,13 +213,13 @@ def _with_ground(
     squares = cv2.blur(np.where(reached, height, 0) ** 2, (WINDOW, WINDOW))
     with np.errstate(divide='ignore', invalid='ignore'):
         relief = np.where(count > 0, squares / count, 0)
-    noise = np.float32(OUTLIER) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
+    noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
     # Among cells that a chain leads to, noise keeps some out of it.
     closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
     reached, beside = closed > 0, cv2.dilate(closed, _SQUARE[1:-1, 1:-1]) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
-    sure = np.float32(OUTLIER) * cells.error
+    sure = np.float32(_CERTAIN) * cells.error
     bounds = np.empty((3, *reached.shape), np.float32)
     bounds[0] = np.where(beside, np.clip(noise, limits.least / 4, share * limits.least), -1)
     bounds[1] = -np.maximum(share * limits.drop, sure)
@@ -233,7 +235,7 @@ def _with_ground(
         crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
     order = slice(None, None, 1 if turned else -1)
     below = CellTerrain(
-        cells.place[:, order], height[order], kind[order], sure[order], crossing[:, order]
+        cells.place[:, order], height[order], kind[order], cells.error[order], crossing[:, order]
     )
     return Terrain(classes, heights, stand, field, below)
 
@@ -245,7 +247,7 @@ def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
         return steep
     rise = np.abs(cells.place[0, 2:] - cells.place[0, :-2])
     way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
-    noise = np.float32(2**0.5 * OUTLIER) * cells.error[1:-1]
+    noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
     # Three times as steep as any ground, as what is hidden behind an edge is not.
     steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
     steep[0], steep[-1] = steep[1], steep[-2]
@@ -269,14 +271,14 @@ def _without_ground(
         # What is higher than any step is none, nor the ground by a wrong height.
         apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
         distance = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + apart + OUTLIER * (height_sd + limits.tilt * distance)
+        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
         obstacle |= cells.place[0] + height > bound
     wide = size.enlarged(obstacle, image.shape)
     classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
     if seen and height > 0:
         off, below = abs(seen.plane[0]), height - seen.plane[0]
         why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
-        if off > OUTLIER * seen.error:
+        if off > _CERTAIN * seen.error:
             why += f', {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
         else:
             why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
