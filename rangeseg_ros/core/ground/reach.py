@@ -207,7 +207,7 @@ def _spread(
     # Of each column: weight, mean, and where the cell is that was reached last; how far what is
     # seen is off the ground that leads to it, and where that was seen last.
     weight, mean, off = np.zeros(columns), np.zeros(columns), np.zeros(columns)
-    last, seen = np.full((columns, 3), np.nan), np.full((columns, 3), np.nan)
+    last, seen = np.full((columns, 3), np.nan), np.full((columns, 4), np.nan)
     for i in range(rows):
         for n in range(columns):
             c = n if i % 2 == 0 else columns - 1 - n
@@ -230,10 +230,12 @@ def _spread(
                 apart = h - summed / total
             near = abs(apart) < half and nearest <= passable.gap
             way = np.sqrt((seen[c, 1] - x) ** 2 + (seen[c, 2] - y) ** 2)
-            if abs(h - seen[c, 0]) < half and way < radius:
+            # Over a wall, or beyond an edge, it is another surface.
+            noise = np.sqrt(variance[i, c] + seen[c, 3])
+            if abs(h - seen[c, 0]) < passable.slope * way + CLEARLY * noise and way < radius:
                 apart += (off[c] - apart) * np.exp(-way / radius)
             off[c] = apart
-            seen[c] = h, x, y
+            seen[c] = h, x, y, variance[i, c]
             if not even[i, c] or not near or abs(apart) >= half:
                 continue
             reached[i, c] = True
