@@ -80,8 +80,9 @@ def _without_distortion_length(original: Any) -> Any:
 
 
 def _near_height_zero(_: Any) -> Any:
-    def near(place: Any, variance: Any, highest: float, least: float, *rest: Any) -> Any:
-        return (variance > 0) & (np.abs(place[0]) < least / 2)
+    def near(place: Any, variance: Any, *rest: Any) -> Any:
+        passable = rest[2]
+        return (variance > 0) & (np.abs(place[0]) < passable.step / 2)
 
     return near
 
@@ -165,6 +166,10 @@ MECHANISMS = (
     # The ground.
     Mechanism('ground reached by a chain', 'ground/reach.py',
               {'ground.terrain.reach': _near_height_zero}, 'terrain'),
+    Mechanism('slopes in any direction', 'ground/reach.py:_find_slopes,_find_steep',
+              {'ground.reach._find_slopes':
+               lambda _: lambda place, variance, *rest: np.zeros(variance.shape, bool)},
+              'terrain'),
     Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
               {'ground.terrain.ground_field':
                lambda original: lambda cells, ground, *rest: original(

@@ -6,8 +6,12 @@ docs/normals.png: jump edges, and the normals that both methods reconstruct.
 docs/figures/planes.png, uncertainty.png: a Kinect's frame of a room and a stereo camera's.
 docs/figures/distortion.png: fixed pattern of a simulated Kinect, what is learned, what is left.
 docs/figures/map.png: the map of a walk through a room, from above and from a side.
+
+python docs/figures.py --detection DETECTION.json PICTURE.png draws what `rangeseg evaluate --json`
+says of test pieces.
 """
 
+import json
 import sys
 from pathlib import Path
 
@@ -38,6 +42,10 @@ METHODS = 'normals', 'planes'
 
 def main():
     """Draw everything."""
+    if sys.argv[1:2] == ['--detection']:
+        found, picture = map(Path, sys.argv[2:])
+        write_image(picture, detection(json.loads(found.read_text())['detection']))
+        return
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
     kinect, stereo = frame('kinect', 8, 1), frame('realsense', 3, 1)
     write_image(folder / 'comparison.png', comparison(kinect))
@@ -50,6 +58,33 @@ def main():
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
     write_image(folder / 'figures' / 'distortion.png', distortion(sensor_seed=1))
     write_image(folder / 'figures' / 'map.png', room_map(scene=8, seed=1))
+
+
+def detection(rows):
+    """In how many scenes each test piece is found (colour), and how much of it in the worst."""
+    kinds = list(dict.fromkeys(row['kind'] for row in rows))
+    figure = Figure(figsize=(9, 2.2), dpi=120, layout='constrained')
+    for axes, kind in zip(figure.subplots(1, len(kinds)), kinds, strict=True):
+        cells = [row for row in rows if row['kind'] == kind]
+        sizes, places = (sorted({row[name] for row in cells}) for name in ('size', 'distance'))
+        shares = np.full((len(sizes), len(places)), np.nan)
+        for row in cells:
+            if row['scenes']:
+                place = sizes.index(row['size']), places.index(row['distance'])
+                shares[place] = row['detected'] / row['scenes']
+                worst = row['worst'].split()[-1]
+                axes.text(*place[::-1], worst, ha='center', va='center', fontsize=8)
+        axes.imshow(
+            shares, cmap='RdYlGn', vmin=0, vmax=1, origin='lower', aspect='auto', alpha=0.7
+        )
+        axes.set_xticks(range(len(places)), [f'{place:g} m' for place in places])
+        unit = '\u00b0' if kind == 'ramp' else ' m'
+        axes.set_yticks(range(len(sizes)), [f'{size:g}{unit}' for size in sizes])
+        axes.tick_params(labelsize=7)
+        axes.set_title(kind, fontsize=9)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
 def comparison(image):

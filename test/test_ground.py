@@ -20,13 +20,13 @@ CAMERA = 0.8
 FLAT = slab(-3, FAR, 0, 0, ALL)
 
 
-def found(pieces, pitch, height, up=None, seed=0, camera=CAMERA):
-    pose = Pose.looking((0, 0, camera), 0, pitch, 0)
+def found(pieces, pitch, height, up=None, seed=0, camera=CAMERA, yaw=0, limits=LIMITS):
+    pose = Pose.looking((0, 0, camera), yaw, pitch, 0)
     scene = Terrain('made', tuple(Piece(*piece) for piece in pieces), (FLAT,), pose)
     frame = simulate_terrain(scene, Kinect(seed), seed=seed)
     image = RangeImage.from_depth(frame.depth, Kinect(seed).camera)
     known = (height, 0.015) if height else (0.0, 0.0)
-    return terrain_of(image, STATED, scene.up if up is None else up, known, LIMITS), frame
+    return terrain_of(image, STATED, scene.up if up is None else up, known, limits), frame
 
 
 def drop_at(edge, depth):
@@ -47,7 +47,7 @@ def test_a_landing_whose_edge_is_out_of_view_is_no_ground(depth, seed):
     pitch = np.degrees(np.arctan2(CAMERA, 1.5)) - SEEN
     terrain, frame = found(drop_at(0.9, depth), pitch, CAMERA, seed=seed)
     assert share(terrain, frame, DROP, GROUND) < 0.01
-    assert not terrain.stand.surface
+    assert not terrain.stand.found
     assert 'stated height is 0.80 m' in terrain.stand.reasons[0]
 
 
@@ -59,21 +59,35 @@ def test_a_strip_of_floor_at_the_lower_border_is_the_ground(depth):
     assert share(terrain, frame, DROP, GROUND) < 0.01
 
 
-@pytest.mark.parametrize('error', [-0.1, 0.1])
+@pytest.mark.parametrize('error', [-0.5, -0.2, -0.1, 0.1, 0.2, 0.5, 1.0])
 def test_a_wrong_height_is_named_and_nothing_is_ground(error):
     terrain, _ = found(drop_at(1.5, 0.1), 30, CAMERA + error)
     assert not (terrain.classes == GROUND).any()
     assert f'stated height is {CAMERA + error:.2f} m' in terrain.stand.reasons[0]
 
 
-def test_what_falls_to_the_side_by_20_degrees_is_no_ground():
+@pytest.mark.parametrize('yaw', [-40, -20, 0])
+def test_what_falls_to_the_side_by_20_degrees_is_no_ground(yaw):
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])  # from x, y to y, z of the world
     level = prism(np.array([(-0.2, -4), (8, -4), (8, 0), (-0.2, 0)]), 20, turn, (0, 0, 0))
     fall = -7.8 * np.tan(np.radians(20))
     side = prism(np.array([(-8, -9), (-0.2, -9), (-0.2, 0), (-8, fall)]), 20, turn, (0, 0, 0))
-    terrain, frame = found([(level, GROUND), (side, DROP, 1.0)], 28, CAMERA)
-    assert share(terrain, frame, GROUND, GROUND) > 0.97
+    terrain, frame = found([(level, GROUND), (side, DROP, 1.0)], 28, CAMERA, yaw=yaw)
     assert share(terrain, frame, DROP, GROUND) < 0.01
+    assert yaw or share(terrain, frame, GROUND, GROUND) > 0.97
+
+
+@pytest.mark.parametrize(('gap', 'kept'), [(0.15, 0.0), (0.5, 0.97)])
+def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
+    pieces = [
+        (slab(-3, 1.2, 0, 0, ALL), GROUND),
+        (slab(1.2, 1.5, -1, -1, ALL), DROP, 1.0),
+        (slab(1.5, FAR, 0, 0, ALL), GROUND),
+    ]
+    terrain, frame = found(pieces, 28, CAMERA, limits=LIMITS._replace(gap=gap, radius=gap + 0.1))
+    beyond = (frame.terrain == GROUND) & (frame.depth > 2100) & (frame.depth < 2600)
+    assert beyond.sum() > 1000
+    assert abs((terrain.classes[beyond] == GROUND).mean() - kept) < 0.03
 
 
 def test_a_table_alone_is_no_floor():

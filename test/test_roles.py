@@ -8,8 +8,7 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.ramps import ramps_of
-from rangeseg_ros.core.ground.roles import ROLES, RolesError, roles
+from rangeseg_ros.core.ground.roles import ROLES, RolesError, ramps_of, roles
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -255,6 +255,15 @@ class Config:
     drop_height: float = option(
         0.05, 'what lies so deep below the ground is a drop, metres', 0.005, 10.0
     )
+    ground_gap: float = option(
+        0.15, 'widest gap in the ground that the robot crosses, metres', 0.0, 10.0
+    )
+    robot_radius: float = option(
+        0.25,
+        'radius of the robot, metres: ground that far apart may lead from one to the other',
+        0.01,
+        10.0,
+    )
     grid_resolution: float = option(
         0.05, 'side of a cell of ~/grid, the ground around the robot, metres', 0.01, 1.0
     )

@@ -15,11 +15,10 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundGrid
-from rangeseg_ros.core.ground.ramps import Ramp, ramps_of
+from rangeseg_ros.core.ground.roles import Ramp, Tilt, ramps_of, tilt_of
 from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
-from rangeseg_ros.core.ground.tilt import Tilt, tilt_of
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.ground.grid import GridMemory
+from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
-from rangeseg_ros.core.ground.survey import HeightMemory, Survey, grid_options
+from rangeseg_ros.core.ground.survey import Survey, grid_options
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.placement import moved_planes
@@ -49,8 +49,7 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config)
-        self._height = HeightMemory(self.config.track_time)
-        self._grid = GridMemory(grid_options(self.config))
+        self._ground = GroundMemory(grid_options(self.config))
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -71,9 +70,8 @@ class SequenceSegmenter:
             self._odometry, self.motion = PlaneOdometry(config), None
         self._odometry.config = config
         self.map.config = config
-        self._height.patience = config.track_time
         if grid_options(config) != grid_options(before) or config.map_frame != before.map_frame:
-            self._grid = GridMemory(grid_options(config))
+            self._ground = GroundMemory(grid_options(config))
 
     def segment(
         self,
@@ -117,8 +115,7 @@ class SequenceSegmenter:
         if stamp < self._stamp:
             self._tracker.reset()
             self.map.clear('time has gone back')
-            self._height.forget()
-            self._grid.forget()
+            self._ground.forget()
             self._pose = None
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
         sensor = Transform(np.eye(3), image.place)
@@ -147,8 +144,7 @@ class SequenceSegmenter:
                 survey = replace(survey, sensor_height=height)
             survey = replace(
                 survey,
-                memory=self._height,
-                grid=self._grid,
+                memory=self._ground,
                 stamp=stamp,
                 pose=pose,
                 fixed_frame=self.config.map_frame,

@@ -36,7 +36,7 @@ def stairs_row(stairs: Stairs) -> list[str]:
 def ground_row(result: Segmentation) -> list[str]:
     """Values of an image for the columns `GROUND`."""
     ground, tilt = result.ground, result.tilt.degrees if result.tilt else 0.0
-    if ground is None or not ground.stand.surface:
+    if ground is None or not ground.stand.found:
         return ['0', '', '', f'{tilt:.9g}']
     height = ground.stand.height(ground.field.up)
     return ['1', *(f'{x:.9g}' for x in (height, ground.stand.confidence, tilt))]

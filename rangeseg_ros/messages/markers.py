@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.ground.ramps import Ramp
+from rangeseg_ros.core.ground.roles import Ramp
 from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.drawing import colours
 

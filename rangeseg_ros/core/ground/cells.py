@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER
 
-# Rows of an image whose cells are 1 x 4 pixels.
+# Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
+WINDOW = 9
+"""Side of the square, in cells, over which the slope of the ground is measured."""
 
 
 class CellSize(NamedTuple):
@@ -31,7 +33,7 @@ class CellSize(NamedTuple):
 
     @classmethod
     def for_image(cls, shape: tuple[int, int]) -> CellSize:
-        """2 x 8 for 640 x 480, more for larger images, 1 x 4 for small ones."""
+        """4 x 8 for 640 x 480, more for larger images, 1 x 2 for small ones."""
         rows = max(shape[0] // _ROWS, 1)
         return cls(rows, 2 * rows)
 
@@ -59,6 +61,8 @@ class Cells(NamedTuple):
     variance : (...) float64
         Of the mean height, metres^2; 0 where not measured, and where the pixels are of two
         surfaces: they differ by more than by noise.
+    shared : (...) float64
+        How many times that variance a slope over `WINDOW` cells errs, by what cells share.
     """
 
     ray: NDArray[np.float32]
@@ -66,6 +70,7 @@ class Cells(NamedTuple):
     place: NDArray[np.float32]
     error: NDArray[np.float32]
     variance: NDArray[np.float64]
+    shared: NDArray[np.float64]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -104,7 +109,13 @@ def cells_of(
     whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
-    return Cells(ray, inverse, place, error.astype(np.float32), of_mean)
+    # Noise that neighbours share counts once, and smooth distortion is a slope: the gradient of a
+    # field smoothed by a Gaussian is 1 / (sqrt(2) length) of the field, per pixel.
+    pixels = size.rows * size.columns
+    alike = max(4 * np.pi * sensor.correlation**2 / pixels, 1.0)
+    bend = WINDOW**4 * pixels / (24 * sensor.distortion_length**2)
+    shared = alike + bend * systematic_variance.py_func(sensor, inverse**2) / (variance * share)
+    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, shared)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

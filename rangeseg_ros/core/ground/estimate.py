@@ -26,24 +26,27 @@ class Stand(NamedTuple):
 
     Attributes
     ----------
-    surface : int
-        1 where the ground is in view, 0 where it is not known.
     theta : (3,) float64
-        Plane of the ground under the robot: theta . ray is its inverse range.
+        Plane of the ground under the robot: theta . ray is its inverse range; zeros where that is
+        not known.
     confidence : float
         0...1: probability that the ground seen is the one that the robot stands on.
     reasons : tuple of str
         What contradicts, in words.
     """
 
-    surface: int
     theta: NDArray[np.float64]
     confidence: float
     reasons: tuple[str, ...] = ()
 
+    @property
+    def found(self) -> bool:
+        """Whether the ground is known."""
+        return bool(self.theta.any())
+
     def height(self, up: NDArray[np.float64]) -> float:
         """Of the sensor above the ground below it, along `up`, metres; NaN without a ground."""
-        return float(-1 / (self.theta @ up)) if self.surface else float('nan')
+        return float(-1 / (self.theta @ up)) if self.found else float('nan')
 
 
 class Continuation(NamedTuple):

@@ -21,6 +21,7 @@ from rangeseg_ros.core.significance import OUTLIER
 # Log-odds that a sight of danger adds, that one of ground takes away, and their bounds: those of
 # OctoMap.
 _HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
+_LAYERS = '_odds', '_height', '_variance', '_danger', '_seen'
 # Points between a cell of the ground and the next one in its column: far away, rows are far apart.
 _BETWEEN = 4
 
@@ -38,12 +39,15 @@ class GridOptions(NamedTuple):
         Seconds after which a cell that is not seen is forgotten.
     clearance : float
         What hangs higher above the ground is not in the way, metres.
+    patience : float
+        Seconds for which the height of the camera holds while no ground is seen.
     """
 
     resolution: float
     size: float
     memory: float
     clearance: float
+    patience: float
 
 
 class GroundGrid(NamedTuple):
@@ -85,8 +89,8 @@ def empty_grid() -> GroundGrid:
     return GroundGrid(classes, empty, empty, empty, 0.0, np.zeros(3), np.array([0, 0, 0, 1.0]), '')
 
 
-class GridMemory:
-    """The grid of one camera.
+class GroundMemory:
+    """What one camera has seen of the ground: the grid, and how high it is above the ground.
 
     Parameters
     ----------
@@ -99,6 +103,19 @@ class GridMemory:
 
     def forget(self) -> None:
         """Know nothing."""
+        self._height_found, self._height_stamp = 0.0, 0
+        self._forget_grid()
+
+    def recall_height(self, stamp: int) -> float:
+        """The height, metres, as it was found last; 0 for unknown."""
+        age = stamp - self._height_stamp
+        return self._height_found if age <= 1e9 * self.options.patience else 0.0
+
+    def keep_height(self, height: float, stamp: int) -> None:
+        """Take a height that was found, metres, in the image of a time, nanoseconds."""
+        self._height_found, self._height_stamp = height, stamp
+
+    def _forget_grid(self) -> None:
         count = max(round(self.options.size / self.options.resolution), 1)
         shape = count, count
         self._odds, self._height, self._variance = np.zeros((3, *shape))
@@ -137,7 +154,7 @@ class GridMemory:
         fixed = pose is not None and (pose[0] @ up)[2] > np.cos(np.pi / 4)
         rotation, shift = pose if fixed and pose else (axes, np.zeros(3))
         if not fixed:
-            self.forget()
+            self._forget_grid()
         self._move_to(shift)
         if terrain.cells is not None:
             turn = rotation @ axes.T
@@ -164,23 +181,17 @@ class GridMemory:
 
     def _move_to(self, centre: NDArray[np.float64]) -> None:
         """Have the grid around a place; what leaves it is forgotten."""
+        before = self._corner
+        kept = {name: getattr(self, name) for name in _LAYERS}
+        self._forget_grid()
         count = len(self._odds)
-        corner = np.floor(centre[:2] / self.options.resolution).astype(np.int64) - count // 2
-        before, self._corner = self._corner, corner
-        if not (corner - before).any():
-            return
+        self._corner = np.floor(centre[:2] / self.options.resolution).astype(np.int64) - count // 2
+        x, y = np.clip(self._corner - before, -count, count)
         # Of the old grid, the cells that are in the new one.
-        x, y = corner - before
         old = slice(max(y, 0), count + min(y, 0)), slice(max(x, 0), count + min(x, 0))
         new = slice(max(-y, 0), count + min(-y, 0)), slice(max(-x, 0), count + min(-x, 0))
-        for name, empty in (
-            ('_odds', 0), ('_height', 0), ('_variance', 0), ('_danger', 0), ('_seen', -np.inf)
-        ):  # fmt: skip
-            values = getattr(self, name)
-            moved = np.full_like(values, empty)
-            if max(abs(x), abs(y)) < count:
-                moved[new] = values[old]
-            setattr(self, name, moved)
+        for name, values in kept.items():
+            getattr(self, name)[new] = values[old]
 
     def _count(
         self,
@@ -224,7 +235,7 @@ def _evidence(
     rays cross the ground continued.
     """
     place = cells.place[[1, 2, 0]].astype(np.float64)
-    variance = (cells.unsure.astype(np.float64) / 3) ** 2
+    variance = cells.error.astype(np.float64) ** 2
     ground = cells.kind == GROUND
     both = ground[1:] & ground[:-1]
     share = np.arange(_BETWEEN) / _BETWEEN

@@ -20,19 +20,7 @@ _TOLERANCE = 2.0
 def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[np.float32]:
     """Points (N, 4) of the pixels of a class: x, y, z and height above the ground, metres.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    terrain : Terrain
-        Of the image.
-    kind : int
-        GROUND, OBSTACLE or DROP.
-
-    Returns
-    -------
-    (N, 4) float32
-        In the frame of the image, in the order of the pixels.
+    In the frame of the image (H, W), in the order of the pixels; `kind` is one of `classes`.
     """
     where = terrain.classes == kind
     points = np.empty((np.count_nonzero(where), 4), np.float32)
@@ -102,42 +90,34 @@ def _crossings(
     where: NDArray[np.bool_],
     bounds: tuple[float, float] = (0.0, np.inf),
 ) -> NDArray[np.float32]:
-    """Points where rays cross the ground continued.
+    """Points (N, 4) where rays (H, W, 3) cross the ground continued, of the pixels `where`.
 
-    Parameters
-    ----------
-    rays : (H, W, 3) float32
-    image : RangeImage
-        (H, W).
-    terrain : Terrain
-    where : (H, W) bool
-        Which rays; those that do not cross the ground in front of the sensor are left out.
-    bounds : (float, float)
-        Least and largest inverse range of the ground at a crossing, 1/m.
-
-    Returns
-    -------
-    (N, 4) float32
-        x, y, z in the frame of the image, metres, and the height of what was measured along the
-        ray, NaN where nothing was.
+    x, y, z in the frame of the image, metres, and the height of what was measured along the ray,
+    NaN where nothing was. Rays that do not cross the ground in front of the sensor are left out,
+    and those for which its inverse range there is not within `bounds`, 1/m.
     """
     rows, columns = np.nonzero(where)
-    crossing, rays, inside = _cross(rays, terrain, rows, columns)
-    inside &= (crossing >= bounds[0]) & (crossing <= bounds[1])
-    points = rays[inside] / crossing[inside][:, None] + image.place
+    points, inverse = _cross(rays, image, terrain, rows, columns)
+    inside = (inverse > 0) & (inverse >= bounds[0]) & (inverse <= bounds[1])
     height = terrain.height[rows[inside], columns[inside]]
-    return np.column_stack([points, height]).astype(np.float32)
+    return np.column_stack([points[inside], height]).astype(np.float32)
 
 
 def _cross(
-    rays: NDArray[np.float32], terrain: Terrain, rows: NDArray[np.intp], columns: NDArray[np.intp]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Inverse range of the ground along the rays of pixels, these rays, and whether they meet."""
+    rays: NDArray[np.float32],
+    image: RangeImage,
+    terrain: Terrain,
+    rows: NDArray[np.intp],
+    columns: NDArray[np.intp],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Where rays meet the ground (N, 3), and their inverse range there, > 0 where they do."""
     field = terrain.field
     theta = field.theta[:, rows // field.size.rows, columns // field.size.columns].T
     rays = rays[rows, columns]
     inverse = (theta * rays).sum(axis=1)
-    return inverse, rays, inverse > 0
+    with np.errstate(divide='ignore', invalid='ignore'):
+        points = rays / inverse[:, None] + image.place
+    return points.astype(np.float32), inverse.astype(np.float32)
 
 
 def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
@@ -148,7 +128,6 @@ def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
     for ring in rings:
         line = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0]
         if len(line) > 2:  # holes of single pixels have no outline
-            inverse, rays, inside = _cross(image.rays, terrain, line[:, 1], line[:, 0])
-            points = rays[inside] / inverse[inside][:, None] + image.place
-            lines.append(points.astype(np.float32))
+            points, inverse = _cross(image.rays, image, terrain, line[:, 1], line[:, 0])
+            lines.append(points[inverse > 0])
     return lines

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.ground.cells import axes_of
 from rangeseg_ros.core.ground.classes import GROUND
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
-from rangeseg_ros.core.significance import SAMPLES
+from rangeseg_ros.core.significance import OUTLIER, SAMPLES
 
 RISE, _RUN = (0.1, 0.24), (0.22, 0.4)
 """Rise and run of stairs, metres: the widest that codes of building allow.
@@ -78,8 +78,6 @@ def stairs_of(terrain: Terrain) -> list[Stairs]:
     if cells is None:
         return []
     found = []
-    if not cells.turned:
-        cells = cells.turned_over()
     for sign in (1, -1):
         # Nobody sees a tread from below.
         highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST
@@ -105,7 +103,7 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
     level[before[flat], np.nonzero(flat)[1]] = True
     height = sign * cells.height
     level &= (height > RISE[0] / 2) & (height < highest)
-    return np.where(level & (cells.unsure <= _UNEVEN * RISE[1]), height, np.float32(0))
+    return np.where(level & (OUTLIER * cells.error <= _UNEVEN * RISE[1]), height, np.float32(0))
 
 
 @njit(cache=True, nogil=True)

@@ -8,37 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.grid import GridMemory, GridOptions, GroundGrid
+from rangeseg_ros.core.ground.grid import GridOptions, GroundGrid, GroundMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-
-
-class HeightMemory:
-    """How high a camera is above the ground, found where it is not stated.
-
-    Parameters
-    ----------
-    patience : float
-        Seconds for which it holds while no ground is seen.
-    """
-
-    def __init__(self, patience: float) -> None:
-        self.patience = patience
-        self.forget()
-
-    def forget(self) -> None:
-        """Know nothing."""
-        self._height, self._stamp = 0.0, 0
-
-    def recall(self, stamp: int) -> float:
-        """The height, metres, as it was found last; 0 for unknown."""
-        return self._height if stamp - self._stamp <= 1e9 * self.patience else 0.0
-
-    def remember(self, height: float, stamp: int) -> None:
-        """Take a height that was found, metres, in the image of a time, nanoseconds."""
-        self._height, self._stamp = height, stamp
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +30,8 @@ class Survey:
     height_noise : float
         Its standard deviation, metres.
     limits : Limits
-    grid : GridMemory
+    memory : GroundMemory
         Of the images before, or of none.
-    memory : HeightMemory, optional
-        Of the images before, for a height that is unknown.
     stamp : int
         When the image was taken, nanoseconds.
     pose : (rotation (3, 3), shift (3,)), optional
@@ -76,8 +48,7 @@ class Survey:
     sensor_height: float
     height_noise: float
     limits: Limits
-    grid: GridMemory
-    memory: HeightMemory | None = None
+    memory: GroundMemory
     stamp: int = 0
     pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     fixed_frame: str = ''
@@ -96,41 +67,46 @@ class Survey:
             config.obstacle_height,
             config.drop_height,
             float(np.radians(config.up_sd)),
+            config.ground_gap,
+            config.robot_radius,
         )
         if up is None:
             up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
-        direction = unit(up)
-        height = config.sensor_height, config.sensor_height_sd
         return cls(
             image,
             sensor,
-            direction,
-            *height,
+            unit(up),
+            config.sensor_height,
+            config.sensor_height_sd,
             limits,
-            GridMemory(grid_options(config)),
+            GroundMemory(grid_options(config)),
             cloud_resolution=config.cloud_resolution,
         )
 
     def terrain(self) -> Terrain:
         """Find it."""
         known = self.sensor_height, self.height_noise
-        remembered = self.memory.recall(self.stamp) if self.memory else 0.0
         if self.sensor_height <= 0:
+            remembered = self.memory.recall_height(self.stamp)
             # A robot nods and a floor undulates, by less than an obstacle is high.
             known = (remembered, self.limits.least) if remembered else (0.0, 0.0)
         found = terrain_of(self.image, self.sensor, self.up, known, self.limits)
-        if self.memory and found.stand.surface:
-            self.memory.remember(found.stand.height(self.up), self.stamp)
+        if found.stand.found:
+            self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found
 
     def ground_grid(self, terrain: Terrain) -> GroundGrid:
         """The grid of the images before, with the terrain of this one."""
         place = self.image.place
-        return self.grid.add(terrain, self.up, self.stamp, place, self.pose, self.fixed_frame)
+        return self.memory.add(terrain, self.up, self.stamp, place, self.pose, self.fixed_frame)
 
 
 def grid_options(config: Config) -> GridOptions:
     """Of the parameters."""
     return GridOptions(
-        config.grid_resolution, config.grid_size, config.grid_memory, config.grid_clearance
+        config.grid_resolution,
+        config.grid_size,
+        config.grid_memory,
+        config.grid_clearance,
+        config.track_time,
     )

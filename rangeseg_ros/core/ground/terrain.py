@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.cells import Cells, CellSize, axes_of, cells_of
+from rangeseg_ros.core.ground.cells import WINDOW, Cells, CellSize, axes_of, cells_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
-from rangeseg_ros.core.ground.reach import reach
+from rangeseg_ros.core.ground.reach import Passable, reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of the noise within which the ground is the ground, and beyond which it is
 # known to be none.
 _CERTAIN = 3.0
-# Cells over which the relief of the ground is measured.
-_RELIEF = (9, 25)
 _SQUARE = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
@@ -46,12 +44,16 @@ class Limits(NamedTuple):
         What lies so deep is a drop, metres.
     tilt : float
         Standard deviation of the direction that is up, radians.
+    gap, radius : float
+        See `Passable`.
     """
 
     slope: float
     obstacle: float
     drop: float
     tilt: float = float(np.radians(Config().up_sd))
+    gap: float = Config().ground_gap
+    radius: float = Config().robot_radius
 
     @property
     def least(self) -> float:
@@ -60,7 +62,7 @@ class Limits(NamedTuple):
 
 
 class CellTerrain(NamedTuple):
-    """What the cells of an image are, (rows, columns).
+    """What the cells of an image are, (rows, columns), with the nearest row first.
 
     Attributes
     ----------
@@ -70,26 +72,17 @@ class CellTerrain(NamedTuple):
         Above the ground, metres; NaN where not measured.
     kind : (...) int8
         See `classes`.
-    unsure : (...) float32
-        The noise of a pixel's height, metres.
+    error : (...) float32
+        See `Cells`.
     crossing : (2, ...) float32
         Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
-    turned : bool
-        Whether up is down along the columns.
     """
 
     place: NDArray[np.float32]
     height: NDArray[np.float32]
     kind: NDArray[np.int8]
-    unsure: NDArray[np.float32]
+    error: NDArray[np.float32]
     crossing: NDArray[np.float32]
-    turned: bool
-
-    def turned_over(self) -> CellTerrain:
-        """With the rows in the other order."""
-        place, crossing = self.place[:, ::-1], self.crossing[:, ::-1]
-        height, kind, unsure = self.height[::-1], self.kind[::-1], self.unsure[::-1]
-        return CellTerrain(place, height, kind, unsure, crossing, not self.turned)
 
 
 class Terrain(NamedTuple):
@@ -117,7 +110,7 @@ class Terrain(NamedTuple):
 
     def __str__(self) -> str:
         """Where the ground is and how sure that is, in a few words."""
-        if not self.stand.surface:
+        if not self.stand.found:
             return '; '.join(['no ground in view', *self.stand.reasons])
         height, confidence = self.stand.height(self.field.up), self.stand.confidence
         return f'ground {height:.2f} m below, confidence {confidence:.2f}'
@@ -172,34 +165,31 @@ def _upright(
     cells = cells_of(image, size, up, sensor)
     place, variance = cells.place.astype(np.float64), cells.variance
     height, height_sd = known
-    height = height or _nearest(place[0], turned)
+    height = height or _nearest(place[0, :: 1 if turned else -1])
     place[0] += height
-    steepest, highest = limits.slope + limits.tilt, HIGHEST if height_sd > 0 else np.inf
-    reached = reach(place, variance, highest, limits.least, float(np.tan(steepest)), turned)
-    if not reached.any():
-        return _without_ground(image, cells, size, None, up, known, limits)
     slope = float(np.tan(limits.slope))
-    found = continued(place[:, reached], 4 * variance[reached], height_sd, slope, limits.least)
+    passable = Passable(limits.least, slope, limits.gap, limits.radius)
+    found = None
+    # Where nothing is near the stated height, what is elsewhere tells how wrong that is.
+    for highest in (HIGHEST, np.inf) if height_sd > 0 else (np.inf,):
+        reached = reach(place, variance, cells.shared, highest, passable, turned)
+        if reached.any():
+            near = place[:, reached], 4 * variance[reached]
+            found = continued(*near, height_sd, slope, limits.least)
+            break
     # Without a height the ground is what the camera stands on: a table tells by its size.
-    if found.confidence < SURE if height_sd > 0 else found.size < FURNITURE:
+    if not found or (found.confidence < SURE if height_sd > 0 else found.size < FURNITURE):
         return _without_ground(image, cells, size, found, up, known, limits)
-    stand = Stand(1, _theta(found, height, up), found.confidence)
+    a, b, c = found.plane
+    lean = np.array([b, c]) @ axes_of(up)[1:]
+    stand = Stand(-(up - lean) / (height - a), found.confidence)
     return _with_ground(image, cells, size, reached, stand, up, limits, turned)
 
 
-def _nearest(above: NDArray[np.float64], turned: bool) -> float:
+def _nearest(above: NDArray[np.float64]) -> float:
     """How far below the sensor the nearest cells are, metres, where no height is stated."""
-    rows = above if turned else above[::-1]
-    nearest = rows[np.isfinite(rows).argmax(axis=0), np.arange(rows.shape[1])]
+    nearest = above[np.isfinite(above).argmax(axis=0), np.arange(above.shape[1])]
     return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
-
-
-def _theta(found: Continuation, height: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The plane of the ground under the robot: theta . ray is its inverse range."""
-    a, b, c = found.plane
-    lean = np.array([b, c]) @ axes_of(up)[1:]
-    theta: NDArray[np.float64] = -(up - lean) / (height - a)
-    return theta
 
 
 def _with_ground(
@@ -219,8 +209,8 @@ def _with_ground(
     field = ground_field(cells, reached, stand.theta, size, up)
     height = field.heights(cells)
     # Relief counts as noise: what the cells of the ground scatter by.
-    count = cv2.blur(reached.astype(np.float32), _RELIEF)
-    squares = cv2.blur(np.where(reached, height, 0) ** 2, _RELIEF)
+    count = cv2.blur(reached.astype(np.float32), (WINDOW, WINDOW))
+    squares = cv2.blur(np.where(reached, height, 0) ** 2, (WINDOW, WINDOW))
     with np.errstate(divide='ignore', invalid='ignore'):
         relief = np.where(count > 0, squares / count, 0)
     noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
@@ -243,7 +233,10 @@ def _with_ground(
         flat_axes = axes_of(up)[1:].astype(np.float32)
         along[along <= 0] = np.nan
         crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
-    below = CellTerrain(cells.place, height, kind, sure, crossing, turned)
+    order = slice(None, None, 1 if turned else -1)
+    below = CellTerrain(
+        cells.place[:, order], height[order], kind[order], cells.error[order], crossing[:, order]
+    )
     return Terrain(classes, heights, stand, field, below)
 
 
@@ -296,5 +289,5 @@ def _without_ground(
         reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
     nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
-    stand = Stand(0, np.zeros(3), confidence, reasons)
+    stand = Stand(np.zeros(3), confidence, reasons)
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
