@@ -8,7 +8,7 @@ from scanner_points import scanned
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.classes import GROUND
 from rangeseg_ros.core.ground.points import drops, outlines
-from rangeseg_ros.core.mapping.evidence import may_be_in_sight
+from rangeseg_ros.core.mapping.visibility import may_be_in_sight
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.messages.outputs import OUTPUTS

@@ -27,7 +27,6 @@ from scipy.linalg import block_diag
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -125,6 +124,8 @@ class Adjustment:
 
     def add(self, frame: Sighting) -> None:
         """Take in a frame. Of parts of one plane the largest counts."""
+        if frame.moved:
+            self._poses = [frame.moved.after(pose) for pose in self._poses]
         self._poses.append(frame.pose)
         if not len(frame.ids):
             return
@@ -319,18 +320,22 @@ def moved_onto(
     found = []
     for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
         normal, distance = equation[:3], float(equation[3])
-        on = [
-            [ring - (ring @ normal + distance)[:, None] * normal for ring in part]
-            for part in plane.outline.parts
-        ]
+
+        def onto(
+            points: NDArray[np.float64],
+            normal: NDArray[np.float64] = normal,
+            distance: float = distance,
+        ) -> NDArray[np.float64]:
+            return points - (points @ normal + distance)[..., None] * normal
+
         found.append(
             replace(
                 plane,
                 normal=normal,
                 distance=distance,
                 covariance=covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4],
-                centroid=plane.centroid - (plane.centroid @ normal + distance) * normal,
-                outline=MapOutline(on),
+                centroid=onto(plane.centroid),
+                outline=plane.outline.moved(onto),
             )
         )
     return found

@@ -54,12 +54,15 @@ class Sighting(NamedTuple):
         Of the planes of the map that they are.
     view : (M, C) float64
         See `views`.
+    moved : Transform or None
+        By which the fixed frame has jumped since the frame before.
     """
 
     pose: Transform
     planes: Sequence[Plane]
     ids: NDArray[np.int64]
     view: NDArray[np.float64]
+    moved: Transform | None = None
 
 
 class Observations(NamedTuple):
@@ -73,6 +76,9 @@ class Observations(NamedTuple):
         Square root of the covariance of the error that lasts, of (normal, distance).
     fresh : (M, 4, 4) float64
         Covariance of the error that is new in this frame.
+    by_pose : (M, 4, 6) float64
+        Square root of that part of it which is of the pose: by the turn of the camera about
+        itself and by its shift, each over its standard deviation.
     centroid : (M, 3) float64
     range : (M,) float64
         Distance of the centroid from the camera, metres.
@@ -83,6 +89,7 @@ class Observations(NamedTuple):
     plane: NDArray[np.float64]
     lasting: NDArray[np.float64]
     fresh: NDArray[np.float64]
+    by_pose: NDArray[np.float64]
     centroid: NDArray[np.float64]
     range: NDArray[np.float64]
     view: NDArray[np.float64]
@@ -124,12 +131,13 @@ def observations(
     world, place = normal @ pose.rotation.T, centroid @ pose.rotation.T
     axes = tangents(world)
     by_pose = from_errors(axes, place + pose.shift) @ by_motion(world, axes, place)
-    variance = np.repeat(np.square([noise.turn, noise.shift]), 3)
+    by_pose *= np.repeat([noise.turn, noise.shift], 3)
     fresh = (1 - LASTING) * congruent(lasting, np.eye(3))
     return Observations(
         np.column_stack([normal, distance]) @ to_world.T,
         np.sqrt(LASTING) * lasting,
-        fresh + congruent(by_pose * np.sqrt(variance), np.eye(6)),
+        fresh + congruent(by_pose, np.eye(6)),
+        by_pose,
         place + pose.shift,
         np.asarray(np.linalg.norm(centroid, axis=1)),
         view,

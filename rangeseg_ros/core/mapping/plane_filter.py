@@ -9,13 +9,14 @@ what that information has grown by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.mapping.observations import Observations, continuity
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
     candidates,
@@ -109,6 +110,16 @@ class PlaneFilters:
         """These planes followed by others."""
         pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
         return PlaneFilters(*(np.concatenate(pair) for pair in pairs))
+
+    def moved(self, motion: Transform) -> PlaneFilters:
+        """The planes moved with all that is known of them."""
+        turn, shift = motion
+        return replace(
+            self,
+            normal=self.normal @ turn.T,
+            point=self.point @ turn.T + shift,
+            axes=self.axes @ turn.T,
+        )
 
     def coordinates(
         self, index: NDArray[np.intp], points: NDArray[np.float64]

@@ -9,15 +9,13 @@ camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.rotations import rotation_by
-from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.rotations import rotation_by, rotation_vector
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
     by_motion,
@@ -41,31 +39,8 @@ NOMINAL, PERSISTENCE = 1 / 30, 0.5
 _TURN = np.radians(22.0)
 # The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
-# Chi-squared with the six degrees of freedom of a motion.
-_JUMP = chi2_quantile(6)
-
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
-
-
-class Jump(NamedTuple):
-    """What a motion that was told differs by from that of the planes: metres and radians."""
-
-    shift: float
-    turn: float
-
-    @classmethod
-    def between(cls, told: Motion, own: Motion) -> Jump:
-        """Of two motions."""
-        turn = told[0] @ own[0].T
-        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-        return cls(float(np.linalg.norm(told[1] - turn @ own[1])), float(angle))
-
-    def __str__(self) -> str:
-        return (
-            f'the planes contradict the pose by {1e3 * self.shift:.0f} mm and '
-            f'{np.degrees(self.turn):.1f} degrees'
-        )
 
 
 class Tracker:
@@ -86,13 +61,7 @@ class Tracker:
     Parameters
     ----------
     config : Config, optional
-        `track_time`, `camera_turn`, `camera_speed`, `pose_noise` and `pose_turn_noise`.
-
-    Attributes
-    ----------
-    jump : Jump or None
-        How far the motion that was told of the last frame is from that of the planes, where they
-        contradict it.
+        `track_time`, `camera_turn` and `camera_speed`.
 
     Examples
     --------
@@ -102,7 +71,6 @@ class Tracker:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self.jump: Jump | None = None
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
@@ -175,21 +143,9 @@ class Tracker:
         # Planes that were in sight and have half of their pixels in common.
         sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
         sure &= (known.unseen == 0)[:, None] & near_planes(known, seen)
-        t, s = np.nonzero(sure)
         speed = np.repeat([np.radians(config.camera_turn), config.camera_speed], 3)
         prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
-        own = _camera_motion(known, seen, (t, s), prior)
-        self.jump = None
-        if told is None:
-            return known.moved(*own)
-        # What poses err by, at both ends of the motion.
-        noise = 2 * np.array([np.radians(config.pose_turn_noise), config.pose_noise]) ** 2
-        if _contradiction(known, seen, (t, s), (told, own), noise) > _JUMP:
-            # Where the frames that tell the motion jump, the planes know better.
-            self.jump = Jump.between(told, own)
-            return known.moved(*own)
-        known = known.moved(*told)
-        return known.moved(*_camera_motion(known, seen, (t, s), prior))
+        return known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, told))
 
     def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
         """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
@@ -219,53 +175,36 @@ class Tracker:
 def _camera_motion(
     known: Tracks,
     seen: Tracks,
-    pairs: tuple[NDArray[np.intp], NDArray[np.intp]],
+    pairs: tuple[NDArray[np.intp], ...],
     prior: NDArray[np.float64],
+    told: Motion | None,
 ) -> Motion:
     """Motion of the known planes to those that are seen, of sure pairs of them.
 
     Gauss-Newton steps for the turn and the shift, weighted by the covariances of the pairs; those
     that fit badly (things that move by themselves) count less. Directions in which the planes
-    leave the motion open are held by a prior of zero, with the inverse variances `prior` (6,).
+    leave the motion open are held by a prior, with the inverse variances `prior` (6,): the motion
+    that was told, or none.
     """
-    rotation, shift = np.eye(3), np.zeros(3)
     t, s = pairs
-    for _ in range(_MOTION_ROUNDS if len(t) else 0):
+    if told is None:
+        told = np.eye(3), np.zeros(3)
+    if not len(t):
+        return told
+    rotation, shift = np.eye(3), np.zeros(3)
+    for _ in range(_MOTION_ROUNDS):
         gap, spread, axes, point = differences(known.moved(rotation, shift), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
         weight = 1 / (1 + mahalanobis(gap, spread) / 4)
         weighted = weight[:, None, None] * np.linalg.solve(spread, design)
         left = np.diag(prior) + np.einsum('kia,kib->ab', weighted, design)
-        step = np.linalg.solve(left, -np.einsum('kia,ki->a', weighted, gap))
+        rest = told[0] @ rotation.T
+        lacking = np.concatenate([rotation_vector(rest), told[1] - rest @ shift])
+        right = prior * lacking - np.einsum('kia,ki->a', weighted, gap)
+        step = np.linalg.solve(left, right)
         twist = rotation_by(step[:3])
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
     return rotation, shift
-
-
-def _contradiction(
-    known: Tracks,
-    seen: Tracks,
-    pairs: tuple[NDArray[np.intp], NDArray[np.intp]],
-    motions: tuple[Motion, Motion],
-    noise: NDArray[np.float64],
-) -> float:
-    """How much better, in chi-squared, sure pairs are explained by the second of two motions.
-
-    That of the plane for which it is most does not count where there are others: it may be one
-    that moves by itself. `noise` are variances of the turn and the shift of the first.
-    """
-    t, s = pairs
-    if not len(t):
-        return 0.0
-    values = []
-    for motion, (turn, place) in zip(motions, (noise.tolist(), [0.0, 0.0]), strict=True):
-        gap, spread, axes, point = differences(known.moved(*motion), seen, t, s)
-        design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
-        variance = np.repeat([turn, place], 3)
-        spread = spread + np.einsum('kia,a,kja->kij', design, variance, design)
-        values.append(mahalanobis(gap, spread))
-    gains = values[0] - values[1]
-    return float(gains.sum() - (gains.max() if len(gains) > 1 else 0.0))
 
 
 def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.intp]:
