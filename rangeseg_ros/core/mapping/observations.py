@@ -8,7 +8,7 @@ observation to the next as much as both were of the same pixels. The rest is new
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ from rangeseg_ros.core.tracking.plane_errors import (
     moved_plane,
     tangents,
 )
+
+if TYPE_CHECKING:
+    from rangeseg_ros.core.mapping.pose_jumps import Jump
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
@@ -54,15 +57,15 @@ class Sighting(NamedTuple):
         Of the planes of the map that they are.
     view : (M, C) float64
         See `views`.
-    moved : Transform or None
-        By which the fixed frame has jumped since the frame before.
+    jump : Jump or None
+        Of the fixed frame since the frame before.
     """
 
     pose: Transform
     planes: Sequence[Plane]
     ids: NDArray[np.int64]
     view: NDArray[np.float64]
-    moved: Transform | None = None
+    jump: Jump | None = None
 
 
 class Observations(NamedTuple):

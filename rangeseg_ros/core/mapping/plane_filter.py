@@ -19,6 +19,7 @@ from rangeseg_ros.core.mapping.observations import Observations, continuity
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
+    by_motion,
     candidates,
     congruent,
     from_errors,
@@ -114,12 +115,15 @@ class PlaneFilters:
     def moved(self, motion: Transform) -> PlaneFilters:
         """The planes moved with all that is known of them."""
         turn, shift = motion
-        return replace(
-            self,
-            normal=self.normal @ turn.T,
-            point=self.point @ turn.T + shift,
-            axes=self.axes @ turn.T,
-        )
+        normal, point = self.normal @ turn.T, self.point @ turn.T + shift
+        return replace(self, normal=normal, point=point, axes=self.axes @ turn.T)
+
+    def with_motion_error(
+        self, covariance: NDArray[np.float64], place: NDArray[np.float64]
+    ) -> PlaneFilters:
+        """The planes with the error (6, 6) of a motion: a turn about `place` (3,), a shift."""
+        design = by_motion(self.normal, self.axes, self.point - place)
+        return replace(self, covariance=self.covariance + congruent(design, covariance))
 
     def coordinates(
         self, index: NDArray[np.intp], points: NDArray[np.float64]

@@ -102,8 +102,7 @@ class PlaneMap:
         stamp : int
             Nanoseconds.
 
-        Where the fixed frame jumps, the planes move along if they tell how far; otherwise the map
-        begins anew.
+        Where the fixed frame jumps, the planes move along as far as they tell.
         """
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
@@ -123,8 +122,7 @@ class PlaneMap:
                 self._update(planes, seen, step)
             self._fuse(planes, seen, match, stamp)
             ids = np.array([self._records[k].id for k in match.tolist()])
-            moved = jump.motion if jump and jump.determined else None
-            self.sighting = Sighting(pose, planes, ids, view, moved)
+            self.sighting = Sighting(pose, planes, ids, view, jump)
         self._look(self._outlines(planes, match, pose), image, pose, noise)
         if planes:
             self._merge(np.unique(match), pose.shift)
@@ -136,19 +134,17 @@ class PlaneMap:
         """Find a jump of the fixed frame by planes that were followed through it; follow it."""
         known = {record.track: k for k, record in enumerate(self._records)}
         both = [m for m, plane in enumerate(planes) if plane.id in known]
-        if self._filters is None or not both:
+        # Odometry never jumps.
+        odometry = self.config.odometry and not self.config.fixed_frame
+        if self._filters is None or not both or odometry:
             return None
         index = np.array([known[planes[m].id] for m in both])
         jump = find_jump(self._filters.where(index), seen.where(both), pose.shift, noise)
-        if jump is None:
-            return None
-        self.jumps.append((self._stamp, jump))
-        if jump.determined:
-            self._filters = self._filters.moved(jump.motion)
-        else:
-            now = self._stamp, self._time
-            self.clear('the fixed frame has jumped')
-            self._stamp, self._time = now
+        if jump:
+            self.jumps.append((self._stamp, jump))
+            self._filters = self._filters.moved(jump.motion).with_motion_error(
+                jump.covariance, pose.shift
+            )
         return jump
 
     @property

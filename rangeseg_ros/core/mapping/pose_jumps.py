@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.mapping.observations import Observations, PoseNoise
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.rotations import rotation_by, rotation_vector
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import congruent, mahalanobis, to_errors
 
 _ROUNDS = 5  # until the motion and the weights settle
+# Inverse variance of jumps beforehand, in every direction: of a hundred times the noise of poses.
+_PRIOR = 1e-4
 _GATE = chi2_quantile(6)
 
 
@@ -25,21 +27,24 @@ class Jump(NamedTuple):
     ----------
     motion : Transform
         Of the fixed frame as it was to what it is.
-    shift, turn : float
-        Of the camera, metres and radians.
-    determined : bool
-        Whether the planes tell all of it better than the pose that was told.
+    camera : (3,) float64
+        Where the camera was told to be.
+    error : (6,) float64
+        The motion as a turn about the camera, radians, and a shift, metres.
+    covariance : (6, 6) float64
+        Of the error: large in directions that the planes do not tell.
     """
 
     motion: Transform
-    shift: float
-    turn: float
-    determined: bool
+    camera: NDArray[np.float64]
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
 
     def __str__(self) -> str:
+        turn, shift = np.linalg.norm(self.error.reshape(2, 3), axis=1)
         return (
-            f'the planes contradict the pose by {1e3 * self.shift:.0f} mm and '
-            f'{np.degrees(self.turn):.1f} degrees'
+            f'the planes contradict the pose by {1e3 * shift:.0f} mm and '
+            f'{np.degrees(turn):.1f} degrees'
         )
 
 
@@ -79,19 +84,15 @@ def find_jump(
         spread = step.spread - congruent(root, np.eye(6))
         weighted = weight[:, None, None] * np.linalg.solve(spread, root)
         information = np.einsum('kia,kib->ab', weighted, root)
-        right = np.einsum('kia,ki->a', weighted, step.gap)
-        change = -np.linalg.lstsq(information, right, rcond=1e-9)[0]
+        right = np.einsum('kia,ki->a', weighted, step.gap) + _PRIOR * error
+        change = -np.linalg.solve(information + _PRIOR * np.eye(6), right)
         weight = 1 / (1 + mahalanobis(step.gap + root @ change, spread) / 4)
-        turn, shift = np.split(change * deviations, 2)
-        turned = rotation_by(turn)
-        place = motion.rotation @ camera + motion.shift
-        motion = Transform(turned, place + shift - turned @ place).after(motion)
-        error = np.concatenate(
-            [rotation_vector(motion.rotation), motion.rotation @ camera + motion.shift - camera]
-        )
-        scaled = np.divide(error, deviations, out=np.zeros(6), where=deviations > 0)
-        value = scaled @ np.linalg.solve(information + np.eye(6), information @ scaled)
-        if value < _GATE:
+        error = error + change
+        if error @ np.linalg.solve(information + np.eye(6), information @ error) < _GATE:
             return None
-    size, angle = float(np.linalg.norm(error[3:])), float(np.linalg.norm(error[:3]))
-    return Jump(motion, size, angle, bool(np.linalg.eigvalsh(information)[0] > 1))
+        turn, shift = np.split(error * deviations, 2)
+        rotation = rotation_by(turn)
+        motion = Transform(rotation, camera + shift - rotation @ camera)
+    covariance = np.linalg.inv(information + _PRIOR * np.eye(6)) + np.eye(6)
+    scaled = np.outer(deviations, deviations) * covariance
+    return Jump(motion, camera, error * deviations, scaled)
