@@ -59,15 +59,6 @@ def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
     return rotation
 
 
-def rotation_vector(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vector (3,) about which a rotation (3, 3) turns by its length, radians."""
-    quaternion = quaternions(rotation)
-    length = np.linalg.norm(quaternion[:3])
-    scale = 2 * np.arctan2(length, quaternion[3]) / length if length > 1e-12 else 2.0
-    vector: NDArray[np.float64] = scale * quaternion[:3]
-    return vector
-
-
 def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:
     """Matrix (3, 3) of cross products: cross_matrix(a) @ b = a x b."""
     x, y, z = np.asarray(vector, np.float64)

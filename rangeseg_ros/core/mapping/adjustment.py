@@ -252,9 +252,10 @@ class Adjustment:
                 design[at, 3:, :3] = -cross_matrix(pose.shift - jump.camera)
             design[after:] = 0
             effects.insert(-1, design.reshape(-1, 6))
-            known.append(np.linalg.inv(np.linalg.cholesky(jump.covariance)))
+            whiten = np.linalg.inv(np.linalg.cholesky(jump.covariance))
+            known.append(sparse.csr_array(whiten))
         # No drift is longer than the way.
-        known.append(np.eye(3) / (1.0 if drifts else _LEAST))
+        known.append(sparse.eye_array(3) / (1.0 if drifts else _LEAST))
         rest = -poses @ sparse.csr_array(np.hstack(effects))
         rows = sparse.block_array([[poses, rest], [None, sparse.block_diag(known)]])
         return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()

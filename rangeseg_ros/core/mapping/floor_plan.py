@@ -312,7 +312,7 @@ def _drawn(grid: Grid, planes: Sequence[Squared], walls: Sequence[Wall]) -> Grid
     middles = (np.stack([x, y], axis=-1) + 0.5 + first) * side
     for plane in floors:
         for part in plane.outline.parts:
-            area = shapely.make_shapely.make_valid(shapely.Polygon(part[0], part[1:]))
+            area = shapely.make_valid(shapely.Polygon(part[0], part[1:]))
             cells[shapely.contains_xy(area, middles[..., 0], middles[..., 1])] = FREE
     place = own - first
     inside = cells[place[1] : place[1] + height, place[0] : place[0] + width]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.rotations import rotation_by, rotation_vector
+from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
     by_motion,
@@ -25,8 +25,6 @@ from rangeseg_ros.core.tracking.tracks import (
     Tracks,
     differences,
     near_planes,
-    samples_of,
-    shared_samples,
 )
 
 # Intersection over union that planes in reach of each other count with, beside what they have: a
@@ -78,7 +76,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the planes: none of them is matched. Their ids are not given again."""
-        self._tracks = Tracks.of([], np.zeros(0, np.intp))
+        self._tracks: Tracks | None = None
 
     def track(
         self,
@@ -111,9 +109,9 @@ class Tracker:
             self.reset()
         elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
         self._stamp, self._shape = stamp, labels.shape
-        samples = samples_of(labels, planes)
-        seen, known = Tracks.of(planes, samples), self._tracks
-        shared = shared_samples(known, samples, len(planes))
+        seen = Tracks.of(planes, labels)
+        known = self._tracks or Tracks.of([], labels)
+        shared = known.mask @ seen.mask.T
         known = self._with_camera(known, seen, shared, elapsed, motion)
         seen.id[:] = _assign(known, seen, shared)
         new = seen.id == 0
@@ -134,7 +132,7 @@ class Tracker:
         self,
         known: Tracks,
         seen: Tracks,
-        shared: NDArray[np.intp],
+        shared: NDArray[np.float32],
         elapsed: float,
         told: Motion | None,
     ) -> Tracks:
@@ -184,30 +182,25 @@ def _camera_motion(
     Gauss-Newton steps for the turn and the shift, weighted by the covariances of the pairs; those
     that fit badly (things that move by themselves) count less. Directions in which the planes
     leave the motion open are held by a prior, with the inverse variances `prior` (6,): the motion
-    that was told, or none.
+    that was told, or none. Weights are relative to the
+    median misfit, so that a wrong motion is corrected.
     """
     t, s = pairs
-    if told is None:
-        told = np.eye(3), np.zeros(3)
-    if not len(t):
-        return told
-    rotation, shift = np.eye(3), np.zeros(3)
-    for _ in range(_MOTION_ROUNDS):
+    rotation, shift = told or (np.eye(3), np.zeros(3))
+    for _ in range(_MOTION_ROUNDS if len(t) else 0):
         gap, spread, axes, point = differences(known.moved(rotation, shift), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
-        weight = 1 / (1 + mahalanobis(gap, spread) / 4)
+        value = mahalanobis(gap, spread)
+        weight = 1 / (1 + value / (4 * max(float(np.median(value)), 1)))
         weighted = weight[:, None, None] * np.linalg.solve(spread, design)
         left = np.diag(prior) + np.einsum('kia,kib->ab', weighted, design)
-        rest = told[0] @ rotation.T
-        lacking = np.concatenate([rotation_vector(rest), told[1] - rest @ shift])
-        right = prior * lacking - np.einsum('kia,ki->a', weighted, gap)
-        step = np.linalg.solve(left, right)
+        step = np.linalg.solve(left, -np.einsum('kia,ki->a', weighted, gap))
         twist = rotation_by(step[:3])
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
     return rotation, shift
 
 
-def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.intp]:
+def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.float32]) -> NDArray[np.intp]:
     """(N,) id of the known plane that each plane is, 0 for none."""
     # Here, as it takes as long to import as a frame and is for sequences only.
     from scipy.optimize import linear_sum_assignment
