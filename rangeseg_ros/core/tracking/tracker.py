@@ -33,8 +33,6 @@ _UNSEEN_OVERLAP = 0.1
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# Largest angle of a plane to itself in the frame before: bent things are planes that turn.
-_TURN = np.radians(22.0)
 # The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -207,7 +205,7 @@ def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.float32]) -> NDArray
 
     between = np.linalg.norm(known.centroid[:, None] - seen.centroid, axis=2)
     near = (shared > 0) | (between < np.add.outer(known.reach, seen.reach))
-    t, s = np.nonzero(near & near_planes(known, seen, _TURN))
+    t, s = np.nonzero(near & near_planes(known, seen))
     gap, spread, _, _ = differences(known, seen, t, s)
     value = mahalanobis(gap, spread)
     fits = value < GATE
