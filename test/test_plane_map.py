@@ -192,6 +192,19 @@ def test_a_map_keeps_so_many_planes_and_those_seen_last():
     assert max(stamps) == 10**9 + 7 * 10**9 // 30
 
 
+def test_frames_without_planes_change_nothing_but_what_rays_pass():
+    room = kinect_room(0)
+    plane_map = mapped(Scene(room.solids, room.poses * 4), range(4))
+    before = [(plane.id, plane.area) for plane in plane_map.planes]
+    nothing = np.zeros(CAMERA.shape, np.uint16)
+    pose = Transform(room.poses[0].rotation, room.poses[0].position)
+    for depth, kept in ((0.0, True), (9.0, False)):
+        image = RangeImage.from_depth(np.full(CAMERA.shape, depth, np.float32), CAMERA)
+        for k in range(12):
+            plane_map.add(nothing, [], image, pose, 2 * 10**9 + k)
+        assert ([(plane.id, plane.area) for plane in plane_map.planes] == before) == kept
+
+
 def test_a_map_begun_anew_gives_other_ids():
     room = kinect_room(0)
     scene = Scene(room.solids, room.poses * 5)

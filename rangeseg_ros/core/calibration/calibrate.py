@@ -127,10 +127,10 @@ def calibrate(
     change = seen.inverse - residuals(seen, seen.inverse) - reference
     spread = max(float(np.median(np.abs(change))), 1e-6)
     basis = np.stack([np.ones(len(change)), change / spread])
-    weight = _settled_weights(seen, grid)
+    blocks = _blocks(seen, grid)
 
     def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
-        folds = [_folds(seen, basis[: len(own)], weight, grid, own) for own in tried]
+        folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
         return min(zip(tried, folds, strict=True), key=lambda pair: sum(map(_left, pair[1])))
 
     smoothness, folds = best(_SMOOTHNESS)
@@ -139,6 +139,7 @@ def calibrate(
     gain = np.array([_left(one) - _left(two) for one, two in zip(folds, sloped[1], strict=True)])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
+    weight = _settled_weights(seen, grid)
     # What smoothing costs shows in a field that is less smooth.
     field, rough = (
         solve(seen, basis[: len(smoothness)], weight, grid, [s / less for s in smoothness])
@@ -199,25 +200,38 @@ def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float
     return robust_weights(seen, field[seen.cell])
 
 
+_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
+"""Which planes (P,) are of a block of frames, and weights of the cells of all others."""
+
+
+def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
+    """The blocks that are left out, and weights of the others that know nothing of them."""
+    found = []
+    for block in np.array_split(np.unique(seen.frame), BLOCKS):
+        inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
+        found.append((inside, _settled_weights(seen.of_planes(~inside), grid)))
+    return found
+
+
 def _folds(
     seen: Sightings,
     basis: NDArray[np.float64],
-    weight: NDArray[np.float64],
+    blocks: Sequence[_Block],
     grid: tuple[int, int],
     smoothness: Sequence[float],
 ) -> list[Fold]:
     """Each block of frames, and what the field of the others leaves of it."""
     found = []
-    for block in np.array_split(np.unique(seen.frame), BLOCKS):
-        inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
+    for inside, weight in blocks:
         out = ~inside[seen.plane()]
         train, test = seen.of_planes(~inside), seen.of_planes(inside)
-        field = solve(train, basis[:, out], weight[out], grid, smoothness)
-        before, counts = residuals(test, test.inverse), weight[~out]
+        field = solve(train, basis[:, out], weight, grid, smoothness)
+        before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
         share = residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
         total = float(counts.sum())
         rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
-        found.append(Fold((int(block[0]), int(block[-1])), field, rms[0], rms[1], total))
+        ends = int(test.frame.min()), int(test.frame.max())
+        found.append(Fold(ends, field, rms[0], rms[1], total))
     return found
 
 

@@ -88,7 +88,7 @@ class PlaneMap:
         pose: Transform,
         stamp: int,
     ) -> None:
-        """Take in a frame.
+        """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
 
         Parameters
         ----------
@@ -101,14 +101,13 @@ class PlaneMap:
             Fixed frame from the frame of the image.
         stamp : int
             Nanoseconds.
-
-        Where the fixed frame jumps, the planes move along as far as they tell.
         """
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
         self._stamp = stamp
         self.sighting = Sighting(pose, [], np.zeros(0, np.int64), np.zeros((0, 0)))
+        match = np.zeros(0, np.intp)
         if planes:
             view = views(labels, planes, config.distortion_length)
             known = self._filters
@@ -124,7 +123,7 @@ class PlaneMap:
             ids = np.array([self._records[k].id for k in match.tolist()])
             self.sighting = Sighting(pose, planes, ids, view, jump)
         self._look(self._outlines(planes, match, pose), image, pose, noise)
-        if planes:
+        if len(match):
             self._merge(np.unique(match), pose.shift)
         self._forget()
 
