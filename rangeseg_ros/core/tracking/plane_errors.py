@@ -18,8 +18,11 @@ OFFSET, ANGLE = 0.007, np.radians(1.0)
 """What planes of one surface differ by from frame to frame beyond their covariances.
 
 Their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
-distortion of a Kinect is there), and an angle.
+distortion of a Kinect is there), and an angle, at least and for an
+offset over half of the plane's width.
 """
+NARROWEST = 0.01
+"""Half the width that a plane counts with at least, metres, so that what it tilts by is finite."""
 SURE_TURN, FARTHEST = np.radians(15.0), 0.1
 """Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
 
@@ -31,6 +34,7 @@ def candidates(
     first: tuple[NDArray[np.float64], NDArray[np.float64]],
     second: tuple[NDArray[np.float64], NDArray[np.float64]],
     reach: NDArray[np.float64],
+    turn: float = SURE_TURN,
 ) -> NDArray[np.bool_]:
     """(N, M) which planes are near enough in angle and offset to be asked of the gate.
 
@@ -42,12 +46,18 @@ def candidates(
         Normals and points on the planes, metres.
     reach : (M,) float64
         Distances of these points from the camera, metres.
+    turn : float
+        Largest angle, radians.
     """
-    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(SURE_TURN)
+    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(turn)
     return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
 
 
-def with_floor(spread: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float64]:
+def with_floor(
+    spread: NDArray[np.float64],
+    reach: NDArray[np.float64],
+    width: NDArray[np.float64] | float = np.inf,
+) -> NDArray[np.float64]:
     """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
 
     Parameters
@@ -56,10 +66,14 @@ def with_floor(spread: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArr
         Where both planes are looked at, so that c is independent of a and b.
     reach : (K,) float64
         Distances from the camera, metres.
+    width : (K,) float64
+        Half of that of the narrower plane, metres. Planes of a map are not as narrow as one frame
+        shows them.
     """
     result = spread.copy()
-    result[:, 2, 2] += (OFFSET * reach) ** 2
-    result[:, [0, 1], [0, 1]] += ANGLE**2
+    offset = (OFFSET * reach) ** 2
+    result[:, 2, 2] += offset
+    result[:, [0, 1], [0, 1]] += (ANGLE**2 + offset / width**2)[:, None]
     return result
 
 

@@ -33,8 +33,8 @@ _UNSEEN_OVERLAP = 0.1
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# The equations are linear in the motion, and the prior holds each step back.
-_MOTION_ROUNDS = 4
+# The equations of the motion are linear in it.
+_MOTION_ROUNDS = 3
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.tracking.plane_errors import (
+    NARROWEST,
+    SURE_TURN,
     candidates,
     congruent,
     moved_plane,
@@ -29,8 +31,9 @@ class Tracks:
     """N planes in the frame of the camera.
 
     `plane` (N, 4) are normals and distances. `mask` (N, S) tells in which samples of the label
-    image they were last seen; `unseen` is how many seconds have passed since then. `reach` (N,)
-    is half the diagonal of the rectangle around each plane, metres.
+    image they were last seen; `unseen` is how many seconds have passed since then. `width` (N,)
+    and `reach` are half the width and half the diagonal of the rectangle around each plane,
+    metres.
     """
 
     id: NDArray[np.int64]
@@ -38,6 +41,7 @@ class Tracks:
     plane: NDArray[np.float64]
     covariance: NDArray[np.float64]
     centroid: NDArray[np.float64]
+    width: NDArray[np.float64]
     reach: NDArray[np.float64]
     unseen: NDArray[np.float64]
     mask: NDArray[np.float32]
@@ -55,6 +59,7 @@ class Tracks:
             np.array([[*p.normal, p.distance] for p in planes], np.float64).reshape(-1, 4),
             np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4),
             np.array([p.centroid for p in planes], np.float64).reshape(-1, 3),
+            np.maximum(extents.min(axis=1, initial=np.inf) / 2, NARROWEST),
             np.asarray(np.linalg.norm(extents, axis=1)) / 2,
             np.zeros(len(planes)),
             (coarse == own[:, None]).astype(np.float32),
@@ -95,10 +100,10 @@ class Tracks:
         return Tracks(*map(np.concatenate, pairs))
 
 
-def near_planes(known: Tracks, seen: Tracks) -> NDArray[np.bool_]:
+def near_planes(known: Tracks, seen: Tracks, turn: float = SURE_TURN) -> NDArray[np.bool_]:
     """(T, N) see `candidates`."""
     first, second = (known.normal, known.plane[:, 3]), (seen.normal, seen.centroid)
-    return candidates(first, second, seen.range)
+    return candidates(first, second, seen.range, turn)
 
 
 def differences(
@@ -124,4 +129,5 @@ def differences(
     local = to_errors(axes, point)
     gap = (local @ seen.plane[s][..., None])[..., 0]
     spread = congruent(local, known.covariance[t] + seen.covariance[s])
-    return gap, with_floor(spread, seen.range[s]), axes, point
+    width = np.minimum(known.width[t], seen.width[s])
+    return gap, with_floor(spread, seen.range[s], width), axes, point
