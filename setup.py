@@ -128,7 +128,7 @@ setup(
         'Typing :: Typed',
     ],
     packages=find_packages(include=[package_name, f'{package_name}.*']),
-    package_data={package_name: ['py.typed', 'report/templates/*.html']},
+    package_data={package_name: ['py.typed', 'report/templates/*']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{package_name}']),
         (share, ['package.xml']),

@@ -185,7 +185,8 @@ MECHANISMS = (
     Mechanism('gate of chi-squared', 'tracking/plane_errors.py:mahalanobis,with_floor',
               {'tracking.tracker.GATE': 1e9}, 'tracks'),
     Mechanism('gate of angles', 'tracking/tracks.py:near_planes',
-              {'tracking.tracker._TURN': np.pi}, 'tracks'),
+              {'tracking.tracker.near_planes': lambda _: lambda known, seen:
+               np.ones((len(known.id), len(seen.id)), bool)}, 'tracks'),
     Mechanism('planes found again without overlap', 'tracking/tracker.py:_assign',
               {'tracking.tracker._UNSEEN_OVERLAP': 0.0}, 'tracks'),
     Mechanism('planes remembered out of sight', 'tracking/tracker.py:Tracker',

@@ -3,8 +3,7 @@
 import numpy as np
 
 from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
-from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapOutline, MapPlane
 
 
 def plane(number, normal, at, sigma, size=2.0):

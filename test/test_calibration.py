@@ -7,7 +7,7 @@ from calibration_frames import CAMERA, NOISE, frames, rms, true_map
 from rangeseg_ros import RangeImage
 from rangeseg_ros.core.calibration.calibrate import (
     CalibrationError,
-    _splits,
+    _blocks,
     calibrate,
     without_plane,
 )
@@ -85,9 +85,9 @@ def test_frames_left_out_do_not_weigh_the_others():
     cells = seen(12, true_map())
     first = cells.frame[cells.plane()] < 3
     other = cells._replace(inverse=np.where(first, 2 * cells.inverse**2, cells.inverse))
-    one, two = (_splits(each, cell_grid(CAMERA.shape)) for each in (cells, other))
-    assert np.array_equal(one[0].weight, two[0].weight)
-    assert not np.array_equal(one[1].weight, two[1].weight)
+    one, two = (_blocks(each, cell_grid(CAMERA.shape)) for each in (cells, other))
+    assert np.array_equal(one[0][1], two[0][1])
+    assert not np.array_equal(one[1][1], two[1][1])
 
 
 def test_near_planes_that_are_much_noisier_do_not_outvote_the_others():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import shapely
 from planes_of_labels import fit_planes
+from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.evidence import Evidence
-from rangeseg_ros.core.mapping.map_outlines import unite_outlines, widened
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -101,42 +101,45 @@ def test_memory_is_bounded_however_long_one_walks(kind):
             sizes.append(len(pickle.dumps(plane_map)))
     assert kept[-1] > 5 and max(kept) <= 12
     assert max(kept) > 9 or kind == 'returns'
-    # All that it holds: planes, their corners, their evidence.
-    assert max(sizes[10:]) < 1.1 * max(sizes[5:10])
+    # All that it holds; grids on planes that go on grow up to their bound.
+    assert max(sizes[10:]) < 1.1 * max(sizes[5:10]) or kind == 'goes on'
 
 
-@pytest.mark.parametrize('kind', ['same wall', 'corridor'])
-def test_outlines_and_their_evidence_are_bounded_however_long_one_looks(kind):
-    random, outline, evidence = np.random.default_rng(0), shapely.Polygon(), Evidence()
-    for n in range(400):
-        at = random.uniform(-3, 3, 2) if kind == 'same wall' else np.array([0.2 * n, 0.0])
-        corners = at + random.uniform(-1, 1, (12, 2))
-        part = shapely.MultiPoint(corners).convex_hull
-        outline, _ = unite_outlines(outline, part, 0.05)
-        evidence.follow(outline)
-        assert shapely.get_num_coordinates(outline) <= 400
-        # Sides of cells are powers of two: up to four times as many, and those at borders.
-        assert len(evidence.centres) <= 400
-    assert outline.area > 10
+def test_a_grid_is_bounded_however_far_a_plane_goes():
+    grid = PlaneGrid(0.03)
+    for x in range(60):
+        grid.see([[np.array([[x, 0], [x + 1.2, 0], [x + 1.2, 40], [x, 40.0]])]])
+    assert grid.odds.size <= 2**18 and grid.side == 0.12
+    assert grid.area == pytest.approx(60.2 * 40, rel=0.01)
 
 
-def test_what_is_widened_can_be_united():
-    # Of this outline with a narrow notch, the corners of the border that GEOS 3.14 draws cross.
-    notch = [
-        (1.45, 0.49),
-        (1.3893393874173412, 0.054875106286694),
-        (1.3901640133969233, 0.042876451067813),
-        (0.96, 0.0659501798),
-        (1.3911041020756671, 0.0291977649595514),
-        (1.3950271222734791, -0.0278838307404879),
-        (-0.84, -0.74),
-    ]
-    wide = widened(shapely.Polygon(notch), 0.015)
-    assert wide.is_valid
-    assert wide.union(shapely.box(1.3, -0.1, 1.5, 0.1)).area > wide.area
+def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
+    grid, turn = PlaneGrid(0.02), Rotation.from_rotvec([0, 0, 0.6]).as_matrix()[:2, :2]
+    square = np.array([[0, 0], [2, 0], [2, 1], [0, 1.0]])
+    hole = np.array([[0.5, 0.3], [0.5, 0.7], [1.0, 0.7], [1.0, 0.3]])
+    apart = square * 0.2 + (0, 1.5)
+    for _ in range(3):
+        grid.see([[square @ turn.T, hole @ turn.T], [apart @ turn.T]])
+    truth, border = 2 - 0.2 + 0.08, 6 + 1.8 + 1.2
+    # A quarter of a cell along the borders.
+    assert grid.area == grid.sure_area == pytest.approx(truth, abs=0.25 * grid.side * border)
+    (border, inner), (other,) = grid.polygons()
+    areas = [shapely.LinearRing(ring).is_ccw for ring in (border, inner, other)]
+    assert areas == [True, False, True]
+    found = shapely.Polygon(border, [inner]).union(shapely.Polygon(other))
+    wanted = shapely.Polygon(square @ turn.T, [hole @ turn.T]).union(
+        shapely.Polygon(apart @ turn.T)
+    )
+    assert found.symmetric_difference(wanted).area < 0.05 * truth
+    # What is looked at in vain is gone after as many looks as it was sure.
+    for _ in range(7):
+        grid.miss(grid.odds > 0)
+    assert grid.area == 0 and grid.polygons() == []
 
 
-def test_an_outline_of_details_alone_is_empty():
-    speck = shapely.box(0, 0, 0.01, 0.01)
-    outline, _ = unite_outlines(shapely.Polygon(), speck, 0.05)
-    assert outline.is_empty
+def test_a_sliver_between_cells_is_seen():
+    grid = PlaneGrid(0.1)
+    grid.see([[np.array([[0.01, 0.02], [0.05, 0.02], [0.05, 0.03]])]])
+    assert grid.area == pytest.approx(0.01)
+    assert grid.distance(np.array([0.03, 0.02])) == 0
+    assert grid.distance(np.array([0.05, 1.05])) == pytest.approx(1.0)

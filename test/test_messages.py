@@ -17,7 +17,7 @@ from rangeseg_ros import (
     planes_from_message,
 )
 from rangeseg_ros.core.ground.roles import ROLES
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
+from rangeseg_ros.core.mapping.map_planes import MapOutline
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message

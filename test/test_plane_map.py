@@ -181,7 +181,7 @@ def test_what_rays_pass_through_is_gone_within_seconds():
 
 
 @pytest.mark.parametrize('turn', [0.0, 25.0])
-def test_a_jump_of_the_fixed_frame_does_not_double_the_map(turn):
+def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
     room = kinect_room(4)
     scene = Scene(room.solids, walk(room.poses[0], 4, 48), room.dark)
     sequence = SequenceSegmenter(Config(min_pixels=150))
@@ -194,11 +194,21 @@ def test_a_jump_of_the_fixed_frame_does_not_double_the_map(turn):
         pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
         pose = jump.after(pose) if k >= 24 else pose
         image = RangeImage.from_depth(view.depth, view.camera)
-        result = sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
-        sizes.append((len(sequence.map), len(result.planes), sequence.map.begun_anew))
-    assert sizes[5][0] > 3 and not sizes[5][2]
-    assert sizes[6][0] == 0 and sizes[6][2] == 'the fixed frame has jumped'
-    assert 3 < sizes[-1][0] <= sizes[5][0] + 2
+        sequence.segment(image, 10**9 + k * 10**9 // 30, pose=pose)
+        sizes.append(len(sequence.map))
+        if k == 20:
+            before = {plane.id: plane for plane in sequence.map.planes}
+    assert sizes[5] > 3 and sizes[5] <= sizes[-1] <= sizes[5] + 2
+    ((stamp, _),) = sequence.map.jumps
+    assert stamp == 10**9 + 24 * 10**9 // 30
+    after = {plane.id: plane for plane in sequence.map.planes}
+    assert before.keys() <= after.keys()
+    for number, plane in before.items():
+        normal = jump.rotation @ plane.normal
+        offset = (normal - after[number].normal) @ after[number].centroid
+        offset += plane.distance - normal @ jump.shift - after[number].distance
+        assert np.degrees(np.arccos(min(1, normal @ after[number].normal))) < 1.5
+        assert abs(offset) < 0.03
 
 
 def test_a_looped_recording_begins_the_map_anew():

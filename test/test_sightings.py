@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.evidence import find_sightings, may_be_in_sight
+from rangeseg_ros.core.mapping.visibility import may_be_in_sight, ray_evidence
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -22,7 +22,7 @@ def test_whatever_rays_tell_of_lies_in_spheres_that_may_be_in_sight():
     within *= (radii * random.random(4000) / np.linalg.norm(within, axis=1))[:, None]
     points = centres + within
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
-    found = find_sightings(points, normals, np.full(4000, 1e-4), image, SENSOR)
+    found = ray_evidence(points, normals, np.full(4000, 1e-4), image, SENSOR)
     shown = may_be_in_sight(centres, radii, image)
     assert np.count_nonzero(found) > 200
     assert shown[found != 0].all()
@@ -40,7 +40,7 @@ def test_sightings_are_the_same_in_any_frame_of_the_camera():
     points = random.normal((0, 0, 2), 1, (2000, 3))
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     found = [
-        find_sightings(
+        ray_evidence(
             points @ turn.T,
             normals @ turn.T,
             np.full(2000, 1e-4),

@@ -244,10 +244,10 @@ def test_simulated_rooms_keep_their_ids(seed):
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
         tracked = tracker.track(view.labels, planes, 10**9 + k * 10**9 // 30)
         faces = {plane.label: plane.face for plane in view.planes}
+        assert len(set(faces.values())) >= 5
         found = {plane.label: plane.id for plane in tracked}
         frames.append(ids_of_faces(view.labels, found, view.labels, faces, 100))
     figures = track_figures(frames)
-    assert figures['faces'] >= 5
     assert figures['coverage'] == 1
     assert figures['switches'] == figures['transfers'] == 0
 
@@ -266,3 +266,31 @@ def test_a_room_seen_again_from_elsewhere():
             if a.id == b.id:
                 assert a.normal @ b.normal > 0.9
                 assert abs(a.normal @ b.centroid + a.distance) < 0.3
+
+
+@pytest.mark.parametrize(
+    ('frames', 'figures'),
+    [
+        ([{7: [1], 8: [2]}] * 4, (0, 0, 1, 4)),
+        ([{7: [1]}, {7: [2]}, {7: [2]}, {7: [1]}], (2, 0, 1, 2)),
+        # A face stays with its id while any part has it.
+        ([{7: [1]}, {7: [2, 1]}, {7: [1, 2]}], (0, 0, 1, 3)),
+        ([{7: [1]}, {7: [2, 1]}, {7: [2]}], (1, 0, 1, 1.5)),
+        ([{7: [1]}, {7: []}], (0, 0, 0.5, 1)),
+        ([{7: [1], 8: [2]}, {7: [2], 8: [1]}], (2, 2, 1, 1)),
+        ([], (0, 0, 0, 0)),
+    ],
+)
+def test_figures_of_tracks(frames, figures):
+    assert tuple(track_figures(frames).values()) == figures
+
+
+def test_ids_of_faces():
+    truth = np.repeat(np.uint16([1, 2, 3, 9, 0]), [40, 30, 20, 10, 10])[None]
+    labels = np.repeat(np.uint16([1, 2, 3, 0, 4]), [30, 35, 5, 20, 20])[None]
+    ids = {1: 11, 2: 12, 4: 14}
+    # Label 1: 30 of 30 on face 5. Label 2: 10 on region 1 and 25 on region 2, both face 5.
+    # Label 3 is no plane. Label 4: 10 of 20 on region 9, of no face.
+    found = ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=20)
+    assert found == {5: [12, 11], 6: []}
+    assert ids_of_faces(labels, ids, truth, {1: 5, 2: 5, 3: 6}, min_pixels=21) == {5: [12, 11]}

@@ -27,9 +27,9 @@ from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.io.plans import plan_files, write_plan
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.io.transforms import fixed_frame_of
-from rangeseg_ros.report.plan import write_plan_page
+from rangeseg_ros.report.plan import write_picture, write_plan_page
 
-PAGE = 'plan.html'
+PICTURE, PAGE = 'plan.svg', 'plan.html'
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class PlanTask:
         """BagError or NotReplacedError when the recording or the folder will not do."""
         with self._open():
             pass
-        for name in (*plan_files(), PAGE):
+        for name in (PICTURE, PAGE, *plan_files()):
             if (self.folder / name).exists() and not self.overwrite:
                 raise NotReplacedError(self.folder / name)
 
@@ -152,6 +152,7 @@ class PlanTask:
         plan = self._plan(best, solution, points, config)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
+        write_picture(self.folder / PICTURE, plan)
         write_plan_page(self.folder / PAGE, self.recording.name, plan, warnings)
         return PlanOutcome(
             frames,

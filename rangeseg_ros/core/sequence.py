@@ -134,7 +134,7 @@ class SequenceSegmenter:
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:
-            self.map.add(result.labels, planes, image, pose, stamp, self._tracker.jump)
+            self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
         if up is not None and isinstance(survey, Survey):
             survey = replace(survey, up=up)

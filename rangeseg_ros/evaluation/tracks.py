@@ -1,16 +1,12 @@
-"""How well ids persist: switches, fragmentation and lengths of tracks against a known truth.
+"""How well ids persist, against a known truth.
 
-References
-----------
 K. Bernardin and R. Stiefelhagen, "Evaluating multiple object tracking performance: the CLEAR MOT
-metrics", EURASIP J. Image and Video Processing, 2008. Y. Li, C. Huang and R. Nevatia, "Learning
-to associate: HybridBoosted multi-target tracker for crowded scene", CVPR 2009 (fragmentation).
+metrics", EURASIP J. Image and Video Processing, 2008.
 """
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +18,9 @@ def ids_of_faces(
     labels: NDArray[np.uint16],
     ids: Mapping[int, int],
     truth: NDArray[np.uint16],
-    faces: Mapping[int, Hashable],
+    faces: Mapping[int, int],
     min_pixels: int = 1000,
-) -> dict[Hashable, list[int]]:
+) -> dict[int, list[int]]:
     """Ids of the planes found on each physical face in a frame.
 
     Parameters
@@ -35,9 +31,8 @@ def ids_of_faces(
         The id of each plane, or that of its surface.
     truth : (H, W) uint16
         True regions.
-    faces : mapping of label to face
-        The face, however it is called, that a region of `truth` is part of; regions of no face
-        do not count.
+    faces : mapping of int to int
+        The face, 0 or more, that a region of `truth` is part of; others do not count.
     min_pixels : int
         Faces with fewer pixels in the frame do not count.
 
@@ -47,78 +42,52 @@ def ids_of_faces(
         For each face in sight the ids of the planes with more than half their pixels on it,
         that of the largest plane first.
     """
-    numbers = list(dict.fromkeys(faces.values()))
     table = np.zeros(65536, np.int64)
-    for label, face in faces.items():
-        table[label] = 1 + numbers.index(face)
+    table[list(faces)] = np.array(list(faces.values()), np.int64) + 1
     overlap = Overlap.between(table[truth], labels)
-    found: dict[Hashable, list[int]] = {
-        numbers[number - 1]: []
-        for number, size in zip(overlap.truth, overlap.truth_sizes, strict=True)
-        if size >= min_pixels
-    }
+    sizes = zip((overlap.truth - 1).tolist(), overlap.truth_sizes, strict=True)
+    found: dict[int, list[int]] = {face: [] for face, size in sizes if size >= min_pixels}
     for pair in np.argsort(-overlap.shared, kind='stable'):
         g, m = overlap.pairs[pair]
-        face, label = numbers[overlap.truth[g] - 1], int(overlap.labels[m])
+        face, label = int(overlap.truth[g]) - 1, int(overlap.labels[m])
         if overlap.of_labels[pair] > 0.5 and face in found and label in ids:
             found[face].append(ids[label])
     return found
 
 
-def track_figures(frames: Sequence[Mapping[Hashable, Sequence[int]]]) -> dict[str, Any]:
-    """Figures of the ids in a sequence.
+def track_figures(frames: Sequence[Mapping[int, Sequence[int]]]) -> dict[str, float]:
+    """Figures of the ids in a sequence, of faces as `ids_of_faces` returns them.
 
     A face stays with its id as long as any plane on it has that id; otherwise the first id on it
     takes over.
 
-    Parameters
-    ----------
-    frames : sequence of mapping of face to ids
-        As `ids_of_faces` returns them.
-
     Returns
     -------
     dict
-        `frames`; `faces`, in sight in any of them; `switches`, how often a face was taken over
-        by another id than it had when last found, also per 100 frames; `transfers`, how often an
-        id was found on another face than before; `fragmentations`, how often a face was lost
-        while in sight and found again; `ids_per_face`, mean number of ids a face has had in
-        turn; `coverage`, share of the faces in sight that were found, over all frames;
-        `track_length`, mean number of frames in which a face kept one id.
+        `switches`, how often a face was taken over by another id than it had when last found;
+        `transfers`, how often an id was found on another face than before; `coverage`, share of
+        the faces in sight that were found, over all frames; `track_length`, mean number of
+        frames in which a face kept one id.
     """
-    current: dict[Hashable, int] = {}
-    owner: dict[int, Hashable] = {}
-    history: dict[Hashable, list[int]] = {}
-    missed: set[Hashable] = set()
-    switches = transfers = fragmentations = found = visible = 0
+    current: dict[int, int] = {}
+    owner: dict[int, int] = {}
+    switches = transfers = found = 0
+    tracks = set()
     for frame in frames:
         for face, ids in frame.items():
-            visible += 1
-            history.setdefault(face, [])
             if not ids:
-                missed |= {face} & current.keys()
                 continue
             found += 1
-            fragmentations += face in missed
-            missed.discard(face)
             if current.get(face) not in ids:
                 switches += face in current
                 current[face] = ids[0]
-                history[face].append(ids[0])
+            tracks.add((face, current[face]))
             for i in ids:
                 transfers += owner.setdefault(i, face) != face
                 owner[i] = face
-        missed &= frame.keys()
-    tracks = {(face, i) for face, ids in history.items() for i in ids}
-    seen = [ids for ids in history.values() if ids]
     return {
-        'frames': len(frames),
-        'faces': len(history),
         'switches': switches,
-        'switches_per_100_frames': 100 * switches / max(len(frames), 1),
         'transfers': transfers,
-        'fragmentations': fragmentations,
-        'ids_per_face': float(np.mean([len(set(ids)) for ids in seen])) if seen else 0.0,
-        'coverage': found / max(visible, 1),
+        'coverage': found / max(sum(map(len, frames)), 1),
         'track_length': found / max(len(tracks), 1),
     }

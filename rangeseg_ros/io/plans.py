@@ -1,14 +1,12 @@
-"""Floor plans as files: SVG, DXF, GeoJSON, a map for Nav2, and meshes.
+"""Floor plans as files: DXF, GeoJSON, a map for Nav2, and meshes.
 
-All are in metres in the frame of the plan, with z up; SVG alone has y down, as pictures do. DXF
-and GLB need the extra `plan`.
+All are in metres in the frame of the plan, with z up. DXF and GLB need the extra `plan`.
 """
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import triangles
 from rangeseg_ros.core.mapping.floor_plan import FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
@@ -28,21 +24,11 @@ from rangeseg_ros.io.meshes import write_mesh
 # Shades of map_server, and thresholds between them: 205 is unknown, as 1 - 205 / 255 lies between.
 _SHADES = {FREE: 254, OCCUPIED: 0}
 _UNKNOWN, _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 205, 0.65, 0.196
-# Deviations of walls, metres, up to which they have the colours of the legend.
-_CLASSES = (
-    (0.002, '#1a9850'),
-    (0.005, '#66a61e'),
-    (0.01, '#e6ab02'),
-    (0.02, '#e66101'),
-    (np.inf, '#b2182b'),
-)
-_FILLS = {'floor': '#eef3f8', 'table': '#e4d8c4', 'ceiling': 'none'}
 
 
 def plan_files() -> dict[str, Callable[[Path, FloorPlan], None]]:
     """What writes each file of a plan, by its name."""
     return {
-        'plan.svg': write_svg,
         'plan.dxf': write_dxf,
         'plan.geojson': write_geojson,
         'map.pgm': _write_pgm,
@@ -76,115 +62,6 @@ def _row(squared: Squared) -> dict[str, Any]:
         'distance': round(plane.distance, 5),
         'observations': plane.observations,
     }
-
-
-def _colour(deviation: float) -> str:
-    return next(colour for most, colour in _CLASSES if deviation <= most)
-
-
-def _words(plan: FloorPlan, k: int) -> str:
-    """What the title of a plane says."""
-    squared = plan.planes[k]
-    plane = squared.plane
-    exact = f', {squared.exact}' if squared.exact else ''
-    return (
-        f'{plane.role} {plane.id}: {plane.area:.2f} m2, standard deviation '
-        f'{1e3 * deviation_of(plane):.1f} mm{exact}'
-    )
-
-
-def svg(plan: FloorPlan) -> str:
-    """The plan as an SVG picture, 100 units to the metre."""
-    height, width = plan.grid.cells.shape
-    left, low = plan.grid.origin
-    side = plan.grid.resolution
-    high, margin, legend = low + height * side, 0.3, 1.3
-    across, down = width * side + 2 * margin, height * side + 2 * margin + legend
-    box = (left - margin, -high - margin, across, down)
-    lines = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{" ".join(f"{v:.3f}" for v in box)}" '
-        f'width="{100 * box[2]:.0f}" height="{100 * box[3]:.0f}" font-family="sans-serif">',
-        f'<title>Floor plan in {escape(plan.frame)}, metres</title>',
-        f'<rect x="{box[0]:.3f}" y="{box[1]:.3f}" width="{box[2]:.3f}" height="{box[3]:.3f}" '
-        'fill="white"/>',
-        '<g id="free" fill="#f4f4f4">',
-    ]
-    for row, cells in enumerate(plan.grid.cells):
-        for start, end in _runs(cells == FREE):
-            lines.append(
-                f'<rect x="{left + start * side:.3f}" y="{-low - (row + 1) * side:.3f}" '
-                f'width="{(end - start) * side:.3f}" height="{side:.3f}"/>'
-            )
-    lines.append('</g>')
-    for k, squared in enumerate(plan.planes):
-        plane = squared.plane
-        if abs(plane.normal[2]) < 0.5 or plane.role == 'ceiling':
-            continue
-        rings = [
-            'M' + 'L'.join(f'{x:.3f} {-y:.3f}' for x, y in ring[:, :2]) + 'Z'
-            for part in plane.outline.parts
-            for ring in part
-        ]
-        lines.append(
-            f'<path class="{plane.role}" d="{"".join(rings)}" fill-rule="evenodd" '
-            f'fill="{_FILLS.get(plane.role, "#ececec")}" fill-opacity="0.8" stroke="#999" '
-            f'stroke-width="0.008"><title>{_words(plan, k)}</title></path>'
-        )
-    lines.append('<g id="obstacles" fill="#bbb">')
-    for row, cells in enumerate(plan.grid.cells):
-        for start, end in _runs(cells == OCCUPIED):
-            lines.append(
-                f'<rect x="{left + start * side:.3f}" y="{-low - (row + 1) * side:.3f}" '
-                f'width="{(end - start) * side:.3f}" height="{side:.3f}"/>'
-            )
-    lines.append('</g>')
-    for wall in plan.walls:
-        plane = plan.planes[wall.plane].plane
-        thick = 0.06 if plane.role == 'wall' else 0.025
-        for (x1, y1), (x2, y2) in wall.segments:
-            lines.append(
-                f'<line class="{plane.role}" x1="{x1:.3f}" y1="{-y1:.3f}" x2="{x2:.3f}" '
-                f'y2="{-y2:.3f}" stroke="{_colour(deviation_of(plane))}" stroke-width="{thick}">'
-                f'<title>{_words(plan, wall.plane)}, {np.hypot(x2 - x1, y2 - y1):.3f} m long'
-                '</title></line>'
-            )
-    for opening in plan.openings:
-        (x1, y1), (x2, y2) = opening.ends
-        lines.append(
-            f'<line class="opening" x1="{x1:.3f}" y1="{-y1:.3f}" x2="{x2:.3f}" y2="{-y2:.3f}" '
-            'stroke="#2166ac" stroke-width="0.03" stroke-dasharray="0.06 0.05">'
-            f'<title>opening, {opening.width:.2f} m wide</title></line>'
-        )
-    lines += _legend(box[0] + margin, -low + margin + 0.3)
-    return '\n'.join([*lines, '</svg>\n'])
-
-
-def _runs(chosen: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Where runs of true values begin and end (N, 2)."""
-    change = np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]]))
-    return np.flatnonzero(change).reshape(-1, 2)
-
-
-def _legend(x: float, y: float) -> list[str]:
-    """Scale bar, and what the colours of walls say."""
-    lines = [
-        f'<g id="scale" font-size="0.14"><rect x="{x:.3f}" y="{y:.3f}" width="1" height="0.04"/>'
-        f'<text x="{x:.3f}" y="{y - 0.06:.3f}">1 m</text></g>',
-        f'<g id="legend" font-size="0.11"><text x="{x:.3f}" y="{y + 0.3:.3f}">'
-        'standard deviation of walls</text>',
-    ]
-    for k, (most, colour) in enumerate(_CLASSES):
-        text = f'to {1e3 * most:.0f} mm' if np.isfinite(most) else 'more'
-        lines.append(
-            f'<rect x="{x + 0.6 * k:.3f}" y="{y + 0.4:.3f}" width="0.5" height="0.06" '
-            f'fill="{colour}"/><text x="{x + 0.6 * k:.3f}" y="{y + 0.6:.3f}">{text}</text>'
-        )
-    return [*lines, '</g>']
-
-
-def write_svg(path: Path, plan: FloorPlan) -> None:
-    """Write the plan as a picture."""
-    path.write_text(svg(plan), encoding='utf-8')
 
 
 def write_dxf(path: Path, plan: FloorPlan) -> None:
@@ -311,19 +188,6 @@ def _write_yaml(path: Path, plan: FloorPlan) -> None:
     )
 
 
-def meshes(plan: FloorPlan) -> list[tuple[MapPlane, NDArray[np.float64], NDArray[np.intp]]]:
-    """Corners (N, 3) and triangles (T, 3) of each plane of a plan, all parts of it."""
-    found = []
-    for squared in plan.planes:
-        corners, faces, first = [], [], 0
-        for rings in squared.plane.outline.parts:
-            faces.append(first + triangles(rings, squared.plane.normal))
-            corners += rings
-            first += sum(map(len, rings))
-        found.append((squared.plane, np.concatenate(corners), np.concatenate(faces)))
-    return found
-
-
 def _write_ply(path: Path, plan: FloorPlan) -> None:
     planes = [squared.plane for squared in plan.planes]
     write_mesh(path, planes, colours([plane.id for plane in planes]))
@@ -333,7 +197,8 @@ def _write_glb(path: Path, plan: FloorPlan) -> None:
     import trimesh
 
     scene = trimesh.Scene()
-    for plane, corners, faces in meshes(plan):
+    for plane in (squared.plane for squared in plan.planes):
+        corners, faces = plane.mesh()
         material = trimesh.visual.material.PBRMaterial(
             baseColorFactor=[*colours([plane.id])[0].tolist(), 255],
             metallicFactor=0.0,

@@ -29,10 +29,15 @@ class Picture(NamedTuple):
     title: str
 
 
+def render(template: str, **values: Any) -> str:
+    """Fill in a template of this package."""
+    return _environment().get_template(template).render(values)
+
+
 def write_page(path: Path, template: str, **values: Any) -> None:
     """Write the page of a template of this package, whole or not at all."""
     values['kind'] = template.removesuffix('.html')
-    text = _environment().get_template(template).render(values)
+    text = render(template, **values)
     with replacing(path) as partial:
         partial.write_text(text, encoding='utf-8')
 

@@ -127,26 +127,24 @@ def calibrate(
     change = seen.inverse - residuals(seen, seen.inverse) - reference
     spread = max(float(np.median(np.abs(change))), 1e-6)
     basis = np.stack([np.ones(len(change)), change / spread])
-    splits = _splits(seen, grid)
+    blocks = _blocks(seen, grid)
 
     def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
-        found = [_folds(split, basis, grid, tried) for split in splits]
-        pairs = zip(tried, map(list, zip(*found, strict=True)), strict=True)
-        return min(pairs, key=lambda pair: _left(pair[1]))
+        folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
+        return min(zip(tried, folds, strict=True), key=lambda pair: sum(map(_left, pair[1])))
 
     smoothness, folds = best(_SMOOTHNESS)
     sloped = best([(*smoothness, slope) for slope in _SLOPES])
     # The simpler model, unless the other is better by more than the standard error of that.
-    gain = np.array(
-        [_left([one]) - _left([two]) for one, two in zip(folds, sloped[1], strict=True)]
-    )
+    gain = np.array([_left(one) - _left(two) for one, two in zip(folds, sloped[1], strict=True)])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
     weight = _settled_weights(seen, grid)
-    field = solve(seen, basis[: len(smoothness)], weight, grid, smoothness)
     # What smoothing costs shows in a field that is less smooth.
-    less = [value / _STEP for value in smoothness]
-    rough = solve(seen, basis[: len(smoothness)], weight, grid, less, field)
+    field, rough = (
+        solve(seen, basis[: len(smoothness)], weight, grid, [s / less for s in smoothness])
+        for less in (1, _STEP)
+    )
     known, flat = views > 0, field[0].reshape(grid)
     each = [fold.field[0].reshape(grid) for fold in folds]
     deviation = _deviation(each, rough[0].reshape(grid) - flat, known)
@@ -195,40 +193,6 @@ def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
         )
 
 
-class _Split(NamedTuple):
-    """A block of frames, and all others.
-
-    Attributes
-    ----------
-    block : (first, last) int
-    train, test : Sightings
-        The others, and the block.
-    out : (N,) bool
-        Cells of the others.
-    weight, counts : float64
-        Weights of the cells of the others for the solution, and of the block in sums of squares.
-    """
-
-    block: tuple[int, int]
-    train: Sightings
-    test: Sightings
-    out: NDArray[np.bool_]
-    weight: NDArray[np.float64]
-    counts: NDArray[np.float64]
-
-
-def _splits(seen: Sightings, grid: tuple[int, int]) -> list[_Split]:
-    """Each block of frames, and the others with weights that know nothing of the block."""
-    splits = []
-    for block in np.array_split(np.unique(seen.frame), BLOCKS):
-        inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
-        train, test = seen.of_planes(~inside), seen.of_planes(inside)
-        ends, counts = (int(block[0]), int(block[-1])), robust_weights(test, 0.0)
-        out = ~inside[seen.plane()]
-        splits.append(_Split(ends, train, test, out, _settled_weights(train, grid), counts))
-    return splits
-
-
 def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float64]:
     """Weights (N,) by what a field leaves whose own weights know of none."""
     weight = robust_weights(seen, 0.0)
@@ -236,28 +200,44 @@ def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float
     return robust_weights(seen, field[seen.cell])
 
 
-def _folds(
-    split: _Split,
-    basis: NDArray[np.float64],
-    grid: tuple[int, int],
-    tried: Sequence[tuple[float, ...]],
-) -> list[Fold]:
-    """A `Fold` for each smoothness."""
-    block, train, test, out, weight, counts = split
-    before, total = residuals(test, test.inverse), float(counts.sum())
-    field, found = None, []
-    for smoothness in tried:
-        own = basis[: len(smoothness)]
-        field = solve(train, own[:, out], weight, grid, smoothness, field)
-        share = residuals(test, (own[:, ~out] * field[:, test.cell]).sum(axis=0))
-        rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
-        found.append(Fold(block, field, rms[0], rms[1], total))
+_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
+"""Which planes (P,) are of a block of frames, and weights of the cells of all others."""
+
+
+def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
+    """The blocks that are left out, and weights of the others that know nothing of them."""
+    found = []
+    for block in np.array_split(np.unique(seen.frame), BLOCKS):
+        inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
+        found.append((inside, _settled_weights(seen.of_planes(~inside), grid)))
     return found
 
 
-def _left(folds: list[Fold]) -> float:
-    """Sum of the squares of what the fields leave of the residuals of all blocks."""
-    return sum(fold.weight * fold.after**2 for fold in folds)
+def _folds(
+    seen: Sightings,
+    basis: NDArray[np.float64],
+    blocks: Sequence[_Block],
+    grid: tuple[int, int],
+    smoothness: Sequence[float],
+) -> list[Fold]:
+    """Each block of frames, and what the field of the others leaves of it."""
+    found = []
+    for inside, weight in blocks:
+        out = ~inside[seen.plane()]
+        train, test = seen.of_planes(~inside), seen.of_planes(inside)
+        field = solve(train, basis[:, out], weight, grid, smoothness)
+        before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
+        share = residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
+        total = float(counts.sum())
+        rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
+        ends = int(test.frame.min()), int(test.frame.max())
+        found.append(Fold(ends, field, rms[0], rms[1], total))
+    return found
+
+
+def _left(fold: Fold) -> float:
+    """Sum of the squares of what the field leaves of the residuals of a block."""
+    return fold.weight * fold.after**2
 
 
 def _deviation(

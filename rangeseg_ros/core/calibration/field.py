@@ -45,7 +45,6 @@ def solve(
     weight: NDArray[np.float64],
     grid: tuple[int, int],
     smoothness: Sequence[float],
-    start: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Coefficients of the field.
 
@@ -60,8 +59,6 @@ def solve(
         Rows and columns of cells.
     smoothness : (K,) float
         Weight of the squared differences, in sightings of a cell.
-    start : (K, rows * columns) float64, optional
-        Where to begin.
 
     Returns
     -------
@@ -86,8 +83,7 @@ def solve(
         return np.asarray(own @ vector - coupling @ planes)
 
     matrix, alone = (LinearOperator(own.shape, f) for f in (product, splu(own).solve))
-    start = None if start is None else start.ravel()
-    field, _ = cg(matrix, target, start, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=alone)
+    field, _ = cg(matrix, target, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=alone)
     return np.asarray(field).reshape(count, size)
 
 

@@ -114,7 +114,7 @@ def cells_of(
     pixels = size.rows * size.columns
     alike = max(4 * np.pi * sensor.correlation**2 / pixels, 1.0)
     bend = WINDOW**4 * pixels / (24 * sensor.distortion_length**2)
-    shared = alike + bend * systematic_variance.py_func(sensor, inverse**2) / (variance * share)
+    shared = alike + bend * systematic_variance(sensor, inverse**2) / (variance * share)
     return Cells(ray, inverse, place, error.astype(np.float32), of_mean, shared)
 
 

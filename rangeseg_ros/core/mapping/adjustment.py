@@ -9,7 +9,8 @@ estimated by the three numbers (`plane_errors`)
 x_p the error of the plane, s_f that of the pose (a turn about the camera and a shift), and v that
 of the sensor. The part of v that lasts (`observations`) is the same in the n frames of a run in
 which the plane is seen by the same pixels: it counts n times, so that the mean of the run has it
-once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f.
+once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f;
+those before a jump (`pose_jumps`) moreover by what the jump was taken for wrongly.
 The errors of an odometry add up: e_f - e_(f-1) is its noise, and it has no other drift. A drift
 that is not significant is none.
 """
@@ -27,7 +28,6 @@ from scipy.linalg import block_diag
 from scipy.sparse.linalg import SuperLU, splu
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -36,7 +36,9 @@ from rangeseg_ros.core.mapping.observations import (
     continuity,
     observations,
 )
+from rangeseg_ros.core.mapping.pose_jumps import Jump
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import cross_matrix
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
@@ -119,12 +121,17 @@ class Adjustment:
         # Number of its frame, id of its plane and number of its run, for each observation.
         self._index: list[tuple[int, int, int]] = []
         self._last: dict[int, tuple[NDArray[np.float64], int]] = {}
+        # Number of the frame after each jump of the poses.
+        self._jumps: list[tuple[int, Jump]] = []
 
     def __len__(self) -> int:
         return len(self._poses)
 
     def add(self, frame: Sighting) -> None:
         """Take in a frame. Of parts of one plane the largest counts."""
+        if frame.jump:
+            self._poses = [frame.jump.motion.after(pose) for pose in self._poses]
+            self._jumps.append((len(self._poses), frame.jump))
         self._poses.append(frame.pose)
         if not len(frame.ids):
             return
@@ -193,12 +200,14 @@ class Adjustment:
         drifts: bool,
     ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
         """The most probable state and drift, and the covariance of all planes and the drift."""
-        state, drift, weight = told, np.zeros(3), np.ones(len(sightings[0]))
+        state, weight = told, np.ones(len(sightings[0]))
+        # What jumps were taken for wrongly, and the drift.
+        rest = np.zeros(6 * len(self._jumps) + 3)
         first, last = 3 * len(told.normal), 3 * len(told.normal) + 6 * len(told.turn)
         prior = self._prior(first, drifts)
         for _ in range(_ROUNDS):
-            design, gap = _equations(state, *sightings)
-            known = np.concatenate([np.zeros(first), state.pose_errors(told), drift])
+            design, gap = _equations(state, *sightings, len(rest))
+            known = np.concatenate([np.zeros(first), state.pose_errors(told), rest])
             scale = np.repeat(np.sqrt(weight), 3)
             rows = sparse.vstack([sparse.diags_array(scale) @ design, prior]).tocsr()
             factors = splu((rows.T @ rows).tocsc(), 'MMD_AT_PLUS_A', 0.0, options=_SYMMETRIC)
@@ -206,16 +215,17 @@ class Adjustment:
             # Huber's weights: things that move by themselves are not to move the camera.
             left = ((gap - design @ step).reshape(-1, 3) ** 2).sum(axis=1)
             weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(left, 1e-12)))
-            state, drift = state.corrected(step[:first], step[first:last]), drift + step[last:]
-        covariance = _part_of_inverse(factors, np.r_[:first, last : last + 3])
+            state, rest = state.corrected(step[:first], step[first:last]), rest + step[last:]
+        size = len(step)
+        covariance = _part_of_inverse(factors, np.r_[:first, size - 3 : size])
         # What planes disagree by, each with all of its errors: a cluster-robust variance (Liang
         # and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
-        of_drift = factors.solve(np.eye(last + 3, 3, -last))
+        of_drift = factors.solve(np.eye(size, 3, 3 - size))
         part = scale[:, None] * (design @ of_drift) * (scale * (gap - design @ step))[:, None]
         each = np.zeros((len(told.normal), 3))
         np.add.at(each, np.repeat(sightings[1], 3), part)
         covariance[-3:, -3:] += each.T @ each
-        return state, drift, covariance
+        return state, rest[-3:], covariance
 
     def _way(self) -> NDArray[np.float64]:
         """(F,) way of the camera up to each frame; less than the noise of poses is no way."""
@@ -235,10 +245,19 @@ class Adjustment:
             change -= sparse.eye_array(frames, k=-1)
         poses = sparse.kron(change, sparse.diags_array(1 / self._noise))
         shift = np.vstack([np.zeros((3, 3)), np.eye(3)])
-        drift = -poses @ sparse.csr_array(np.kron(way[:, None], shift))
+        effects, known = [np.kron(way[:, None], shift)], []
+        for after, jump in self._jumps:
+            design = np.tile(np.eye(6), (frames, 1, 1))
+            for at, pose in enumerate(self._poses):
+                design[at, 3:, :3] = -cross_matrix(pose.shift - jump.camera)
+            design[after:] = 0
+            effects.insert(-1, design.reshape(-1, 6))
+            whiten = np.linalg.inv(np.linalg.cholesky(jump.covariance))
+            known.append(sparse.csr_array(whiten))
         # No drift is longer than the way.
-        least = sparse.eye_array(3) / (1.0 if drifts else _LEAST)
-        rows = sparse.block_array([[poses, drift], [None, least]])
+        known.append(sparse.eye_array(3) / (1.0 if drifts else _LEAST))
+        rest = -poses @ sparse.csr_array(np.hstack(effects))
+        rows = sparse.block_array([[poses, rest], [None, sparse.block_diag(known)]])
         return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()
 
 
@@ -277,8 +296,12 @@ def _equations(
     plane: NDArray[np.intp],
     seen: NDArray[np.float64],
     error: NDArray[np.float64],
+    rest: int,
 ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
-    """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened."""
+    """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
+
+    The last `rest` unknowns are of the poses only.
+    """
     turn, shift = state.turn[frame], state.shift[frame]
     normal, point, axes = (part[plane] for part in state[:3])
     to_world = np.zeros((len(turn), 4, 4))
@@ -292,7 +315,7 @@ def _equations(
     places = [3 * plane[:, None] + np.arange(3), first + 6 * frame[:, None] + np.arange(6)]
     columns = np.repeat(np.concatenate(places, axis=1), 3, axis=0)
     begin = np.arange(0, columns.size + 1, columns.shape[1])
-    shape = len(columns), first + 6 * len(state.turn) + 3
+    shape = len(columns), first + 6 * len(state.turn) + rest
     design = sparse.csr_array((values.ravel(), columns.ravel(), begin), shape)
     return design, (whiten @ local @ seen[..., None]).ravel()
 
@@ -319,18 +342,22 @@ def moved_onto(
     found = []
     for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
         normal, distance = equation[:3], float(equation[3])
-        on = [
-            [ring - (ring @ normal + distance)[:, None] * normal for ring in part]
-            for part in plane.outline.parts
-        ]
+
+        def onto(
+            points: NDArray[np.float64],
+            normal: NDArray[np.float64] = normal,
+            distance: float = distance,
+        ) -> NDArray[np.float64]:
+            return points - (points @ normal + distance)[..., None] * normal
+
         found.append(
             replace(
                 plane,
                 normal=normal,
                 distance=distance,
                 covariance=covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4],
-                centroid=plane.centroid - (plane.centroid @ normal + distance) * normal,
-                outline=MapOutline(on),
+                centroid=onto(plane.centroid),
+                outline=plane.outline.moved(onto),
             )
         )
     return found

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.adjustment import Solution
-from rangeseg_ros.core.mapping.map_outlines import valid
 from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, occupancy
 from rangeseg_ros.core.mapping.placement import moved_planes
@@ -263,7 +262,9 @@ def _wall(k: int, plane: MapPlane, reach: tuple[float, float], resolution: float
     # The plane as seen from the side: along the wall, and up.
     turned = np.stack([np.append(along, 0), [0, 0, 1]])
     parts = [[(r - np.append(foot, 0)) @ turned.T for r in part] for part in plane.outline.parts]
-    side = shapely.union_all([valid(shapely.Polygon(part[0], part[1:])) for part in parts])
+    side = shapely.union_all(
+        [shapely.make_valid(shapely.Polygon(part[0], part[1:])) for part in parts]
+    )
     left, low, right, high = side.bounds
     within = shapely.get_parts(shapely.clip_by_rect(side, left, reach[0], right, reach[1]))
     # What is seen of it as intervals along the wall.

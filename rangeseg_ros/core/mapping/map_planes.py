@@ -3,17 +3,45 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.core.mapping.evidence import HIT, LEAST, MISS, Evidence
-from rangeseg_ros.core.mapping.map_outlines import MapOutline, rectangle, rings
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.core.rotations import quaternions
+
+
+@dataclass(frozen=True, eq=False)
+class MapOutline:
+    """Parts of a plane that were seen, in the fixed frame.
+
+    Attributes
+    ----------
+    parts : list of list of (N, 3) float64
+        For each part, largest first, its border, counter-clockwise seen from where the
+        plane was seen, and the borders of its holes, clockwise.
+    """
+
+    parts: list[list[NDArray[np.float64]]]
+
+    @property
+    def hull(self) -> NDArray[np.float64]:
+        """(N, 3) border of the largest part, metres."""
+        return self.parts[0][0] if self.parts else np.zeros((0, 3))
+
+    @property
+    def holes(self) -> list[NDArray[np.float64]]:
+        """Borders (N, 3) of the holes in the largest part."""
+        return self.parts[0][1:] if self.parts else []
+
+    def moved(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> MapOutline:
+        """The outline with its corners (N, 3) moved."""
+        return MapOutline([[motion(ring) for ring in part] for part in self.parts])
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -46,47 +74,28 @@ class MapPlane(Plane):
 class Record:
     """What is kept of a plane beside its equation.
 
-    `first` and `last` are stamps; `seen` and `united` are of the map's own time, which goes on
-    where stamps do not: when it was seen last, and when its outline was looked at last.
-    `surface` is that of the frame that saw it last. `margin` is the outline and what is so near
-    that it is no detail of the map, once that was asked for. `evidence` is of the outline where
-    `followed`.
+    `first` and `last` are stamps; `seen` is of the map's own time, which goes on where stamps do
+    not. `track` and `surface` are what the tracker called it in the frame that saw it last.
     """
 
     id: int
     first: int
-    last: int
+    grid: PlaneGrid
+    last: int = 0
     observations: int = 0
     pixels: int = 0
     squares: float = 0.0
     confidence: float = 0.0
     probability: float = 0.0
     roles: Counter[str] = field(default_factory=Counter)
-    outline: shapely.Geometry = field(default_factory=shapely.Polygon)
-    margin: shapely.Geometry | None = None
     seen: int = 0
+    track: int = 0
     surface: int = 0
-    united: int = 0
-    frames: int = 0
-    looks: int = 0
-    evidence: Evidence = field(default_factory=Evidence)
-    followed: bool = False
-
-    @property
-    def confirmed(self) -> bool:
-        """Whether it was seen often enough to be part of the map.
-
-        It is to be as surely there as what is forgotten is not, by the frames it was found in and
-        those in which rays ended where it is and it was not: clutter looks like planes now and
-        then.
-        """
-        missed = max(self.looks - self.frames, 0)
-        return HIT * self.frames + MISS * missed >= -LEAST
 
     def add(self, plane: Plane, stamp: int, now: int) -> None:
         """Take in a plane of a frame."""
-        self.frames += now > self.seen
-        self.last, self.seen, self.surface = stamp, now, plane.surface
+        self.last, self.seen = stamp, now
+        self.track, self.surface = plane.id, plane.surface
         self.observations += 1
         self.pixels += plane.count
         self.squares += plane.count * plane.rms**2
@@ -94,17 +103,12 @@ class Record:
         self.probability = max(self.probability, plane.probability)
         self.roles[plane.role] += 1
 
-    def reshape(self, outline: shapely.Geometry, margin: shapely.Geometry | None = None) -> None:
-        """Have another outline."""
-        self.outline, self.margin, self.followed = outline, margin, False
-
     def absorb(self, other: Record) -> None:
         """Take in what is kept of a plane that turned out to be this one."""
         self.id = min(self.id, other.id)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
         self.seen = max(self.seen, other.seen)
         self.observations += other.observations
-        self.frames, self.looks = max(self.frames, other.frames), max(self.looks, other.looks)
         self.pixels += other.pixels
         self.squares += other.squares
         self.confidence += other.confidence
@@ -127,15 +131,17 @@ def describe(
     normal, point : (3,) float64
         In the fixed frame.
     axes : (2, 3) float64
-        Those of the outline.
+        Those of its grid.
     covariance : (4, 4) float64
         Of normal and distance.
     """
-    centre, sides, extents = rectangle(record.outline)
-    frame = np.stack([*(sides @ axes), normal], axis=1)
-    outline = MapOutline(
-        [[point + ring @ axes for ring in part] for part in rings(record.outline)]
-    )
+    grid = record.grid
+    cells = grid.centres()
+    middle, size, angle = cv2.minAreaRect(cells.astype(np.float32))
+    along = np.radians(angle if size[0] >= size[1] else angle + 90)
+    major = np.array([np.cos(along), np.sin(along)]) @ axes
+    frame = np.stack([major, np.cross(normal, major), normal], axis=1)
+    rings = MapOutline([list(part) for part in grid.polygons()])
     return MapPlane(
         label=record.id,
         id=record.id,
@@ -143,18 +149,18 @@ def describe(
         normal=normal.copy(),
         distance=float(-normal @ point),
         covariance=covariance,
-        centroid=point + shapely.get_coordinates(record.outline.centroid)[0] @ axes,
+        centroid=point + cells.mean(axis=0) @ axes,
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
         probability=record.probability,
         shape=Shape(
-            area=record.outline.area,
-            extents=extents,
-            centre=point + centre @ axes,
+            area=grid.area,
+            extents=np.sort(size)[::-1] + grid.side,
+            centre=point + np.array(middle) @ axes,
             orientation=quaternions(frame),
         ),
-        outline=outline,
+        outline=rings.moved(lambda ring: point + ring @ axes),
         role=record.roles.most_common(1)[0][0],
         observations=record.observations,
         age=(record.last - record.first) * 1e-9,

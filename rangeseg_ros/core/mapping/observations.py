@@ -8,7 +8,7 @@ observation to the next as much as both were of the same pixels. The rest is new
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +25,9 @@ from rangeseg_ros.core.tracking.plane_errors import (
     moved_plane,
     tangents,
 )
+
+if TYPE_CHECKING:
+    from rangeseg_ros.core.mapping.pose_jumps import Jump
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
@@ -54,12 +57,15 @@ class Sighting(NamedTuple):
         Of the planes of the map that they are.
     view : (M, C) float64
         See `views`.
+    jump : Jump or None
+        Of the fixed frame since the frame before.
     """
 
     pose: Transform
     planes: Sequence[Plane]
     ids: NDArray[np.int64]
     view: NDArray[np.float64]
+    jump: Jump | None = None
 
 
 class Observations(NamedTuple):
@@ -73,6 +79,9 @@ class Observations(NamedTuple):
         Square root of the covariance of the error that lasts, of (normal, distance).
     fresh : (M, 4, 4) float64
         Covariance of the error that is new in this frame.
+    by_pose : (M, 4, 6) float64
+        Square root of that part of it which is of the pose: by the turn of the camera about
+        itself and by its shift, each over its standard deviation.
     centroid : (M, 3) float64
     range : (M,) float64
         Distance of the centroid from the camera, metres.
@@ -83,6 +92,7 @@ class Observations(NamedTuple):
     plane: NDArray[np.float64]
     lasting: NDArray[np.float64]
     fresh: NDArray[np.float64]
+    by_pose: NDArray[np.float64]
     centroid: NDArray[np.float64]
     range: NDArray[np.float64]
     view: NDArray[np.float64]
@@ -124,12 +134,13 @@ def observations(
     world, place = normal @ pose.rotation.T, centroid @ pose.rotation.T
     axes = tangents(world)
     by_pose = from_errors(axes, place + pose.shift) @ by_motion(world, axes, place)
-    variance = np.repeat(np.square([noise.turn, noise.shift]), 3)
+    by_pose *= np.repeat([noise.turn, noise.shift], 3)
     fresh = (1 - LASTING) * congruent(lasting, np.eye(3))
     return Observations(
         np.column_stack([normal, distance]) @ to_world.T,
         np.sqrt(LASTING) * lasting,
-        fresh + congruent(by_pose * np.sqrt(variance), np.eye(6)),
+        fresh + congruent(by_pose, np.eye(6)),
+        by_pose,
         place + pose.shift,
         np.asarray(np.linalg.norm(centroid, axis=1)),
         view,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.evidence import HIT, LEAST, MISS
+from rangeseg_ros.core.mapping.plane_grid import HIT, LEAST, MISS
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 

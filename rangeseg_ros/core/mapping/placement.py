@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.core.mapping.map_outlines import MapOutline
+from rangeseg_ros.core.mapping.map_planes import MapOutline
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.rotations import quaternions, rotation_matrix
 from rangeseg_ros.core.tracking.plane_errors import moved_plane
@@ -148,9 +148,7 @@ def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane
     moved = []
     for plane in planes:
         normal = turn @ plane.normal
-        outline = MapOutline(
-            [[ring @ turn.T + shift for ring in part] for part in plane.outline.parts]
-        )
+        outline = MapOutline(plane.outline.parts).moved(lambda ring: ring @ turn.T + shift)
         moved.append(
             replace(
                 plane,

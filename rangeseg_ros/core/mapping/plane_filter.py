@@ -9,15 +9,17 @@ what that information has grown by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.mapping.observations import Observations, continuity
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
+    by_motion,
     candidates,
     congruent,
     from_errors,
@@ -109,6 +111,19 @@ class PlaneFilters:
         """These planes followed by others."""
         pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
         return PlaneFilters(*(np.concatenate(pair) for pair in pairs))
+
+    def moved(self, motion: Transform) -> PlaneFilters:
+        """The planes moved with all that is known of them."""
+        turn, shift = motion
+        normal, point = self.normal @ turn.T, self.point @ turn.T + shift
+        return replace(self, normal=normal, point=point, axes=self.axes @ turn.T)
+
+    def with_motion_error(
+        self, covariance: NDArray[np.float64], place: NDArray[np.float64]
+    ) -> PlaneFilters:
+        """The planes with the error (6, 6) of a motion: a turn about `place` (3,), a shift."""
+        design = by_motion(self.normal, self.axes, self.point - place)
+        return replace(self, covariance=self.covariance + congruent(design, covariance))
 
     def coordinates(
         self, index: NDArray[np.intp], points: NDArray[np.float64]

@@ -2,23 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.mapping.evidence import THERE, find_sightings, may_be_in_sight
-from rangeseg_ros.core.mapping.map_outlines import (
-    polygon_of,
-    simplify,
-    unite_outlines,
-    valid,
-    widened,
-)
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import (
     Observations,
@@ -28,15 +18,15 @@ from rangeseg_ros.core.mapping.observations import (
     views,
 )
 from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
+from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
+from rangeseg_ros.core.mapping.pose_jumps import Jump, find_jump
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.mapping.visibility import THROUGH, in_image, may_be_in_sight, ray_evidence
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.tracking.plane_errors import FARTHEST, GATE, SURE_TURN, candidates
-from rangeseg_ros.core.tracking.tracker import NOMINAL, Jump
+from rangeseg_ros.core.tracking.plane_errors import GATE, candidates
+from rangeseg_ros.core.tracking.tracker import NOMINAL
 
-# Share of the planes in sight whose outlines a frame adds to: at 30 Hz each has its turn four
-# times a second, and the work in a frame is bounded.
-_LOOKED_AT = 1 / 8
 # Jumps of the poses that are told one by one.
 _TOLD = 10
 
@@ -97,9 +87,8 @@ class PlaneMap:
         image: RangeImage,
         pose: Transform,
         stamp: int,
-        jump: Jump | None = None,
     ) -> None:
-        """Take in a frame.
+        """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
 
         Parameters
         ----------
@@ -112,15 +101,13 @@ class PlaneMap:
             Fixed frame from the frame of the image.
         stamp : int
             Nanoseconds.
-        jump : Jump, optional
-            Of the pose, by the tracker. It is noted; the map begins anew where planes are farther
-            off now than the same plane may be.
         """
         config = self.config
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
         self._stamp = stamp
         self.sighting = Sighting(pose, [], np.zeros(0, np.int64), np.zeros((0, 0)))
+        match = np.zeros(0, np.intp)
         if planes:
             view = views(labels, planes, config.distortion_length)
             known = self._filters
@@ -128,22 +115,36 @@ class PlaneMap:
                 # Of images of another size, what comes is of other pixels than before.
                 known.view = np.zeros((len(self._records), view.shape[1]))
             seen = observations(planes, view, pose, noise)
+            jump = self._jump(planes, seen, pose, noise)
             match, step = self._associate(planes, seen)
-            if jump:
-                self.jumps.append((stamp, jump))
-                # Beyond what may be one plane everything would be twice in the map.
-                if jump.shift > FARTHEST * seen.range.min() or jump.turn > SURE_TURN:
-                    now = self._stamp, self._time
-                    self.clear('the fixed frame has jumped')
-                    self._stamp, self._time = now
-                    match, step = np.full(len(planes), -1), None
             if step:
                 self._update(planes, seen, step)
-            self._fuse(planes, seen, match, pose, stamp)
+            self._fuse(planes, seen, match, stamp)
             ids = np.array([self._records[k].id for k in match.tolist()])
-            self.sighting = Sighting(pose, planes, ids, view)
-            self._merge(pose.shift)
-        self._contradict(image, pose, noise)
+            self.sighting = Sighting(pose, planes, ids, view, jump)
+        self._look(self._outlines(planes, match, pose), image, pose, noise)
+        if len(match):
+            self._merge(np.unique(match), pose.shift)
+        self._forget()
+
+    def _jump(
+        self, planes: Sequence[Plane], seen: Observations, pose: Transform, noise: PoseNoise
+    ) -> Jump | None:
+        """Find a jump of the fixed frame by planes that were followed through it; follow it."""
+        known = {record.track: k for k, record in enumerate(self._records)}
+        both = [m for m, plane in enumerate(planes) if plane.id in known]
+        # Odometry never jumps.
+        odometry = self.config.odometry and not self.config.fixed_frame
+        if self._filters is None or not both or odometry:
+            return None
+        index = np.array([known[planes[m].id] for m in both])
+        jump = find_jump(self._filters.where(index), seen.where(both), pose.shift, noise)
+        if jump:
+            self.jumps.append((self._stamp, jump))
+            self._filters = self._filters.moved(jump.motion).with_motion_error(
+                jump.covariance, pose.shift
+            )
+        return jump
 
     @property
     def doubts(self) -> list[str]:
@@ -155,7 +156,7 @@ class PlaneMap:
 
     @property
     def planes(self) -> list[MapPlane]:
-        """The planes that were seen often enough and are no clutter, in the order of their ids."""
+        """The planes whose sure parts are no clutter, in the order of their ids."""
         if self._filters is None:
             return []
         filters = self._filters
@@ -169,7 +170,7 @@ class PlaneMap:
 
     def _told(self, record: Record) -> bool:
         """Whether there is enough of a plane to tell it: no clutter."""
-        return record.confirmed and record.outline.area > self.config.map_area
+        return record.grid.sure_area > self.config.map_area
 
     def _associate(
         self, planes: Sequence[Plane], seen: Observations
@@ -196,10 +197,11 @@ class PlaneMap:
         value = filters.gate(step, seen)
         fits = np.flatnonzero(value < GATE)
         index, which, value = index[fits], which[fits], value[fits]
-        reach = np.array([np.hypot(*planes[m].extents) / 2 for m in which.tolist()])
         at = filters.coordinates(index, seen.centroid[which])
-        outlines = np.array([self._records[k].outline for k in index.tolist()], object)
-        away = shapely.distance(outlines, shapely.points(at))
+        away = np.array(
+            [self._records[k].grid.distance(p) for k, p in zip(index.tolist(), at, strict=True)]
+        )
+        reach = np.array([np.hypot(*planes[m].extents) / 2 for m in which.tolist()])
         # The one it lies on, or else the likeliest.
         order = np.lexsort([value, away > 0])
         # What one frame finds on two surfaces is not one plane, however badly its pose is known.
@@ -225,57 +227,94 @@ class PlaneMap:
         planes: Sequence[Plane],
         seen: Observations,
         match: NDArray[np.intp],
-        pose: Transform,
         stamp: int,
     ) -> None:
-        """Keep what planes of a frame are known by and their outlines, and begin new ones."""
-        count = np.array([plane.count for plane in planes])
-        order = np.argsort(-count, kind='stable')
-        new = order[match[order] < 0]
+        """Keep what planes of a frame are known by, and begin new ones."""
+        new = np.flatnonzero(match < 0)
         if len(new):
             match[new] = len(self._records) + np.arange(len(new))
             first = PlaneFilters.of(seen.where(new))
             self._filters = self._filters.joined(first) if self._filters else first
             for _ in new:
-                self._records.append(Record(self._next, stamp, stamp))
+                grid = PlaneGrid(self.config.map_resolution)
+                self._records.append(Record(self._next, stamp, grid))
                 self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp, self._time)
-        # The new ones first, then those that wait the longest.
-        due = sorted(set(match.tolist()), key=lambda k: (self._records[k].united, k))
-        for k in due[: max(math.ceil(_LOOKED_AT * len(due)), len(new))]:
-            self._records[k].united = self._time
-            for part in np.flatnonzero(match == k).tolist():
-                self._unite(k, planes[part], pose)
 
-    def _unite(self, k: int, plane: Plane, pose: Transform) -> None:
-        """Add what is seen of a plane to its outline."""
+    def _outlines(
+        self, planes: Sequence[Plane], match: NDArray[np.intp], pose: Transform
+    ) -> dict[int, NDArray[np.bool_]]:
+        """Cells of the planes of the map that a frame has found."""
+        found = {}
+        for k in np.unique(match).tolist():
+            parts = []
+            for m in np.flatnonzero(match == k).tolist():
+                rings = [planes[m].hull, *planes[m].holes]
+                parts.append([self._flat(k, r @ pose.rotation.T + pose.shift) for r in rings])
+            found[k] = self._records[k].grid.see([part for part in parts if len(part[0]) > 2])
+        return found
+
+    def _flat(self, k: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Coordinates (N, 2) of points (N, 3) on a plane."""
+        assert self._filters is not None
+        return self._filters.coordinates(np.full(len(points), k), points)
+
+    def _look(
+        self,
+        found: dict[int, NDArray[np.bool_]],
+        image: RangeImage,
+        pose: Transform,
+        noise: PoseNoise,
+    ) -> None:
+        """Take in that cells were looked at, and no plane was found there."""
         filters = self._filters
-        assert filters is not None
+        if filters is None or not self._records:
+            return
+        circles = [record.grid.circle() for record in self._records]
+        middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
+        middles = filters.points(np.arange(len(middles)), middles)
+        middles = (middles - pose.shift) @ pose.rotation
+        shown = np.flatnonzero(may_be_in_sight(middles, reaches, image)).tolist()
+        cells = [self._records[k].grid.odds > 0 for k in shown]
+        for k, own in zip(shown, cells, strict=True):
+            own &= ~found.get(k, np.False_)
+        at = [self._records[k].grid.centres(own) for k, own in zip(shown, cells, strict=True)]
+        owner = np.repeat(shown, list(map(len, at))).astype(np.intp)
+        place = np.concatenate([np.zeros((0, 2)), *at])
+        points = (filters.points(owner, place) - pose.shift) @ pose.rotation
+        within = np.flatnonzero(in_image(points, image))
+        variance = filters.variances(owner[within], place[within])
+        variance += noise.shift**2 + noise.turn**2 * (points[within] ** 2).sum(axis=1)
+        normals = (filters.normal @ pose.rotation)[owner[within]]
+        sensor = SensorModel.from_config(self.config)
+        through = np.zeros(len(owner), np.bool_)
+        through[within] = ray_evidence(points[within], normals, variance, image, sensor) == THROUGH
+        for k, own in zip(shown, cells, strict=True):
+            own[own] = through[owner == k]
+            self._records[k].grid.miss(own)
 
-        def flat(ring: NDArray[np.float64]) -> NDArray[np.float64]:
-            world = ring @ pose.rotation.T + pose.shift
-            return filters.coordinates(np.full(len(ring), k), world)
-
-        part = polygon_of(flat(plane.hull), [flat(hole) for hole in plane.holes])
-        # Corners of pixels are finer than the map, and cost time in every step that follows.
-        self._grow(k, part.simplify(self.config.map_resolution / 4))
-
-    def _merge(self, camera: NDArray[np.float64]) -> None:
-        """Unite planes of the map that turn out to be one with those that have just grown."""
+    def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
+        """Unite planes of the map that turn out to be one with some of this frame."""
         filters = self._filters
         assert filters is not None
         gone: list[int] = []
-        grown = [k for k, record in enumerate(self._records) if record.united == self._time]
-        for k, m in filters.alike(np.array(grown), camera):
-            if m in gone or k in gone or self._distinct(k, m) or not self._touch(k, m):
+        for k, m in filters.alike(some, camera):
+            if m in gone or k in gone or self._distinct(k, m):
                 continue
             kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
+            cells = self._records[lost].grid
+            odds = cells.odds[cells.odds > 0]
+            own = cells.centres()
+            centres = self._flat(kept, filters.points(np.full(len(own), lost), own))
+            reach = cells.circle()[1]
+            if not len(own) or self._records[kept].grid.distance(centres.mean(axis=0)) > 2 * reach:
+                continue
+            self._records[kept].grid.absorb(centres, odds)
             filters.absorb(kept, lost)
             first, second = sorted(self._records[n].id for n in (kept, lost))
             self.successors[second] = first
             self._records[kept].absorb(self._records[lost])
-            self._grow(kept, self._across(lost, kept))
             gone.append(lost)
         if gone:
             self._keep(np.isin(np.arange(len(self._records)), gone, invert=True))
@@ -285,104 +324,23 @@ class PlaneMap:
         a, b = self._records[k], self._records[m]
         return a.seen == b.seen == self._time and a.surface != b.surface
 
-    def _touch(self, k: int, m: int) -> bool:
-        """Whether outlines are no farther apart than the smaller one is large."""
-        a, b = self._records[k].outline, self._across(m, k)
-        if a.is_empty or b.is_empty:
-            return True
-        reach = min(np.hypot(x - u, y - v) for u, v, x, y in (a.bounds, b.bounds))
-        return bool(a.distance(b) <= reach)
-
-    def _across(self, source: int, target: int) -> shapely.Geometry:
-        """Outline of one plane on another."""
-        filters = self._filters
-        assert filters is not None
-        point, axes = filters.point, filters.axes
-        turn = axes[target] @ axes[source].T
-        shift = axes[target] @ (point[source] - point[target])
-        across = shapely.transform(self._records[source].outline, lambda xy: xy @ turn.T + shift)
-        # Corners that touched may cross by what rounding turns them by.
-        return valid(across)
-
-    def _grow(self, k: int, part: shapely.Geometry) -> None:
-        record, resolution = self._records[k], self.config.map_resolution
-        if record.outline.is_empty:
-            record.reshape(simplify(part, resolution))
-            return
-        if record.margin is None:
-            record.margin = widened(record.outline, resolution)
-        shapely.prepare(record.margin)
-        # What reaches no farther is no detail of the map: most looks show nothing new.
-        if not record.margin.covers(part):
-            record.reshape(*unite_outlines(record.outline, part, resolution))
-
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         assert self._filters is not None
         self._filters = self._filters.where(chosen)
         self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
 
-    def _contradict(self, image: RangeImage, pose: Transform, noise: PoseNoise) -> None:
-        """Take away what rays pass through."""
-        filters = self._filters
-        if filters is None or not self._records:
-            return
-        for record in self._records:
-            # What was found once is mostly not found again.
-            if not record.followed and record.frames > 1:
-                record.evidence.follow(record.outline)
-                record.followed = True
-        circles = [record.evidence.circle() for record in self._records]
-        middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
-        middles = filters.points(np.arange(len(middles)), middles)
-        middles = (middles - pose.shift) @ pose.rotation
-        shown = np.flatnonzero(may_be_in_sight(middles, reaches, image))
-        if len(shown):
-            self._look(shown, filters, image, pose, noise)
-        self._forget()
-
-    def _look(
-        self,
-        shown: NDArray[np.intp],
-        filters: PlaneFilters,
-        image: RangeImage,
-        pose: Transform,
-        noise: PoseNoise,
-    ) -> None:
-        """Take away what rays pass through of some planes."""
-        records = [self._records[k] for k in shown.tolist()]
-        evidence = [record.evidence for record in records]
-        which = np.repeat(np.arange(len(evidence)), [len(one.centres) for one in evidence])
-        owner = shown[which]
-        at = np.concatenate([one.centres for one in evidence])
-        points = (filters.points(owner, at) - pose.shift) @ pose.rotation
-        variance = filters.variances(owner, at)
-        variance += noise.shift**2 + noise.turn**2 * (points**2).sum(axis=1)
-        found = find_sightings(
-            points,
-            (filters.normal @ pose.rotation)[owner],
-            variance,
-            image,
-            SensorModel.from_config(self.config),
-        )
-        for number, record in enumerate(records):
-            part = found[which == number]
-            record.looks += int(2 * np.count_nonzero(part == THERE) > len(part))
-            if record.evidence.see(part):
-                record.reshape(record.evidence.remaining(record.outline))
-
     def _forget(self) -> None:
-        """Drop planes of which nothing is left, those not confirmed, and what is too much."""
-        trial = 1e9 * self.config.track_time
-        kept = [
-            not r.outline.is_empty and (r.confirmed or self._time - r.seen <= trial)
-            for r in self._records
-        ]
-        if (surplus := sum(kept) - self.config.map_planes) > 0:
-            # Those out of sight the longest are forgotten, and of these the ones hardly seen.
-            records = self._records
-            order = np.flatnonzero(kept).tolist()
-            order.sort(key=lambda k: (records[k].seen, records[k].observations))
-            for k in order[:surplus]:
-                kept[k] = False
-        if not all(kept):
-            self._keep(np.array(kept))
+        """Drop planes of which nothing is left, clutter out of sight, and what is too much."""
+        records, trial = self._records, 1e9 * self.config.track_time
+        kept = np.array(
+            [r.grid.area > 0 and (self._told(r) or self._time - r.seen <= trial) for r in records],
+            np.bool_,
+        )
+        # Those out of sight the longest are forgotten first, and of these the ones hardly seen.
+        order = sorted(
+            range(len(records)), key=lambda k: (-records[k].seen, -records[k].observations)
+        )
+        surplus = [k for k in order if kept[k]][self.config.map_planes :]
+        kept[surplus] = False
+        if not kept.all():
+            self._keep(kept)

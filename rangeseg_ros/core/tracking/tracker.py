@@ -9,7 +9,6 @@ camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.rotations import rotation_by
-from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
     by_motion,
@@ -27,8 +25,6 @@ from rangeseg_ros.core.tracking.tracks import (
     Tracks,
     differences,
     near_planes,
-    samples_of,
-    shared_samples,
 )
 
 # Intersection over union that planes in reach of each other count with, beside what they have: a
@@ -37,35 +33,10 @@ _UNSEEN_OVERLAP = 0.1
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# Largest angle of a plane to itself in the frame before: bent things are planes that turn.
-_TURN = np.radians(22.0)
 # The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
-# Chi-squared with the six degrees of freedom of a motion.
-_JUMP = chi2_quantile(6)
-
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
-
-
-class Jump(NamedTuple):
-    """What a motion that was told differs by from that of the planes: metres and radians."""
-
-    shift: float
-    turn: float
-
-    @classmethod
-    def between(cls, told: Motion, own: Motion) -> Jump:
-        """Of two motions."""
-        turn = told[0] @ own[0].T
-        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
-        return cls(float(np.linalg.norm(told[1] - turn @ own[1])), float(angle))
-
-    def __str__(self) -> str:
-        return (
-            f'the planes contradict the pose by {1e3 * self.shift:.0f} mm and '
-            f'{np.degrees(self.turn):.1f} degrees'
-        )
 
 
 class Tracker:
@@ -86,13 +57,7 @@ class Tracker:
     Parameters
     ----------
     config : Config, optional
-        `track_time`, `camera_turn`, `camera_speed`, `pose_noise` and `pose_turn_noise`.
-
-    Attributes
-    ----------
-    jump : Jump or None
-        How far the motion that was told of the last frame is from that of the planes, where they
-        contradict it.
+        `track_time`, `camera_turn` and `camera_speed`.
 
     Examples
     --------
@@ -102,7 +67,6 @@ class Tracker:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self.jump: Jump | None = None
         self._next = 1
         self._stamp = 0
         self._shape: tuple[int, ...] = ()
@@ -110,7 +74,7 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget the planes: none of them is matched. Their ids are not given again."""
-        self._tracks = Tracks.of([], np.zeros(0, np.intp))
+        self._tracks: Tracks | None = None
 
     def track(
         self,
@@ -143,9 +107,9 @@ class Tracker:
             self.reset()
         elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
         self._stamp, self._shape = stamp, labels.shape
-        samples = samples_of(labels, planes)
-        seen, known = Tracks.of(planes, samples), self._tracks
-        shared = shared_samples(known, samples, len(planes))
+        seen = Tracks.of(planes, labels)
+        known = self._tracks or Tracks.of([], labels)
+        shared = known.mask @ seen.mask.T
         known = self._with_camera(known, seen, shared, elapsed, motion)
         seen.id[:] = _assign(known, seen, shared)
         new = seen.id == 0
@@ -166,7 +130,7 @@ class Tracker:
         self,
         known: Tracks,
         seen: Tracks,
-        shared: NDArray[np.intp],
+        shared: NDArray[np.float32],
         elapsed: float,
         told: Motion | None,
     ) -> Tracks:
@@ -175,21 +139,9 @@ class Tracker:
         # Planes that were in sight and have half of their pixels in common.
         sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
         sure &= (known.unseen == 0)[:, None] & near_planes(known, seen)
-        t, s = np.nonzero(sure)
         speed = np.repeat([np.radians(config.camera_turn), config.camera_speed], 3)
         prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
-        own = _camera_motion(known, seen, (t, s), prior)
-        self.jump = None
-        if told is None:
-            return known.moved(*own)
-        # What poses err by, at both ends of the motion.
-        noise = 2 * np.array([np.radians(config.pose_turn_noise), config.pose_noise]) ** 2
-        if _contradiction(known, seen, (t, s), (told, own), noise) > _JUMP:
-            # Where the frames that tell the motion jump, the planes know better.
-            self.jump = Jump.between(told, own)
-            return known.moved(*own)
-        known = known.moved(*told)
-        return known.moved(*_camera_motion(known, seen, (t, s), prior))
+        return known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, told))
 
     def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
         """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
@@ -219,21 +171,25 @@ class Tracker:
 def _camera_motion(
     known: Tracks,
     seen: Tracks,
-    pairs: tuple[NDArray[np.intp], NDArray[np.intp]],
+    pairs: tuple[NDArray[np.intp], ...],
     prior: NDArray[np.float64],
+    told: Motion | None,
 ) -> Motion:
     """Motion of the known planes to those that are seen, of sure pairs of them.
 
     Gauss-Newton steps for the turn and the shift, weighted by the covariances of the pairs; those
     that fit badly (things that move by themselves) count less. Directions in which the planes
-    leave the motion open are held by a prior of zero, with the inverse variances `prior` (6,).
+    leave the motion open are held by a prior, with the inverse variances `prior` (6,): the motion
+    that was told, or none. Weights are relative to the
+    median misfit, so that a wrong motion is corrected.
     """
-    rotation, shift = np.eye(3), np.zeros(3)
     t, s = pairs
+    rotation, shift = told or (np.eye(3), np.zeros(3))
     for _ in range(_MOTION_ROUNDS if len(t) else 0):
         gap, spread, axes, point = differences(known.moved(rotation, shift), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
-        weight = 1 / (1 + mahalanobis(gap, spread) / 4)
+        value = mahalanobis(gap, spread)
+        weight = 1 / (1 + value / (4 * max(float(np.median(value)), 1)))
         weighted = weight[:, None, None] * np.linalg.solve(spread, design)
         left = np.diag(prior) + np.einsum('kia,kib->ab', weighted, design)
         step = np.linalg.solve(left, -np.einsum('kia,ki->a', weighted, gap))
@@ -242,40 +198,14 @@ def _camera_motion(
     return rotation, shift
 
 
-def _contradiction(
-    known: Tracks,
-    seen: Tracks,
-    pairs: tuple[NDArray[np.intp], NDArray[np.intp]],
-    motions: tuple[Motion, Motion],
-    noise: NDArray[np.float64],
-) -> float:
-    """How much better, in chi-squared, sure pairs are explained by the second of two motions.
-
-    That of the plane for which it is most does not count where there are others: it may be one
-    that moves by itself. `noise` are variances of the turn and the shift of the first.
-    """
-    t, s = pairs
-    if not len(t):
-        return 0.0
-    values = []
-    for motion, (turn, place) in zip(motions, (noise.tolist(), [0.0, 0.0]), strict=True):
-        gap, spread, axes, point = differences(known.moved(*motion), seen, t, s)
-        design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
-        variance = np.repeat([turn, place], 3)
-        spread = spread + np.einsum('kia,a,kja->kij', design, variance, design)
-        values.append(mahalanobis(gap, spread))
-    gains = values[0] - values[1]
-    return float(gains.sum() - (gains.max() if len(gains) > 1 else 0.0))
-
-
-def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.intp]:
+def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.float32]) -> NDArray[np.intp]:
     """(N,) id of the known plane that each plane is, 0 for none."""
     # Here, as it takes as long to import as a frame and is for sequences only.
     from scipy.optimize import linear_sum_assignment
 
     between = np.linalg.norm(known.centroid[:, None] - seen.centroid, axis=2)
     near = (shared > 0) | (between < np.add.outer(known.reach, seen.reach))
-    t, s = np.nonzero(near & near_planes(known, seen, _TURN))
+    t, s = np.nonzero(near & near_planes(known, seen))
     gap, spread, _, _ = differences(known, seen, t, s)
     value = mahalanobis(gap, spread)
     fits = value < GATE

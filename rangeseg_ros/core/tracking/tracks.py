@@ -30,10 +30,10 @@ _SAMPLES = 60
 class Tracks:
     """N planes in the frame of the camera.
 
-    `plane` (N, 4) are normals and distances. `footprint` and `owner` list the samples of the label
-    image in which the planes were last seen and whose they were, 0...N-1; `unseen` is how many
-    seconds have passed since then. `width` (N,) and `reach` are half the width and half the
-    diagonal of the rectangle around each plane, metres.
+    `plane` (N, 4) are normals and distances. `mask` (N, S) tells in which samples of the label
+    image they were last seen; `unseen` is how many seconds have passed since then. `width` (N,)
+    and `reach` are half the width and half the diagonal of the rectangle around each plane,
+    metres.
     """
 
     id: NDArray[np.int64]
@@ -44,13 +44,14 @@ class Tracks:
     width: NDArray[np.float64]
     reach: NDArray[np.float64]
     unseen: NDArray[np.float64]
-    footprint: NDArray[np.intp]
-    owner: NDArray[np.intp]
+    mask: NDArray[np.float32]
 
     @classmethod
-    def of(cls, planes: Sequence[Plane], samples: NDArray[np.intp]) -> Tracks:
-        """Planes seen now, without ids (0)."""
-        footprint = np.flatnonzero(samples)
+    def of(cls, planes: Sequence[Plane], labels: NDArray[np.uint16]) -> Tracks:
+        """Planes seen now in a label image (H, W), without ids (0)."""
+        step = max(min(labels.shape) // _SAMPLES, 1)
+        coarse = labels[step // 2 :: step, step // 2 :: step].ravel()
+        own = np.array([p.label for p in planes], np.uint16)
         extents = np.array([p.extents for p in planes], np.float64).reshape(-1, 2)
         return cls(
             np.zeros(len(planes), np.int64),
@@ -61,8 +62,7 @@ class Tracks:
             np.maximum(extents.min(axis=1, initial=np.inf) / 2, NARROWEST),
             np.asarray(np.linalg.norm(extents, axis=1)) / 2,
             np.zeros(len(planes)),
-            footprint,
-            samples[footprint] - 1,
+            (coarse == own[:, None]).astype(np.float32),
         )
 
     @property
@@ -71,9 +71,9 @@ class Tracks:
         return self.plane[:, :3]
 
     @cached_property
-    def size(self) -> NDArray[np.intp]:
+    def size(self) -> NDArray[np.float32]:
         """(N,) number of samples of each plane."""
-        return np.bincount(self.owner, minlength=len(self.id))
+        return self.mask.sum(axis=1)
 
     @cached_property
     def range(self) -> NDArray[np.float64]:
@@ -92,33 +92,12 @@ class Tracks:
 
     def where(self, chosen: NDArray[np.bool_]) -> Tracks:
         """Some of the planes."""
-        kept = chosen[self.owner]
-        number = np.cumsum(chosen) - 1
-        rest = {f.name: getattr(self, f.name)[chosen] for f in fields(self)[:-2]}
-        return Tracks(**rest, footprint=self.footprint[kept], owner=number[self.owner[kept]])
+        return Tracks(*(getattr(self, f.name)[chosen] for f in fields(self)))
 
     def joined(self, others: Tracks) -> Tracks:
         """These planes followed by others."""
-        others = replace(others, owner=others.owner + len(self.id))
-        return Tracks(
-            *(np.concatenate([getattr(t, f.name) for t in (self, others)]) for f in fields(self))
-        )
-
-
-def samples_of(labels: NDArray[np.uint16], planes: Sequence[Plane]) -> NDArray[np.intp]:
-    """(S,) number of the plane in each sample of the label image, 1...N; 0 where is none."""
-    step = max(min(labels.shape) // _SAMPLES, 1)
-    coarse = labels[step // 2 :: step, step // 2 :: step].ravel()
-    number = np.zeros(65536, np.intp)
-    number[[p.label for p in planes]] = np.arange(1, len(planes) + 1)
-    return number[coarse]
-
-
-def shared_samples(known: Tracks, samples: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """(T, N) number of samples that each known plane has in common with each one seen."""
-    shape = len(known.id), count + 1
-    pair = known.owner * shape[1] + samples[known.footprint]
-    return np.bincount(pair, minlength=shape[0] * shape[1]).reshape(shape)[:, 1:]
+        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
+        return Tracks(*map(np.concatenate, pairs))
 
 
 def near_planes(known: Tracks, seen: Tracks, turn: float = SURE_TURN) -> NDArray[np.bool_]:

@@ -1,0 +1,155 @@
+"""Where a plane of a map is: an occupancy grid on the plane.
+
+References
+----------
+A. Elfes, "Using occupancy grids for mobile robot perception and navigation", Computer 1989.
+A. Hornung et al., "OctoMap", Autonomous Robots 2013: log-odds with bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+HIT, MISS, SURE, LEAST = 0.85, -0.4, 2.0, -2.0
+"""Log-odds of a look that finds the plane in a cell and of one that does not, from which on a cell
+is sure, and the least, as of OctoMap.
+"""
+_MOST = 3.5
+# Cells of a grid at most: beyond, they become twice as large, so that memory is bounded.
+_CELLS = 2**18
+# Fractional bits of coordinates in OpenCV's polygons.
+_BITS = 8
+
+Polygon = Sequence[NDArray[np.float64]]
+"""Border (N, 2) and borders of holes, metres along the axes of a plane."""
+
+
+class PlaneGrid:
+    """Log-odds that a plane is there, in square cells along its axes.
+
+    Parameters
+    ----------
+    side : float
+        Of a cell, metres.
+
+    Attributes
+    ----------
+    odds : (V, U) float32
+        0 where nothing is known; rows along the second axis of the plane.
+    first : (2,) int
+        Numbers of the first cell along both axes.
+    """
+
+    def __init__(self, side: float) -> None:
+        self.side = side
+        self.odds = np.zeros((0, 0), np.float32)
+        self.first = np.zeros(2, np.intp)
+
+    @property
+    def area(self) -> float:
+        """Square metres of cells where the plane is."""
+        return float(np.count_nonzero(self.odds > 0)) * self.side**2
+
+    @property
+    def sure_area(self) -> float:
+        """Square metres of cells where it surely is: seen three times, or as much oftener."""
+        return float(np.count_nonzero(self.odds >= SURE)) * self.side**2
+
+    def circle(self) -> tuple[NDArray[np.float64], float]:
+        """Middle (2,) and radius of a circle around all cells, metres."""
+        size = np.array(self.odds.shape[::-1]) * self.side
+        return self.first * self.side + size / 2, float(np.hypot(*size)) / 2
+
+    def centres(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
+        """Centres (K, 2) of the cells where the plane is, or of those chosen (V, U)."""
+        v, u = np.nonzero(self.odds > 0 if chosen is None else chosen)
+        return np.asarray((np.stack([u, v], axis=1) + self.first + 0.5) * self.side, np.float64)
+
+    def distance(self, point: NDArray[np.float64]) -> float:
+        """From a point (2,) to the next cell where the plane is, metres; 0 inside."""
+        u, v = np.floor(point / self.side).astype(np.intp) - self.first
+        height, width = self.odds.shape
+        if 0 <= u < width and 0 <= v < height and self.odds[v, u] > 0:
+            return 0.0
+        away = self.centres() - point
+        return float(np.sqrt((away**2).sum(axis=1).min(initial=np.inf)))
+
+    def see(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
+        """Take in the parts of the plane that a frame has found; their cells (V, U)."""
+        corners = np.concatenate([ring for part in parts for ring in part])
+        self._reach(corners)
+        height, width = self.odds.shape
+        # Samples at the corners of cells; a cell is seen where all four of its corners are.
+        lattice = np.zeros((height + 1, width + 1), np.uint8)
+        for part in parts:
+            rings = [np.rint((r / self.side - self.first) * 2**_BITS).astype(int) for r in part]
+            cv2.fillPoly(lattice, [ring.astype(np.int32) for ring in rings], 1, shift=_BITS)
+        inside = cv2.erode(lattice, np.ones((2, 2), np.uint8), anchor=(0, 0))[:-1, :-1] > 0
+        if not inside.any():
+            # A sliver between the corners of cells.
+            u, v = np.floor(corners.mean(axis=0) / self.side).astype(np.intp) - self.first
+            inside[v, u] = True
+        self._add(inside, HIT)
+        return inside
+
+    def miss(self, cells: NDArray[np.bool_]) -> None:
+        """Take in cells (V, U) that were looked at without finding the plane."""
+        self._add(cells, MISS)
+
+    def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
+        """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
+        self._reach(centres)
+        u, v = (np.floor(centres / self.side).astype(np.intp) - self.first).T
+        np.maximum.at(self.odds, (v, u), odds)
+
+    def polygons(self) -> list[Polygon]:
+        """Outlines of the parts, largest first, counter-clockwise, holes clockwise."""
+        # Gaps of a cell are closed.
+        room = cv2.copyMakeBorder((self.odds > 0).view(np.uint8), 2, 2, 2, 2, cv2.BORDER_CONSTANT)
+        room = cv2.morphologyEx(room, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+        # The corners of the cells, so that borders run along their sides.
+        lattice = cv2.dilate(room, np.ones((2, 2), np.uint8), anchor=(1, 1))
+        contours, tree = cv2.findContours(lattice, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+        order = sorted(range(len(contours)), key=lambda k: -cv2.contourArea(contours[k]))
+        # Contours run counter-clockwise with the rows downwards, thus clockwise here.
+        rings = [cv2.approxPolyDP(c, 1.0, True)[::-1, 0] for c in contours]
+        placed = [np.asarray((r + self.first - 2) * self.side, np.float64) for r in rings]
+        kept = [k for k in order if len(rings[k]) > 2]
+        parents = [int(tree[0, k, 3]) for k in range(len(contours))]
+        return [
+            [placed[k], *(placed[m] for m in kept if parents[m] == k)]
+            for k in kept
+            if parents[k] < 0
+        ]
+
+    def _add(self, cells: NDArray[np.bool_], change: float) -> None:
+        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
+
+    def _reach(self, points: NDArray[np.float64]) -> None:
+        """Have cells for points (N, 2)."""
+        least, most = points.min(axis=0), points.max(axis=0)
+        low, high = (np.floor(end / self.side).astype(np.intp) for end in (least, most))
+        last = self.first + self.odds.shape[::-1]
+        if not self.odds.size:
+            self.first = last = low
+        before, after = np.maximum(self.first - low, 0), np.maximum(high + 1 - last, 0)
+        if not (before.any() or after.any()):
+            return
+        if np.prod(last + after - self.first + before) > _CELLS:
+            self._coarsen()
+            return self._reach(points)
+        self.odds = np.pad(self.odds, list(zip(before[::-1], after[::-1], strict=True)))
+        self.first = self.first - before
+
+    def _coarsen(self) -> None:
+        """Cells twice as large, each as sure as its surest quarter."""
+        start = self.first % 2
+        end = (start + self.odds.shape[::-1]) % 2
+        odds = np.pad(self.odds, list(zip(start[::-1], end[::-1], strict=True)))
+        height, width = odds.shape
+        self.odds = odds.reshape(height // 2, 2, width // 2, 2).max(axis=(1, 3))
+        self.first, self.side = self.first // 2, 2 * self.side
