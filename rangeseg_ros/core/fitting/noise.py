@@ -62,13 +62,14 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         Taken as far as the image says too little.
     """
     quanta = submit(quantisation, image.inverse)
-    if image.inverse.size >= _ENOUGH * (2 * BLOCK) ** 2:
-        # What is correlated over more than a pixel hides from blocks of four.
-        reduced = Cells(2, 0, 0).reduced(image)
-        wider = _measured(reduced, Blocks.of(reduced), prior.every(2), quanta)
-        if wider and wider.white <= 0.5:
-            return wider.every(0.5)
-    return _measured(image, blocks, prior, quanta) or prior
+    found = _measured(image, blocks, prior, quanta) or prior
+    few = image.inverse.size < _ENOUGH * (2 * BLOCK) ** 2
+    if found.white > 0.5 or found.correlation < 1 or few:
+        return found
+    # What is correlated over more than a pixel hides from blocks of four: every second pixel then.
+    reduced = Cells(2, 0, 0).reduced(image)
+    wider = _measured(reduced, Blocks.of(reduced), prior.every(2), quanta)
+    return wider.every(0.5) if wider else found
 
 
 def _measured(
