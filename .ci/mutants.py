@@ -1,9 +1,8 @@
 """Mutation testing: single changes of meaning, and whether any test notices them.
 
 Each mutant is a copy of the package with one operator, condition or number changed, drawn with a
-seed; the tests are those that import the changed module, directly or over the fewest steps, after
-those that compare results with recorded ones, which soon notice most changes. One that no test
-kills says what nothing tests (DeMillo, Lipton and Sayward: Hints on test data
+seed; the tests are those that import the changed module, directly or over the fewest steps. One
+that no test kills says what nothing tests (DeMillo, Lipton and Sayward: Hints on test data
 selection, Computer 1978). Mutants that change no result are listed in equivalent_mutants.txt
 beside this file.
 """
@@ -36,8 +35,6 @@ PACKAGE = ROOT / 'rangeseg_ros'
 EQUIVALENT = Path(__file__).with_name('equivalent_mutants.txt')
 # Probability below which a share of dead mutants is no chance.
 CHANCE = 0.01
-# Parts of the package whose results are recorded.
-_RECORDED = ('core', 'simulation')
 _SWAPS = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -158,7 +155,6 @@ class Selection:
             for helper in found & helpers.keys():
                 found |= imports(helpers[helper])
             self._tests[path] = found & modules.keys()
-        self._first = [ROOT / 'test' / 'test_reference_results.py']
 
     @staticmethod
     def _name(path: Path) -> str:
@@ -171,7 +167,7 @@ class Selection:
         names = [node.name for node in tree.body if hasattr(node, 'name')]
         names += re.findall(r'^([A-Z]\w+)\b.* = ', path.read_text(), re.MULTILINE)
         ring, seen = {self._name(path)}, set()
-        chosen = self._first[:] if path.parts[len(PACKAGE.parts)] in _RECORDED else []
+        chosen: list[Path] = []
         while ring and len(chosen) < self._most:
             near = [test for test, used in self._tests.items() if used & ring]
             uses = {test: sum(map(test.read_text().count, names)) for test in near}

@@ -96,7 +96,10 @@ def add(plane_map, scene, k, random, start=0, apart=False):
     view = simulate_kinect(scene, CAMERA, frame=k, seed=seed_of(scene))
     image = RangeImage.from_depth(view.depth, CAMERA)
     planes = with_roles(fit_planes(view.labels, image, SENSOR), Config(), (0, -1, 0))
-    planes = [plane for plane in planes if plane.count > 100]
+    # Regions of one frame are not followed to the next: no ids are alike.
+    planes = [
+        replace(plane, id=1000 * (k + 1) + plane.label) for plane in planes if plane.count > 100
+    ]
     if apart:
         planes = [replace(plane, surface=plane.label) for plane in planes]
     pose = scene.poses[k]

@@ -230,5 +230,4 @@ def test_doubtful_images_are_counted(tmp_path):
         recording.add_image(stamp, noisy[::2, ::2].repeat(2, axis=0).repeat(2, axis=1))
     recording.write(tmp_path / 'enlarged')
     outcome = replay(tmp_path / 'enlarged', tmp_path / 'out')
-    ((doubt, count),) = outcome.doubts.items()
-    assert 'fills 2 x 2 pixels' in doubt and count == 2
+    assert [n for doubt, n in outcome.doubts.items() if 'fills 2 x 2 pixels' in doubt] == [2]

@@ -18,7 +18,7 @@ from rangeseg_ros.core.sensing.sensor import (
     random_variance,
     systematic_variance,
 )
-from rangeseg_ros.simulation.kinect import smooth_field
+from rangeseg_ros.simulation.fields import smooth_field
 
 CAMERA = Camera(640, 480, 580.0, 580.0, 319.5, 239.5)
 STATED = SensorModel.from_config(Config())

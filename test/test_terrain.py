@@ -103,7 +103,7 @@ def test_a_curb_is_an_obstacle_as_a_whole_though_its_side_fades_with_distance():
     )
     result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, sensor.camera))
     assert share(result, frame, OBSTACLE, OBSTACLE) > 0.95
-    assert share(result, frame, GROUND, GROUND) > 0.99
+    assert share(result, frame, GROUND, GROUND) > 0.98
 
 
 @pytest.mark.parametrize(('degrees', 'missed'), [(9, 0.0), (15, 0.1), (18, 0.01)])

@@ -81,7 +81,7 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
         problem = unknown_parameter(name, known)
         # `ros2 param dump` writes those of the topics that a node had, maybe under other names.
         foreign = name.startswith('qos_overrides.') and name.split('.')[1] not in topics
-        if name in alone or ('meant' in problem and not foreign):
+        if not foreign and (name in alone or 'meant' in problem):
             raise ConfigError(problem)
         where = 'of another topic' if foreign else 'of another node'
         node.get_logger().warning(f'{problem} ({where}?), ignored')
