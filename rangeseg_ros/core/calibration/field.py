@@ -134,4 +134,5 @@ def residuals(
 def _plane_inverses(seen: Sightings, weight: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverses (P, 3, 3) of the planes' normal matrices."""
     products = weight[:, None, None] * seen.ray[:, :, None] * seen.ray[:, None]
-    return np.linalg.inv(np.add.reduceat(products, seen.start[:-1]) + _RIDGE * np.eye(3))
+    sums = np.add.reduceat(products, seen.start[:-1]) + _RIDGE * np.eye(3)
+    return np.asarray(np.linalg.inv(sums), np.float64)

@@ -97,7 +97,7 @@ class Fits(NamedTuple):
 
     def inverses(self) -> NDArray[np.float64]:
         """Inverses (M + 1, 3, 3) of the sums of w r r^T; zeros where there is no plane."""
-        known = self.theta.any(axis=1)
+        known: NDArray[np.bool_] = np.asarray(self.theta.any(axis=1))
         *entries, determinant = cofactors(*self.total[:, :6].T)
         inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
         inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
