@@ -167,7 +167,8 @@ def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     # A report from now on: the tests before may have dropped frames.
     bench.spin(1.5)
     before = dropped(bench.status(lambda status: True))
-    slow = {'method': 'normals', 'exact': True}
+    # For two seconds, so that a report, which comes every second, says it.
+    slow = {'method': 'normals', 'exact': True, 'direction_count': 1249}
     assert bench.set_parameters(atomically=True, **slow).successful
     bench.in_use()
     images = [bench.image() for _ in range(5)]
