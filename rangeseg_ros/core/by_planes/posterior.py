@@ -24,7 +24,7 @@ from rangeseg_ros.core.fitting.region_sums import (
     WEIGHT,
     fit_sums,
 )
-from rangeseg_ros.core.fitting.uncertainty import is_empty, level_of
+from rangeseg_ros.core.fitting.uncertainty import level_of
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -119,8 +119,6 @@ def _residuals(
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
     half = max(box[2] - box[0], box[3] - box[1]) / 2
     for cell in cells:
-        if is_empty(cell):
-            continue
         count, level = cell[COUNT], level_of(cell, theta)
         variance = random_variance(sensor, level**2)
         # Weights of a cloud are not those of its errors.

@@ -209,12 +209,6 @@ def add_common_errors(
 
 
 @njit(cache=True)
-def is_empty(cell: NDArray[np.float64]) -> bool:
-    """Whether no pixel is in a cell, or none that weighs anything."""
-    return cell[COUNT] == 0 or cell[WEIGHT] <= 0
-
-
-@njit(cache=True)
 def level_of(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
     """Inverse range of a plane at the middle of a cell."""
     total = 0.0
