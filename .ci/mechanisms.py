@@ -56,8 +56,8 @@ def _sensor(**fields: Callable[[Any, Any], float]) -> dict[str, Any]:
     """The measured sensor with fields that follow from it and from the stated one."""
 
     def changed(original: Any) -> Any:
-        def measured(image: Any, blocks: Any, stated: Any) -> Any:
-            found = original(image, blocks, stated)
+        def measured(image: Any, blocks: Any, stated: Any, quanta: Any) -> Any:
+            found = original(image, blocks, stated, quanta)
             return found._replace(**{name: new(found, stated) for name, new in fields.items()})
 
         return measured
@@ -74,9 +74,7 @@ def _zero(*names: str) -> dict[str, Any]:
 
 
 def _without_distortion_length(original: Any) -> Any:
-    return lambda nodes, block, sensor: original(
-        nodes, block, sensor._replace(distortion_length=0.0)
-    )
+    return lambda nodes, sensor: original(nodes, sensor._replace(distortion_length=0.0))
 
 
 def _near_height_zero(_: Any) -> Any:
@@ -92,8 +90,8 @@ _CORRELATION = 'fitting/noise.py:_random'
 _TURNING = 'fitting/error_law.py:fit_turning'
 _NOISE = ('noise', 'error_law', 'quantisation')
 _NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
-# Costs of borders that let nothing merge by the energy.
-_NO_BORDER = _given(4, -1e12)
+# Cost of a border that lets nothing merge by the energy.
+_NO_BORDER = -1e12
 
 # fmt: off
 MECHANISMS = (
@@ -110,7 +108,7 @@ MECHANISMS = (
     Mechanism('noise is correlated', f'{_CORRELATION} sensing/sensor.py:correlated_residuals',
               _sensor(white=lambda *_: 1.0, correlation=lambda *_: 0.0)),
     Mechanism('quantisation found', 'fitting/quantisation.py',
-              {'fitting.noise.quantisation': _returning((0.0, 0.0))}),
+              {'segmenter.quantisation': _returning((0.0, 0.0))}),
     Mechanism('noise of directions', _TURNING, _zero('column_noise', 'row_noise')),
     Mechanism('scanners that turn', _TURNING,
               {'fitting.noise.fit_turning':
@@ -136,8 +134,8 @@ MECHANISMS = (
               'by_planes/patches.py by_planes/surfaces.py:Patches,_patches,_put_together',
               {'by_planes.method.Patches.of': _without_distortion_length}),
     Mechanism('parts merge by the energy', 'by_planes/surfaces.py:_apart',
-              {'by_planes.method.join_surfaces': _NO_BORDER,
-               'by_planes.method.unite_regions': _NO_BORDER}),
+              {'by_planes.method.join_surfaces': _given(3, _NO_BORDER),
+               'by_planes.method.unite_regions': _given(2, _NO_BORDER)}),
     Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
               {'by_planes.method.unite_regions': _unchanged}),
     Mechanism('planes shifted by the distortion', 'by_planes/shifts.py',
@@ -151,7 +149,15 @@ MECHANISMS = (
               {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
-    Mechanism('every pixel, not every fourth', 'runtime/work.py', {'work_budget': 0.9}),
+    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'runtime/work.py', {'work_budget': 0.9}),
+    Mechanism('bins, not pixels', 'sensing/binning.py',
+              {'segmenter.bin_side': _returning(1)}),
+    Mechanism('bins of one surface', 'sensing/binning.py:_average',
+              {'sensing.binning.Bins.of_one_surface': lambda _: lambda bins, steps: bins.means}),
+    Mechanism('borders of pixels, not of bins', 'by_planes/borders.py',
+              {'segmenter.with_sharp_borders': lambda _: lambda regions, surfaces, models, image,
+               side, *rest: regions.repeat(side, 0).repeat(side, 1)[
+                   : image.shape[0], : image.shape[1]] * image.valid}),
     Mechanism('thin regions are noise', 'regions.py:_thin,merge', {'noise_regions': 'leave'}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.grid import Grid, View
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -26,16 +26,19 @@ def grid(height, width, seed=0):
     return inverse.astype(np.float32), rays, edges
 
 
+def nodes_of(inverse, rays, edges, **sensor):
+    """Blocks of 2 x 2 pixels that surfaces are grown from."""
+    image, model = RangeImage(rays, inverse), SensorModel.from_config(Config(**sensor))
+    return Nodes.of(View(image, image, Blocks.of(image), edges, model, 1, 0.0, True))
+
+
 def whole(inverse, edges):
-    """Blocks of 4 pixels that surfaces are grown from."""
-    rays = grid(*inverse.shape)[1]
-    blocks = Blocks.of(RangeImage(rays, inverse))
-    nodes = Nodes.of(inverse, edges, blocks, SensorModel.from_config(Config()), 4)
-    return nodes.moments[..., COUNT] > 0
+    """Whether surfaces are grown from the blocks."""
+    return nodes_of(inverse, grid(*inverse.shape)[1], edges).moments[..., COUNT] > 0
 
 
 def test_blocks_are_sums_over_their_pixels():
-    inverse, rays, edges = grid(12, 14)
+    inverse, rays, _ = grid(12, 14)
     blocks = Blocks.of(RangeImage(rays, inverse)).moments
     assert blocks.shape == (3, 4, SIZE)
     part = slice(4, 8), slice(8, 12)
@@ -44,7 +47,6 @@ def test_blocks_are_sums_over_their_pixels():
     np.testing.assert_allclose(blocks[1, 2], expected, rtol=1e-12)
     assert (blocks[:, :3, COUNT] == 16).all()
     assert (blocks[:, 3, COUNT] == 8).all(), 'half a block at the border'
-    assert not whole(inverse, edges)[:, 3].any()
 
 
 @pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3)])
@@ -79,53 +81,45 @@ def test_blocks_of_any_size_add_up(shape, size):
         np.testing.assert_allclose(whole.moments[i, j], parts.sum(axis=0), rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('shape', 'size'), [((120, 160), 2), ((240, 320), 3), ((480, 640), 4), ((720, 1280), 8)]
-)
-def test_larger_images_have_larger_blocks(shape, size):
-    assert block_size(shape) == size
-
-
 def test_blocks_that_jumps_cross_are_left_out():
     """Only those: an edge on the border of two blocks, or beside a hole, crosses neither."""
-    inverse, _, edges = grid(12, 20)
+    inverse, _, edges = grid(6, 10)
     horizontal, vertical = edges
-    horizontal[1, 1] = 0  # inside block (0, 0)
-    vertical[6, 9] = 0  # inside block (1, 2)
-    horizontal[9, 7] = 0  # between blocks (2, 1) and (2, 2)
-    vertical[3, 14] = 0  # between blocks (0, 3) and (1, 3)
-    inverse[1, 17] = 0
-    horizontal[1, 16:18] = 0
-    vertical[0:2, 17] = 0
+    horizontal[1, 0] = 0  # inside block (0, 0)
+    vertical[4, 5] = 0  # inside block (2, 2)
+    horizontal[2, 3] = 0  # between blocks (1, 1) and (1, 2)
+    vertical[1, 6] = 0  # between blocks (0, 3) and (1, 3)
+    inverse[0, 9] = 0
+    horizontal[0, 8] = vertical[0, 9] = 0
     expected = np.ones((3, 5), bool)
-    expected[0, 0] = expected[1, 2] = False
+    expected[0, 0] = expected[2, 2] = False
     np.testing.assert_array_equal(whole(inverse, Grid(horizontal, vertical)), expected)
 
 
-@pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
-def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
-    """30 % of 16 pixels are 4.8."""
-    inverse, _, edges = grid(4, 4)
+@pytest.mark.parametrize(('missing', 'kept'), [(1, True), (2, False), (4, False)])
+def test_blocks_of_too_few_measurements_are_left_out(missing, kept):
+    """Three points determine a plane."""
+    inverse, _, edges = grid(2, 2)
     inverse.ravel()[:missing] = 0
     assert whole(inverse, edges)[0, 0] == kept
 
 
 @pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
-def test_blocks_touch_along_half_of_their_border(shape):
+def test_blocks_touch_where_an_edge_joins_them(shape):
     height, width = shape
     random = np.random.default_rng(sum(shape))
     horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
     vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
     inverse, rays, _ = grid(height, width)
-    blocks, sensor = Blocks.of(RangeImage(rays, inverse)), SensorModel.from_config(Config())
-    nodes = Nodes.of(inverse, Grid(horizontal, vertical), blocks, sensor, 4)
+    nodes = nodes_of(inverse, rays, Grid(horizontal, vertical))
     right, below = nodes.right, nodes.below
-    rows, columns = -(-height // 4), -(-width // 4)
+    rows, columns = -(-height // 2), -(-width // 2)
     assert right.shape == (rows, columns - 1) and below.shape == (rows - 1, columns)
     for i, j in np.ndindex(right.shape):
-        assert right[i, j] == (horizontal[4 * i : 4 * i + 4, 4 * j + 3].sum() >= 2)
+        assert right[i, j] == horizontal[2 * i : 2 * i + 2, 2 * j + 1].any()
     for i, j in np.ndindex(below.shape):
-        assert below[i, j] == (vertical[4 * i + 3, 4 * j : 4 * j + 4].sum() >= 2)
+        assert below[i, j] == vertical[2 * i + 1, 2 * j : 2 * j + 2].any()
+    assert not (nodes.moments[..., COUNT] > 0)[:, width // 2 :].any(), 'half a block'
 
 
 def test_slopes_and_residuals_are_those_of_the_planes():
@@ -155,15 +149,12 @@ def test_an_exact_plane_leaves_no_more_than_float32_rounds(theta):
 
 def test_weights_count_in_variances_of_the_sensor():
     inverse, rays, edges = grid(80, 80, seed=4)
-    sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
-    plain = Blocks.of(RangeImage(rays, inverse))
-    flat = np.zeros(plain.squared.shape)
-    facing = plain._replace(across=flat, down=flat)
-    nodes = Nodes.of(inverse, edges, facing, sensor, 4)
+    nodes = nodes_of(inverse, rays, edges, noise=0.002, distortion=0.004, pixel_noise=0.0)
+    plain = Blocks.of(RangeImage(rays, inverse), 2)
     theta, residual = fit_all(nodes.moments.reshape(-1, SIZE))
     unweighted, _ = fit_all(plain.moments.reshape(-1, SIZE))
-    np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)
-    # Chi-squared of 16 - 3 degrees of freedom each; 400 blocks: 2 % of standard error.
-    assert residual.mean() == pytest.approx(13, rel=0.08)
-    np.testing.assert_allclose(nodes.residual.ravel(), residual, rtol=1e-3)
-    np.testing.assert_allclose(nodes.moments[..., RATIO], 16 * 4.0, rtol=1e-5)
+    np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-7)
+    # Chi-squared of 4 - 3 degrees of freedom each; 1600 blocks: 3.5 % of standard error.
+    assert residual.mean() == pytest.approx(1, rel=0.12)
+    np.testing.assert_allclose(nodes.residual.ravel(), residual, rtol=1e-3, atol=1e-6)
+    np.testing.assert_allclose(nodes.moments[..., RATIO], 4 * 4.0, rtol=1e-5)

@@ -6,9 +6,10 @@ import pytest
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.binning import pixel_area
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.grid import View, weights
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
 from rangeseg_ros.core.sensing.moments import fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -32,12 +33,11 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     inverse = inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = weights(image, plane_deviation(image, 0.0065))
-    model = SensorModel.from_config(Config(**sensor))
-    blocks = Blocks.of(image)
-    blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
-    nodes = Nodes.of(image.inverse, edges, blocks, model, 4)
-    patches, rays = Patches.of(nodes, 4, model), image.rays
-    return join_surfaces(patches, nodes, 4, model, SMOOTHNESS, rays, least)
+    model = SensorModel.from_config(Config(pixel_noise=0.0, **sensor))
+    area = pixel_area(image.rays)
+    view = View(image, image, Blocks.of(image), edges, model, least, area, True)
+    nodes = Nodes.of(view)
+    return join_surfaces(Patches.of(nodes, model), nodes, view, SMOOTHNESS)
 
 
 def covered(labels, label):
@@ -53,7 +53,7 @@ def covered(labels, label):
 @pytest.mark.parametrize('noise', [0.0, NOISE])
 def test_a_plane_is_one_surface(noise):
     labels, moments = grown(plane(WALL), noise)
-    assert labels.shape == (30, 40) and covered(labels, 1) > 0.95
+    assert labels.shape == (60, 80) and covered(labels, 1) > 0.95
     assert moments.shape == (2, 13)
     assert not moments[0].any()
     np.testing.assert_allclose(fit_all(moments)[0][1], WALL, atol=3e-4)
@@ -68,10 +68,10 @@ def test_planes_that_meet_at_a_crease_are_two_surfaces(turn):
     left_side = np.arange(CAMERA.width) < column
     labels, moments = grown(np.where(left_side, plane(WALL), plane(right)))
     assert len(moments) == 3
-    middle = column // 4
-    left, other = labels[:, :middle].max(), labels[:, middle + 2 :].max()
-    assert covered(labels[:, : middle - 2], left) > 0.9
-    assert covered(labels[:, middle + 2 :], other) > 0.9
+    middle = column // 2
+    left, other = labels[:, :middle].max(), labels[:, middle + 4 :].max()
+    assert covered(labels[:, : middle - 4], left) > 0.9
+    assert covered(labels[:, middle + 4 :], other) > 0.9
     planes = fit_all(moments)[0]
     np.testing.assert_allclose(planes[left], WALL, atol=3e-3)
     np.testing.assert_allclose(planes[other], right, atol=5e-3)
@@ -83,16 +83,16 @@ def test_parallel_planes_behind_each_other_are_two_surfaces(step):
         np.where(ROWS >= 60, plane(WALL + np.array([0, 0, step])), plane(WALL))
     )
     assert len(moments) == 3
-    upper, lower = labels[:14].max(), labels[16:].max()
+    upper, lower = labels[:28].max(), labels[32:].max()
     assert upper != lower
-    assert covered(labels[:14], upper) > 0.9 and covered(labels[16:], lower) > 0.9
+    assert covered(labels[:28], upper) > 0.9 and covered(labels[32:], lower) > 0.9
 
 
 def test_parts_that_do_not_touch_are_surfaces_of_their_own():
     """A pillar hides a stripe of one wall."""
     pillar = (COLUMNS >= 70) & (COLUMNS < 90)
     labels, moments = grown(np.where(pillar, plane([0, 0, 1.0]), plane(WALL)))
-    left, front, right = labels[15, [0, 20, 39]]
+    left, front, right = labels[30, [0, 40, 79]]
     assert len({left, front, right, 0}) == 4 and len(moments) == 4
 
 
@@ -101,7 +101,7 @@ def test_surfaces_below_the_least_are_left_out():
     inverse = np.where(card, plane([0, 0, 1.0]), plane(WALL))
     assert len(grown(inverse)[1]) == 3
     labels, moments = grown(inverse, least=401)
-    assert len(moments) == 2 and not labels[15, 20]
+    assert len(moments) == 2 and not labels[30, 40]
 
 
 def distorted(strength=1.0):
@@ -137,8 +137,8 @@ def test_clutter_is_no_surface():
     random = np.random.default_rng(5)
     inverse = plane(WALL) + clutter * random.normal(0, 20 * QUANTUM, CAMERA.shape)
     labels, _ = grown(inverse)
-    assert not labels[11:19].any()
-    assert (labels[:9] > 0).mean() > 0.9 and (labels[21:] > 0).mean() > 0.9
+    assert not labels[22:38].any()
+    assert (labels[:18] > 0).mean() > 0.9 and (labels[42:] > 0).mean() > 0.9
 
 
 @pytest.mark.parametrize('seed', range(4))

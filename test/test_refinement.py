@@ -15,8 +15,9 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.moves import Labelling
 from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
+from rangeseg_ros.core.sensing.binning import pixel_area
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.grid import Grid, weights
+from rangeseg_ros.core.sensing.grid import Grid, View, weights
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -25,7 +26,7 @@ from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 NOISE = 0.002
-BLOCK = 4
+BLOCK = 2
 LAMBDA = Config().plane_smoothness
 SENSOR = SensorModel.from_config(Config(noise=NOISE, distortion=0.003))
 
@@ -52,7 +53,7 @@ def random_case(seed, height, width, count=3):
     shift = random.normal(0, 0.004, area.sum()).astype(np.float32)
     models = Models(theta, half_precision, Shifts(box, np.cumsum(area) - area, shift))
     labels = np.where(image.valid, random.integers(0, count + 1, (height, width)), 0)
-    problem = Problem.of(image, SENSOR, edges, BLOCK, LAMBDA)
+    problem = Problem.of(image, SENSOR, edges, LAMBDA)
     # The rays are those of a pinhole camera, whether that is known or not.
     return problem._replace(pinhole=seed % 2 == 1), models, labels.astype(np.int32)
 
@@ -149,8 +150,7 @@ def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     white = SENSOR._replace(correlation=0.0)
     links, of_white = (
-        Problem.of(image, sensor, weights(image), BLOCK, LAMBDA).links
-        for sensor in (SENSOR, white)
+        Problem.of(image, sensor, weights(image), LAMBDA).links for sensor in (SENSOR, white)
     )
     assert SENSOR.patch > 2 and white.patch == 1
     np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
@@ -206,15 +206,12 @@ def test_expansions_in_larger_images_never_raise_the_energy(seed):
 def small_room(seed=900):
     frame = simulate_kinect(kinect_room(seed), kinect_camera(160, 120), seed=seed)
     image = RangeImage.from_depth(frame.depth, frame.camera)
-    sensor = SensorModel.from_config(Config())
+    sensor = SensorModel.from_config(Config(pixel_noise=0.0))
     edges = weights(image)
-    blocks = Blocks.of(image)
-    blocks = blocks._replace(across=np.zeros_like(blocks.across), down=np.zeros_like(blocks.down))
-    nodes = Nodes.of(image.inverse, edges, blocks, sensor, BLOCK)
-    found = join_surfaces(
-        Patches.of(nodes, BLOCK, sensor), nodes, BLOCK, sensor, LAMBDA, image.rays
-    )
-    problem = Problem.of(image, sensor, edges, BLOCK, LAMBDA)
+    view = View(image, image, Blocks.of(image), edges, sensor, 1, pixel_area(image.rays), True)
+    nodes = Nodes.of(view)
+    found = join_surfaces(Patches.of(nodes, sensor), nodes, view, LAMBDA)
+    problem = Problem.of(image, sensor, edges, LAMBDA)
     return problem, (found[0], nodes.moments, found[1]), sensor
 
 

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.error_law import Strata, fit_law
 from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -34,7 +35,7 @@ def three_planes():
 
 def sensor_of(inverse, prior=STATED, camera=CAMERA):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), camera)
-    return measured_sensor(image, Blocks.of(image), prior)
+    return measured_sensor(image, Blocks.of(image), prior, quantisation(image.inverse))
 
 
 def test_variance_is_the_sum_of_both_kinds():
@@ -214,7 +215,7 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
     image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
     blocks = Blocks.of(image)
-    sensor = measured_sensor(image, blocks, STATED)
+    sensor = measured_sensor(image, blocks, STATED, (0.0, 0.0))
     assert np.isfinite(sensor).all() and min(sensor) >= 0
     assert sensor.white <= 1
     steps = jump_steps(blocks, sensor)
@@ -231,7 +232,7 @@ def test_jumps_follow_the_noise():
     inverse = three_planes() + random.normal(0, 1e-5, CAMERA.shape)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     blocks = Blocks.of(image)
-    steps = jump_steps(blocks, measured_sensor(image, blocks, STATED))
+    steps = jump_steps(blocks, measured_sensor(image, blocks, STATED, (0.0, 0.0)))
     assert np.median(steps.windows) < 6e-4
 
 

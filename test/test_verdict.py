@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
-from rangeseg_ros.core.sensing.enlargement import interpolation, replication
+from rangeseg_ros.core.sensing.enlargement import enlargement, interpolation, replication
 from rangeseg_ros.core.sensing.verdict import filled_share, judge
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
@@ -104,8 +104,9 @@ def test_levels_of_exact_scenes_are_not_replication():
     for left, right, top, bottom in ((200, 440, 120, 360), (160, 480, 160, 320)):
         depth = np.full((480, 640), 2.1)
         depth[top:bottom, left:right] = 2.0
-        result = segment(depth, Camera.from_fov(640, 480, 57))
-        assert result.cells is None and result.verdict.ok
+        camera = Camera.from_fov(640, 480, 57)
+        assert enlargement(RangeImage.from_depth(depth, camera)) is None
+        assert segment(depth, camera).verdict.ok
 
 
 @pytest.mark.parametrize('sensor', SENSOR_NAMES)

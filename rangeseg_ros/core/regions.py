@@ -200,6 +200,15 @@ def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.in
     return framed.reshape(height + 2, row)[1:-1, 1:-1].copy()
 
 
+@njit(cache=True, nogil=True)
+def region_sizes(regions: NDArray[np.uint16], count: int) -> NDArray[np.intp]:
+    """Pixels (count,) of each region 0...count - 1."""
+    sizes = np.zeros(count, np.intp)
+    for region in regions.flat:
+        sizes[region] += 1
+    return sizes
+
+
 def drop_regions(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
     """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
     if not dropped.any():

@@ -19,6 +19,7 @@ from rangeseg_ros.core.ground.roles import Ramp, Tilt, ramps_of, tilt_of
 from rangeseg_ros.core.ground.stairs import Stairs, stairs_of
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
+from rangeseg_ros.core.regions import region_sizes
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.jump_edges import pixels_beside
@@ -78,7 +79,7 @@ class Segmentation:
     labelling : Labelling
         What the regions were made from.
     jumps : (horizontal, vertical) of bool or None
-        Edges of the grid that cross a jump; None where none were looked for.
+        Edges of the grid of `cells` that cross a jump; None where none were looked for.
     survey : Survey or Terrain
         How the ground is found, or what was found.
     upright : tuple of 3 float
@@ -86,12 +87,11 @@ class Segmentation:
     image : RangeImage or None
         What was segmented; None in a result that was pickled.
     cells : Cells or None
-        Squares of pixels of which one was looked at, when the image was enlarged, or the work
-        budget small; lengths of `sensor` are in such squares.
+        Squares of pixels that planes were found in; None for pixels.
     work_budget : float
         Share of the full work that the image was given: with the same, its labels are the same.
     curved_regions : array of uint16 or None
-        See `curved`, of the squares of `cells`; None where none were looked for.
+        See `curved`, of `cells`; None where none were looked for.
     identified : bool
         False where `sensor` was to be measured and the image says too little: it is as stated.
     """
@@ -173,6 +173,21 @@ class Segmentation:
         }
         return judge(self.image, self.labels, thetas, self.curved, self.identified)
 
+    def of_pixels(
+        self, labels: NDArray[np.uint16], image: RangeImage, cells: Cells
+    ) -> Segmentation:
+        """The result of the image whose `cells` it is of, with labels (H, W) of its pixels."""
+        counts = region_sizes(
+            labels, max((plane.label for plane in self.planes), default=0) + 1
+        ).tolist()
+        planes = [plane.named(count=counts[plane.label]) for plane in self.planes]
+        return replace(self, labels=labels, planes=planes, image=image, cells=cells)
+
+    @property
+    def side(self) -> int:
+        """Pixels along the side of the squares that planes were found in."""
+        return self.cells.factor if self.cells else 1
+
     def _at_full_size(self, array: NDArray[Any]) -> NDArray[Any]:
         """Values of all pixels."""
         return array if self.cells is None else self.cells.enlarged(array, self.labels.shape)
@@ -185,7 +200,7 @@ class Segmentation:
         if self.curved_regions is None:
             return np.zeros_like(self.labels)
         curved = self._at_full_size(self.curved_regions)
-        return curved if self.image is None else curved * self.image.valid
+        return curved * (self.labels == 0) * (True if self.image is None else self.image.valid)
 
     @cached_property
     def tilt(self) -> Tilt | None:
@@ -255,14 +270,14 @@ class Segmentation:
         """(H, W) 0 not measured or not known, 1 ground, 2 obstacle, 3 drop."""
         if self.ground is None:
             return np.zeros(self.labels.shape, np.uint8)
-        return self._at_full_size(self.ground.classes)
+        return self.ground.classes
 
     @property
     def height(self) -> NDArray[np.float32]:
         """(H, W) metres along up above the ground; NaN where that is not known."""
         if self.ground is None:
             return np.full(self.labels.shape, np.nan, np.float32)
-        return self._at_full_size(self.ground.height)
+        return self.ground.height
 
     @cached_property
     def energy(self) -> float:

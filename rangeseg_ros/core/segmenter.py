@@ -9,18 +9,22 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
+from rangeseg_ros.core.by_planes.borders import with_sharp_borders
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import load_lazily, with_kernels
 from rangeseg_ros.core.runtime.memory import keep_freed_memory
-from rangeseg_ros.core.runtime.work import Stopwatch, step_within
-from rangeseg_ros.core.segmentation import Labelling, Segmentation
+from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.runtime.work import Stopwatch
+from rangeseg_ros.core.segmentation import Segmentation
+from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
@@ -68,7 +72,7 @@ class Segmenter:
         return with_kernels(lambda: self._segment(image), self.config, image.camera is None)
 
     def _segment(self, image: RangeImage) -> Segmentation:
-        config, step = self.config, step_within(self.config.work_budget)
+        config = self.config
         if config.distortion_map and not image.corrected:
             raise RangeImageError(
                 'distortion_map is not subtracted yet: segment corrected(image, config)'
@@ -76,97 +80,84 @@ class Segmenter:
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         cells = enlargement(image)
-        if cells is None and step > 1:
-            cells, config = Cells(step, 0, 0), _for_every(step, config)
         if cells is None:
-            return self._find_planes(image, config)
-        result = self._find_planes(cells.reduced(image), config)
+            result = self._find_planes(image)
+            return replace(result, survey=Survey.of(image, result.sensor, config))
+        result = self._find_planes(cells.reduced(image))
+        survey = replace(Survey.of(image, result.sensor, config), cells=cells)
         labels = cells.enlarged(result.labels, image.shape) * image.valid
-        counts = np.bincount(labels.ravel(), minlength=len(result.planes) + 1).tolist()
-        planes = [plane.named(count=counts[plane.label]) for plane in result.planes]
-        return replace(result, labels=labels, planes=planes, image=image, cells=cells)
+        squares = cells._replace(factor=cells.factor * result.side)
+        sensor = result.sensor.every(1 / cells.factor)
+        return replace(result.of_pixels(labels, image, squares), survey=survey, sensor=sensor)
 
-    def _find_planes(self, image: RangeImage, config: Config) -> Segmentation:
+    def _find_planes(self, image: RangeImage) -> Segmentation:
+        """Planes of the bins of an image, and labels of its pixels."""
+        config, watch = self.config, Stopwatch()
         if config.dithering > 0:
             image = image.dithered(config.dithering, config.seed)
-        watch = Stopwatch()
-        view, jumps = _preprocessed(image, config, watch)
-        labelling: Labelling
-        curved: NDArray[np.uint16] | None
+        # Directions are told from pixels.
+        side = bin_side(image.shape, config.work_budget) if config.method == 'planes' else 1
+        view, sensor, jumps = _preprocessed(image, config, side, watch)
+        labelling: by_planes.Labelling | by_normals.Labelling
+        curved: NDArray[np.uint16] | None = None
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
             regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
-            regions, curved, probability, fits = by_planes.flat_regions(
-                regions,
-                view,
-                config.plane_smoothness,
-                config.plane_probability,
-                config.plane_prior,
-            )
-            watch.lap('regions')
+            regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
         else:
-            regions, labelling = self._by_normals(view, config, watch)
-            curved = None
+            labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
+            found, valid = labelling.labels, view.whole.valid
+            regions = plane_regions(found, valid, view.grid, config.noise_regions, view.least)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
-            stated = SensorModel.from_config(config, view.image.shape)
+            stated = SensorModel.from_config(config, image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
             probability = plane_probabilities(fits, config.plane_prior)
+        watch.lap('regions')
         planes = describe_regions(regions, view.whole, fits, probability)
         # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
         # or so steep that they have no end.
         kept = np.zeros(len(fits.theta), np.uint16)
         kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
-        labels = relabel(regions, kept) * image.valid
+        labels = relabel(regions, kept) * view.image.valid
         watch.lap('planes')
-        reason = _reason(image, planes)
-        survey = Survey.of(image, view.sensor, config)
-        upright = config.role_tolerance, config.role_area, config.ground_slope
-        others = jumps, survey, upright, config.work_budget
-        return Segmentation(
+        result = Segmentation(
             labels,
             planes,
             watch.laps,
-            reason,
-            view.sensor,
+            _reason(image, planes),
+            sensor,
             labelling,
-            *others,
-            image,
+            jumps,
+            upright=(config.role_tolerance, config.role_area, config.ground_slope),
+            work_budget=config.work_budget,
+            image=view.image,
             curved_regions=curved,
             identified=view.identified,
         )
-
-    def _by_normals(
-        self, view: View, config: Config, watch: Stopwatch
-    ) -> tuple[NDArray[np.uint16], Labelling]:
-        """Regions by discretised normals as labels, and the labelling they are made from."""
-        image, grid = view.whole, view.grid
-        labelling = by_normals.segment(image, grid, config, watch.lap)
-        valid, least = image.valid, view.least
-        regions = plane_regions(labelling.labels, valid, grid, config.noise_regions, least)
-        watch.lap('regions')
-        return regions, labelling
-
-
-def _for_every(step: int, config: Config) -> Config:
-    """Parameters for images of every `step`-th row and column: lengths, areas are in pixels."""
-    return replace(
-        config,
-        min_pixels=-(-config.min_pixels // step**2),
-        noise_correlation=config.noise_correlation / step,
-        distortion_length=config.distortion_length / step,
-        pixel_noise=config.pixel_noise / step,
-    )
+        if side == 1 or isinstance(labelling, by_normals.Labelling):
+            return result
+        surfaces, models = labelling.labels, labelling.models
+        prior = config.plane_smoothness * sensor.patch
+        labels = with_sharp_borders(labels, surfaces, models, image, side, sensor, prior)
+        watch.lap('borders')
+        return result.of_pixels(labels, image, Cells(side, 0, 0))
 
 
 def _preprocessed(
-    image: RangeImage, config: Config, watch: Stopwatch
-) -> tuple[View, GridEdges | None]:
-    """What is known of an image before planes are looked for, and its jump edges."""
-    blocks = Blocks.of(image)
-    sensor = stated = SensorModel.from_config(config, image.shape)
+    image: RangeImage, config: Config, side: int, watch: Stopwatch
+) -> tuple[View, SensorModel, GridEdges | None]:
+    """What is known of an image's bins before planes are looked for.
+
+    And the errors of its pixels, and the jump edges between bins.
+    """
+    quanta = submit(quantisation, image.inverse)
+    least = -(-least_pixels(config.min_pixels, image.shape) // side**2)
+    stated = SensorModel.from_config(config, image.shape).binned(side)
+    bins = Bins.of(image, side)
+    blocks, sensor = Blocks.of(bins.means), stated
     if config.sensor_model == 'measured':
-        sensor = measured_sensor(image, blocks, stated)
+        sensor = measured_sensor(bins.means, blocks, stated, quanta.result())
     identified = config.sensor_model != 'measured' or sensor is not stated
     watch.lap('noise')
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on
@@ -178,13 +169,17 @@ def _preprocessed(
     if config.edge_step > 0:
         given = np.full_like(steps.windows, config.edge_step)
         steps = steps._replace(windows=given, pixels=given)
+    excess = bins.noise_of_pixels(sensor)
+    if side > 1:
+        image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
+        blocks = Blocks.of(image)
     # Planes are fitted to what was measured; where they end is found with small holes bridged.
     whole = bridge_holes(image, steps.windows, steps.slopes)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = weights(whole, jumps, config.weighting)
     watch.lap('edges')
-    least = least_pixels(config.min_pixels, image.shape)
-    return View(image, whole, blocks, grid, sensor, least, identified), jumps
+    view = View(image, whole, blocks, grid, sensor, least, bins.area, identified)
+    return view, sensor.of_pixels(side, excess), jumps
 
 
 def _reason(image: RangeImage, planes: list[Plane]) -> str:

@@ -1,4 +1,4 @@
-"""Square blocks of pixels: what surfaces are grown from, and what tells the noise."""
+"""The blocks of 2 x 2 pixels that surfaces are grown from."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.blocks import Blocks
+from rangeseg_ros.core.sensing.grid import View
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SLOPE
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -20,8 +19,10 @@ from rangeseg_ros.core.sensing.sensor import (
     tilt_variance,
 )
 
-# Share of a block that must have been measured.
-_MEASURED = 0.7
+NODE = 2
+"""Rows and columns of a block: the least that holds a plane."""
+# Measurements of a block, those of bridged holes included, and without these: a plane has three.
+_LEAST = 3
 
 
 class Nodes(NamedTuple):
@@ -31,13 +32,11 @@ class Nodes(NamedTuple):
     ----------
     moments : (rows, columns, 13) float64
         With weights according to the sensor, and the ratios of its variances. Zeros for blocks to
-        leave out: that a jump crosses or that lack measurements in over 30 %, bridged holes being
-        measured, or in over 75 % without these.
+        leave out: that a jump crosses or that lack two measurements.
     residual : (rows, columns) float64
         What the plane through each leaves, with these weights.
     right, below : (rows, columns-1), (rows-1, columns) bool
-        Whether a block touches its right, its lower neighbour: along half of their border at
-        least.
+        Whether a block touches its right, its lower neighbour.
     """
 
     moments: NDArray[np.float64]
@@ -46,49 +45,15 @@ class Nodes(NamedTuple):
     below: NDArray[np.bool_]
 
     @classmethod
-    def of(
-        cls,
-        inverse: NDArray[np.float32],
-        grid: Grid,
-        blocks: Blocks,
-        sensor: SensorModel,
-        size: int,
-    ) -> Nodes:
-        """Those of an image.
-
-        Parameters
-        ----------
-        inverse : (H, W) float32
-            Holes bridged; 0 where nothing was measured.
-        grid : Grid
-            0 across jumps.
-        blocks : Blocks
-            Of the image.
-        sensor : SensorModel
-        size : int
-            Rows and columns of a block.
-        """
+    def of(cls, view: View) -> Nodes:
+        """Those of an image, holes bridged: a row of pixels alone determines no plane."""
+        blocks = Blocks.of(view.whole, NODE)
         rows, columns = blocks.squared.shape
         right = np.empty((rows, columns - 1), np.bool_)
         below = np.empty((rows - 1, columns), np.bool_)
-        moments = np.empty_like(blocks.moments)
-        nodes = cls(moments, np.empty((rows, columns)), right, below)
-        run_rows(_fill_in, rows, inverse, grid, blocks, sensor, size, nodes)
+        nodes = cls(np.zeros_like(blocks.moments), np.zeros((rows, columns)), right, below)
+        run_rows(_fill_in, rows, view.whole.inverse, *view.grid, blocks, view.sensor, nodes)
         return nodes
-
-
-def block_size(shape: tuple[int, int]) -> int:
-    """Rows and columns of the blocks: 2 pixels below an eighth of VGA, 3 below half of it, 8 above
-    twice VGA, and 4 between.
-
-    Blocks of 4 pixels find faces 10 pixels wide; a larger image shows the same face larger, a
-    smaller one smaller.
-    """
-    if shape[0] * shape[1] < VGA / 8:
-        return 2
-    if shape[0] * shape[1] < VGA / 2:
-        return 3
-    return 4 if shape[0] * shape[1] <= 2 * VGA else 8
 
 
 @njit(cache=True, nogil=True)
@@ -96,121 +61,48 @@ def _fill_in(
     first: int,
     after: int,
     inverse: NDArray[np.float32],
-    grid: Grid,
+    right: NDArray[np.float32],
+    below: NDArray[np.float32],
     blocks: Blocks,
     sensor: SensorModel,
-    size: int,
     nodes: Nodes,
 ) -> None:
     """Fill in some rows of nodes."""
-    count = nodes.residual.shape[1]
-    # Zeros beyond the image, and bytes, as the compiler takes many of these at a time.
-    columns, whole = np.empty((6, count * size), np.uint8), np.empty(count, np.bool_)
+    height, width = inverse.shape
     for bi in range(first, after):
-        _look(bi * size, min((bi + 1) * size, len(inverse)), inverse, grid, columns)
-        # Nearly always of a size that the compiler knows.
-        if size == BLOCK:
-            _link(bi, columns, BLOCK, whole, nodes)
-        else:
-            _link(bi, columns, size, whole, nodes)
-        _weigh(bi, blocks, whole, sensor, max(size * size // 4, 3), nodes)
-
-
-@njit(cache=True, nogil=True)
-def _look(
-    top: int,
-    bottom: int,
-    inverse: NDArray[np.float32],
-    grid: Grid,
-    columns: NDArray[np.uint8],
-) -> None:
-    """Look at the pixels of a row of blocks.
-
-    `columns` (6, W or more) receives for every column how many were measured, how many are
-    connected with the next one to the right and whether a jump parts one from it, and the same of
-    those below as far as they are in these rows; last, whether the one in the last row is
-    connected with that below.
-    """
-    columns[:] = 0
-    for i in range(top, bottom):
-        here = inverse[i]
-        for j in range(len(here)):
-            columns[0, j] += here[j] > 0
-        _look_beside(here, here[1:], grid.right[i], columns[1], columns[2])
-        if i + 1 < bottom:
-            _look_beside(here, inverse[i + 1], grid.below[i], columns[3], columns[4])
-    if bottom < len(inverse):
-        below = grid.below[bottom - 1]
-        for j in range(len(below)):
-            columns[5, j] = below[j] > 0
-
-
-@njit(cache=True, nogil=True)
-def _look_beside(
-    here: NDArray[np.float32],
-    beside: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    joined: NDArray[np.uint8],
-    parted: NDArray[np.uint8],
-) -> None:
-    """Count edges of a row that connect pixels, and mark those that jumps cross."""
-    for j in range(len(weight)):
-        joined[j] += weight[j] > 0
-        parted[j] |= (here[j] > 0) & (beside[j] > 0) & (weight[j] == 0)
+        for bj in range(nodes.residual.shape[1]):
+            i, j = bi * NODE, bj * NODE
+            if j + NODE < width:
+                one = right[i, j + 1] > 0
+                nodes.right[bi, bj] = one | (right[min(i + 1, height - 1), j + 1] > 0)
+            if i + NODE < height:
+                one = below[i + 1, j] > 0
+                nodes.below[bi, bj] = one | (below[i + 1, min(j + 1, width - 1)] > 0)
+            if i + 1 < height and j + 1 < width:
+                crossed = _parted(inverse[i, j], inverse[i, j + 1], right[i, j])
+                crossed |= _parted(inverse[i + 1, j], inverse[i + 1, j + 1], right[i + 1, j])
+                crossed |= _parted(inverse[i, j], inverse[i + 1, j], below[i, j])
+                crossed |= _parted(inverse[i, j + 1], inverse[i + 1, j + 1], below[i, j + 1])
+                if not crossed and blocks.moments[bi, bj, COUNT] >= _LEAST:
+                    _weigh(bi, bj, blocks, sensor, nodes)
 
 
 @njit(cache=True, inline='always')
-def _link(
-    bi: int, columns: NDArray[np.uint8], size: int, whole: NDArray[np.bool_], nodes: Nodes
-) -> None:
-    """Link a row of blocks to their neighbours, and tell which are `whole`.
-
-    Those that no jump crosses and that were measured, bridged holes included.
-    """
-    measured, joined, across, down = columns[0], columns[1], columns[2], columns[4]
-    least = np.ceil(_MEASURED * size * size)
-    for bj in range(len(whole)):
-        count, crossed = 0, 0
-        for k in range(size):
-            count += measured[bj * size + k]
-            crossed |= down[bj * size + k]
-        for k in range(size - 1):
-            crossed |= across[bj * size + k]
-        whole[bj] = (crossed == 0) & (count >= least)
-    right, below = nodes.right[bi], nodes.below[bi : bi + 1]
-    for bj in range(len(right)):
-        right[bj] = 2 * joined[(bj + 1) * size - 1] >= size
-    for i in range(len(below)):
-        for bj in range(len(whole)):
-            touching = 0
-            for k in range(size):
-                touching += columns[5, bj * size + k]
-            below[i, bj] = 2 * touching >= size
+def _parted(here: float, beside: float, weight: float) -> bool:
+    """Whether a jump parts two pixels that were both measured."""
+    return (here > 0) & (beside > 0) & (weight == 0)
 
 
 @njit(cache=True, nogil=True)
-def _weigh(
-    i: int,
-    blocks: Blocks,
-    whole: NDArray[np.bool_],
-    sensor: SensorModel,
-    least: int,
-    nodes: Nodes,
-) -> None:
-    """Weigh the whole ones of a row of blocks, of at least so many measurements."""
-    for j in range(len(whole)):
-        count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
-        if not whole[j] or count < least:
-            nodes.moments[i, j] = 0
-            nodes.residual[i, j] = 0
-            continue
-        level = random_variance(sensor, squared)
-        tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
-        weight = 1 / (level * (1 + tilt))
-        for entry in range(COUNT):
-            nodes.moments[i, j, entry] = weight * blocks.moments[i, j, entry]
-        nodes.residual[i, j] = weight * blocks.residual[i, j]
-        nodes.moments[i, j, COUNT] = count
-        systematic = systematic_variance(sensor, squared)
-        nodes.moments[i, j, RATIO] = count * weight * systematic
-        nodes.moments[i, j, SLOPE] = count * tilt
+def _weigh(i: int, j: int, blocks: Blocks, sensor: SensorModel, nodes: Nodes) -> None:
+    """Weigh a block."""
+    count, squared = blocks.moments[i, j, COUNT], blocks.squared[i, j]
+    level = random_variance(sensor, squared)
+    tilt = tilt_variance(sensor, blocks.across[i, j], blocks.down[i, j]) / level
+    weight = 1 / (level * (1 + tilt))
+    for entry in range(COUNT):
+        nodes.moments[i, j, entry] = weight * blocks.moments[i, j, entry]
+    nodes.residual[i, j] = weight * blocks.residual[i, j]
+    nodes.moments[i, j, COUNT] = count
+    nodes.moments[i, j, RATIO] = count * weight * systematic_variance(sensor, squared)
+    nodes.moments[i, j, SLOPE] = count * tilt

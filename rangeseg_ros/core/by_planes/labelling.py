@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.by_planes.blocks import NODE
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,
@@ -17,13 +18,12 @@ from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import expand
 from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
-from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
-_BAND = BLOCK // 2
+_BAND = NODE
 # Blocks around a surface that shifts of its plane are known for.
-_DOMAIN = BLOCK
+_DOMAIN = 4
 
 
 def refine(
@@ -57,7 +57,7 @@ def refine(
     models = Models.of(moments, sensor.distortion_pixels)
     # Windows as wide as the distortion tell the shifts: where it changes, larger ones tell
     # another's.
-    around = int(sensor.distortion_length / problem.block - 1) // 2
+    around = int(sensor.distortion_length / NODE - 1) // 2
     local = shifts(surfaces, blocks, models.theta, _DOMAIN, around, sensor.agreement)
     models = models._replace(shifts=local)
     labels = np.empty(len(problem.inverse), np.int32)
@@ -86,7 +86,7 @@ def _label_block_row(
     lowest cost among those of the blocks around it. Expansions that begin with these have less to
     change than those that begin with no plane, and end with a lower energy.
     """
-    size, width = problem.block, problem.width
+    size, width = NODE, problem.width
     around = np.empty(9, np.int32)
     for bi in range(first, after):
         for bj in range(surfaces.shape[1]):

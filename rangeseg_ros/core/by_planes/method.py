@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import Nodes, block_size
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
@@ -16,7 +16,6 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.regions import drop_regions
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.grid import View
 
 
@@ -27,16 +26,18 @@ class Labelling:
     ----------
     labels : (H, W) int32
         0 = no plane.
+    models : Models
+        Of the other labels.
     """
 
     def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
         self.labels = labels
         self._problem = problem
-        self._models = models
+        self.models = models
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
-        return energy(self.labels.ravel(), self._problem, self._models)
+        return energy(self.labels.ravel(), self._problem, self.models)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""
@@ -53,22 +54,13 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
     lap : callable
         Told the name of every stage that ends.
     """
-    whole, blocks, grid, sensor = view.whole, view.blocks, view.grid, view.sensor
-    size = block_size(whole.shape)
-    if size == 2 * BLOCK:
-        blocks = blocks.merged(whole.rays, size)
-    elif size != BLOCK:
-        # With what was bridged: a row of three pixels alone determines no plane.
-        blocks = Blocks.of(whole, size)
-    nodes = Nodes.of(whole.inverse, grid, blocks, sensor, size)
+    whole, sensor = view.whole, view.sensor
+    nodes = Nodes.of(view)
     lap('blocks')
     smoothness = config.plane_smoothness
-    pending = submit(Problem.of, whole, sensor, grid, size, smoothness)
-    patches = Patches.of(nodes, size, sensor)
-    # Surfaces as large as regions: smaller ones are clutter.
-    surface, moments = join_surfaces(
-        patches, nodes, size, sensor, smoothness, whole.rays, view.least
-    )
+    pending = submit(Problem.of, whole, sensor, view.grid, smoothness)
+    patches = Patches.of(nodes, sensor)
+    surface, moments = join_surfaces(patches, nodes, view, smoothness)
     problem = pending.result()
     lap('surfaces')
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)
@@ -77,17 +69,16 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
 
 
 def flat_regions(
-    regions: NDArray[np.uint16], view: View, smoothness: float, least: float, prior: float
+    regions: NDArray[np.uint16], view: View, config: Config
 ) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.float64], Fits]:
-    """Regions (H, W) whose probability to be a plane is not below the `least`, and the others.
+    """Regions (H, W) whose probability to be a plane is `plane_probability` at least, and others.
 
-    Numbered anew, with the probabilities (M + 1,) and the fits of the first. `prior` is the share
-    of planes among regions.
+    Numbered anew, with the probabilities (M + 1,) and the fits of the first.
     """
-    regions = unite_regions(regions, view.whole, view.grid, view.sensor, smoothness)
+    regions = unite_regions(regions, view, config.plane_smoothness)
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
-    probability = plane_probabilities(fits, prior)
-    curved = probability < least
+    probability = plane_probabilities(fits, config.plane_prior)
+    curved = probability < config.plane_probability
     curved[0] = False
     kept = drop_regions(regions, curved), drop_regions(regions, ~curved)
     return *kept, probability[~curved], fits.without(curved)

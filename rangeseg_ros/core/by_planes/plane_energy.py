@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.by_planes.blocks import NODE
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.runtime.threads import map_halves
@@ -49,8 +50,6 @@ class Problem(NamedTuple):
         Cost of unlike labels across the edges to the right and down, see `link_costs`.
     width : int
         Columns of the image.
-    block : int
-        Rows and columns of the blocks that surfaces are grown from.
     """
 
     inverse: NDArray[np.float32]
@@ -59,7 +58,6 @@ class Problem(NamedTuple):
     weight: NDArray[np.float32]
     links: NDArray[np.float32]
     width: int
-    block: int
 
     @classmethod
     def of(
@@ -67,7 +65,6 @@ class Problem(NamedTuple):
         image: RangeImage,
         sensor: SensorModel,
         grid: Grid,
-        block: int,
         smoothness: float,
     ) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor.
@@ -79,7 +76,7 @@ class Problem(NamedTuple):
         weight = _weights(inverse, sensor)
         prior = link_costs(grid, smoothness * sensor.patch)
         width = image.shape[1]
-        return cls(inverse, rays, image.pinhole, weight, prior, width, block)
+        return cls(inverse, rays, image.pinhole, weight, prior, width)
 
 
 def pixel_weights(inverse: NDArray[np.float32], sensor: SensorModel) -> NDArray[np.float32]:
@@ -143,7 +140,7 @@ def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     if label == 0:
         return NO_PLANE
     # Unsigned and short, which divides in a fraction of the time.
-    place, width, block = np.uint32(p), np.uint32(problem.width), np.uint32(problem.block)
+    place, width, block = np.uint32(p), np.uint32(problem.width), np.uint32(NODE)
     i, j = place // width, place % width
     row, column, along = np.intp(i // block), np.intp(j // block), int(np.intp(j))
     plane = shifted_plane(label, shift_at(models.shifts, label, int(row), int(column)), models)

@@ -20,17 +20,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
 from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches
 from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
 from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.blocks import BLOCK
-from rangeseg_ros.core.sensing.grid import Grid
+from rangeseg_ros.core.sensing.grid import View
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, common_residual, fit_all
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share
 from rangeseg_ros.core.significance import chi2_quantile
 
@@ -70,27 +68,17 @@ class Expected(NamedTuple):
     bend: float
 
     @classmethod
-    def of(
-        cls, sensor: SensorModel, unit: int, smoothness: float, rays: NDArray[np.float32]
-    ) -> Expected:
-        """Of parts of an image with `rays`, their borders counted in units of so many pixels."""
+    def of(cls, view: View, unit: int, smoothness: float) -> Expected:
+        """Of parts of an image, their borders counted in units of so many pixels."""
+        sensor = view.sensor
         return cls(
             sensor.distortion_pixels,
             sensor.agreement,
             sensor.patch,
             float(unit),
             float(smoothness * sensor.patch * unit),
-            PLANE_BEND**2 * _pixel_area(rays),
+            PLANE_BEND**2 * view.area,
         )
-
-
-def _pixel_area(rays: NDArray[np.float32]) -> float:
-    """Median area of a pixel at inverse range 1 of an image with `rays` (H, W, 3), m^2."""
-    step = max(BLOCK, *(side // 16 for side in rays.shape[:2]))  # a few hundred pixels tell it
-    here = rays[::step, ::step].astype(np.float64)
-    across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
-    area = np.linalg.norm(np.cross(across, down), axis=2) / step**2
-    return float(np.median(area)) if area.size else 0.0
 
 
 class Patches(NamedTuple):
@@ -108,23 +96,13 @@ class Patches(NamedTuple):
     moments: NDArray[np.float64]
 
     @classmethod
-    def of(cls, nodes: Nodes, block: int, sensor: SensorModel) -> Patches:
-        """Patches of blocks.
-
-        Parameters
-        ----------
-        nodes : Nodes
-            (rows, columns).
-        block : int
-            Rows and columns of a block.
-        sensor : SensorModel
-            Its `agreement` and `distortion_pixels` are read.
-        """
+    def of(cls, nodes: Nodes, sensor: SensorModel) -> Patches:
+        """Patches of blocks (rows, columns)."""
         shape = nodes.residual.shape
         # No patch reaches over the middle, but neither does any reach across a large surface.
         # Not even in a small image is one smaller than four blocks.
-        largest = max(sensor.distortion_pixels, 4.0 * block**2)
-        smallest = float(_BLOCKS_OF_PATCH * block**2)
+        largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
+        smallest = float(_BLOCKS_OF_PATCH * NODE**2)
         halves = map_halves(_patches, shape[0], nodes, largest, smallest, sensor.agreement)
         labels, moments = _put_together(*halves[0], *halves[1])
         return cls(labels.reshape(shape), moments)
@@ -133,11 +111,8 @@ class Patches(NamedTuple):
 def join_surfaces(
     patches: Patches,
     nodes: Nodes,
-    block: int,
-    sensor: SensorModel,
+    view: View,
     smoothness: float,
-    rays: NDArray[np.float32],
-    least: int = 1,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Group blocks into planar surfaces.
 
@@ -147,16 +122,10 @@ def join_surfaces(
         Of the blocks.
     nodes : Nodes
         (rows, columns).
-    block : int
-        Rows and columns of a block.
-    sensor : SensorModel
-        Its `agreement`, `patch` and `distortion_pixels` are read.
+    view : View
+        Of the blocks. Surfaces are as large as its `least` plane: smaller ones are clutter.
     smoothness : float
         Of the energy's prior, see `Problem.of`.
-    rays : (H, W, 3) float32
-        Of the image.
-    least : int
-        Pixels of the smallest surface.
 
     Returns
     -------
@@ -165,12 +134,12 @@ def join_surfaces(
     moments : (K + 1, 13) float64
         Of the surfaces; zeros for 0.
     """
-    expected = Expected.of(sensor, block, smoothness, rays)
-    return _surfaces(patches, nodes.right, nodes.below, expected, float(least))
+    expected = Expected.of(view, NODE, smoothness)
+    return _surfaces(patches, nodes.right, nodes.below, expected, float(view.least))
 
 
 def unite_regions(
-    regions: NDArray[np.uint16], image: RangeImage, grid: Grid, sensor: SensorModel, prior: float
+    regions: NDArray[np.uint16], view: View, smoothness: float
 ) -> NDArray[np.uint16]:
     """Unite regions whose pixels touch, for the reasons for which patches are.
 
@@ -180,12 +149,10 @@ def unite_regions(
     ----------
     regions : (H, W) uint16
         0...M.
-    image : RangeImage
-        (H, W), holes bridged.
-    grid : Grid
-    sensor : SensorModel
-    prior : float
-        Of the energy, see `Problem.of`.
+    view : View
+        (H, W).
+    smoothness : float
+        Of the energy's prior, see `Problem.of`.
 
     Returns
     -------
@@ -193,10 +160,11 @@ def unite_regions(
         0...N.
     """
     count = int(regions.max(initial=0)) + 1
+    image, grid, sensor = view.whole, view.grid, view.sensor
     weight = pixel_weights(image.inverse, sensor)
     moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
     touching = grid.right > 0, grid.below > 0
-    expected = Expected.of(sensor, 1, prior, image.rays)
+    expected = Expected.of(view, 1, smoothness)
     roots = _roots(regions.astype(np.int32), *touching, moments, expected)
     pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
     return relabel(regions, by_falling_size(pixels)[roots])

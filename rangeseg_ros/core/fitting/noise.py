@@ -20,10 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, fit_turning, quantile
-from rangeseg_ros.core.fitting.quantisation import quantisation
-from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
-from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, correlated_residuals
@@ -50,7 +47,9 @@ _EXACT = 1e-4
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 
 
-def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> SensorModel:
+def measured_sensor(
+    image: RangeImage, blocks: Blocks, prior: SensorModel, quanta: tuple[float, float]
+) -> SensorModel:
     """The errors that an image shows.
 
     Parameters
@@ -60,24 +59,8 @@ def measured_sensor(image: RangeImage, blocks: Blocks, prior: SensorModel) -> Se
         Of the image.
     prior : SensorModel
         Taken as far as the image says too little.
-    """
-    quanta = submit(quantisation, image.inverse)
-    found = _measured(image, blocks, prior, quanta) or prior
-    few = image.inverse.size < _ENOUGH * (2 * BLOCK) ** 2
-    if found.white > 0.5 or found.correlation < 1 or few:
-        return found
-    # What is correlated over more than a pixel hides from blocks of four: every second pixel then.
-    reduced = Cells(2, 0, 0).reduced(image)
-    wider = _measured(reduced, Blocks.of(reduced), prior.every(2), quanta)
-    return wider.every(0.5) if wider else found
-
-
-def _measured(
-    image: RangeImage, blocks: Blocks, prior: SensorModel, quanta: Task[tuple[float, float]]
-) -> SensorModel | None:
-    """The errors that blocks of an image show; None where these are too few.
-
-    `quanta` are the steps that it is rounded to, see `quantisation`.
+    quanta : tuple of 2 float
+        Steps that it is rounded to, see `quantisation`.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
@@ -85,8 +68,8 @@ def _measured(
     count = coarse.moments[..., COUNT]
     used = np.flatnonzero(2 * count >= count.max())
     if len(used) < SAMPLES:
-        return None
-    quantum, range_quantum = quanta.result()
+        return prior
+    quantum, range_quantum = quanta
     # Rounding errors spread evenly over a step.
     rounding = max(quantum / np.sqrt(12), _EXACT)
     range_rounding = range_quantum / np.sqrt(12)
@@ -106,7 +89,7 @@ def _measured(
         noise = fit_turning(strata, coarse, shown(strata), noise)
     found = _over_scales(image.rays, blocks, coarse, noise, least)
     if found is None:
-        return None
+        return prior
     within, between, filled, distortion = found
     total, white, width = _random(within, between, filled)
     # Directions that err one way are those of a scanner that turns, anew in every pixel, so that

@@ -11,6 +11,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.grid import GridOptions, GroundGrid, GroundMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
+from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -40,6 +41,8 @@ class Survey:
         Its name.
     cloud_resolution : float
         Side of the cubes of which clouds have a point, metres; 0 = all pixels.
+    cells : Cells or None
+        Of one measurement each, where the image was enlarged; the errors are theirs.
     """
 
     image: RangeImage
@@ -53,6 +56,7 @@ class Survey:
     pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     fixed_frame: str = ''
     cloud_resolution: float = 0.0
+    cells: Cells | None = None
 
     @classmethod
     def of(
@@ -90,7 +94,13 @@ class Survey:
             remembered = self.memory.recall_height(self.stamp)
             # A robot nods and a floor undulates, by less than an obstacle is high.
             known = (remembered, self.limits.least) if remembered else (0.0, 0.0)
-        found = terrain_of(self.image, self.sensor, self.up, known, self.limits)
+        image, cells = self.image, self.cells
+        if cells is not None:
+            image = cells.reduced(image)
+        found = terrain_of(image, self.sensor, self.up, known, self.limits)
+        if cells is not None:
+            pixels = [cells.enlarged(values, self.image.shape) for values in found[:2]]
+            found = found._replace(classes=pixels[0], height=pixels[1])
         if found.stand.found:
             self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found

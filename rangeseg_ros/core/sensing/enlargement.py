@@ -42,12 +42,16 @@ class Cells(NamedTuple):
         u = np.clip(np.arange(k // 2 - self.columns, width + k // 2, k), 0, width - 1)
         v, u = v[: -(-(height + self.rows) // k)], u[: -(-(width + self.columns) // k)]
         picked = np.ix_(v, u)
-        camera = _camera_of_cells(self, image.camera) if image.camera else None
+        camera = self.camera(image.camera) if image.camera else None
         rays = image.rays[picked] if camera is None else camera.rays
         # Like those of cameras, or every kernel that reads them is compiled twice.
         rays.flags.writeable = False
         body = None if image.body is None else image.body[picked]
         return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
+
+    def camera(self, camera: Camera) -> Camera:
+        """The camera that has a pixel for each cell."""
+        return _camera_of_cells(self, camera)
 
     def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
         """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""

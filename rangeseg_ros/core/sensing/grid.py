@@ -34,7 +34,7 @@ class Grid(NamedTuple):
 
 
 class View(NamedTuple):
-    """A range image, its blocks, neighbourhood and errors.
+    """A range image, or its bins, with blocks, neighbourhood and errors.
 
     Attributes
     ----------
@@ -50,6 +50,8 @@ class View(NamedTuple):
         Errors of the image.
     least : int
         Pixels of the smallest plane.
+    area : float
+        Of a pixel, see `pixel_area`.
     identified : bool
         False where the errors were to be measured and the image says too little.
     """
@@ -60,6 +62,7 @@ class View(NamedTuple):
     grid: Grid
     sensor: SensorModel
     least: int
+    area: float
     identified: bool
 
 

@@ -83,6 +83,36 @@ class SensorModel(NamedTuple):
             row_noise=self.row_noise / step,
         )
 
+    def binned(self, side: int) -> SensorModel:
+        """The model of the means of squares of so many pixels along the side."""
+        line = np.arange(side)
+        alike = np.zeros((side, side))
+        if self.correlation > 0:
+            alike = np.exp(-((line[:, None] - line) ** 2) / (4 * self.correlation**2))
+        white = self.white / side**2
+        left = white + (1 - self.white) * max(float(alike.mean()) ** 2, 1 / side**2)
+        return self.every(side)._replace(
+            noise=self.noise * left**0.5,
+            range_noise=self.range_noise * left**0.5,
+            white=white / left,
+            column_noise=self.column_noise * left**0.5 / side,
+            row_noise=self.row_noise * left**0.5 / side,
+        )
+
+    def of_pixels(self, side: int, excess: float) -> SensorModel:
+        """The model of pixels, of the means of whose squares this one is.
+
+        Their random variance is `excess` times that of the means, and what it is more is new in
+        every pixel.
+        """
+        return self.every(1 / side)._replace(
+            noise=self.noise * excess**0.5,
+            range_noise=self.range_noise * excess**0.5,
+            white=1 - (1 - self.white) / excess,
+            column_noise=self.column_noise * excess**0.5 * side,
+            row_noise=self.row_noise * excess**0.5 * side,
+        )
+
     def __str__(self) -> str:
         """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ...
 

@@ -1,0 +1,126 @@
+"""Means of squares of pixels, and borders between the planes that are found in them."""
+
+import numpy as np
+import pytest
+
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.binning import Bins, bin_side
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.simulation.fields import smooth_field
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+WALL = np.array([0.1, -0.05, 0.5])
+
+
+def image_of(inverse, camera=CAMERA):
+    return RangeImage(camera.rays, inverse.astype(np.float32), camera)
+
+
+@pytest.mark.parametrize(
+    ('shape', 'side'),
+    [((240, 320), 1), ((480, 640), 2), ((480, 848), 2), ((720, 1280), 3), ((1080, 1920), 5)],
+)
+def test_images_of_any_size_have_about_as_many_bins(shape, side):
+    assert bin_side(shape, 1.0) == side
+    assert bin_side(shape, 0.9) == 2 * side and bin_side(shape, 0.0) == 4 * side
+
+
+@pytest.mark.parametrize('shape', [(9, 10), (7, 13), (1, 1), (2, 1)])
+@pytest.mark.parametrize('side', [2, 3])
+@pytest.mark.parametrize('cloud', [False, True])
+def test_bins_are_means_of_what_was_measured(shape, side, cloud):
+    random = np.random.default_rng(sum(shape))
+    inverse = random.uniform(0.5, 0.6, shape).astype(np.float32)
+    inverse[random.random(shape) < 0.3] = 0
+    camera = Camera(shape[1], shape[0], 50.0, 50.0, 3.0, 3.0)
+    rays = np.where(inverse[..., None] > 0, camera.rays, 0).astype(np.float32)
+    image = RangeImage(rays, inverse) if cloud else RangeImage(camera.rays, inverse, camera)
+    bins = Bins.of(image, side)
+    assert bins.means.shape == tuple(-(-length // side) for length in shape)
+    for i, j in np.ndindex(bins.means.shape):
+        part = np.s_[side * i : side * (i + 1), side * j : side * (j + 1)]
+        known = inverse[part][inverse[part] > 0]
+        assert bins.means.inverse[i, j] == pytest.approx(known.mean() if len(known) else 0)
+        assert bins.spread[i, j] == pytest.approx(np.ptp(known) if len(known) else 0)
+        if cloud and len(known):
+            mean = rays[part][inverse[part] > 0].mean(axis=0)
+            np.testing.assert_allclose(bins.means.rays[i, j], mean, rtol=1e-5)
+
+
+def test_rays_of_bins_are_those_of_the_middle_of_their_pixels():
+    bins = Bins.of(image_of(np.ones(CAMERA.shape)), 2)
+    mean = CAMERA.rays.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(bins.means.rays, mean, atol=1e-6)
+
+
+def test_a_jump_mixes_no_two_surfaces():
+    """But in bins of one surface nothing is left out, however steep that is."""
+    columns = np.arange(CAMERA.width)
+    for edge in (200, 201):
+        inverse = np.where(columns < edge, 0.5, 0.25) * np.ones(CAMERA.shape)
+        bins = Bins.of(image_of(inverse), 2)
+        found = bins.of_one_surface(np.full((60, 80), 0.01, np.float32)).inverse
+        assert set(np.unique(found)) == {np.float32(0.5), np.float32(0.25)}
+    steep = image_of(np.maximum(CAMERA.rays @ [0.0, 0.7, 0.01], 0))
+    bins = Bins.of(steep, 2)
+    found = bins.of_one_surface(np.full((60, 80), 1e-4, np.float32)).inverse
+    near = bins.means.inverse > 0.1  # seen at more than five degrees
+    np.testing.assert_array_equal(found[near], bins.means.inverse[near])
+
+
+@pytest.mark.parametrize(('width', 'side'), [(0, 2), (0, 3), (3.0, 2)])
+def test_noise_of_pixels_follows_from_that_of_bins(width, side):
+    """White noise of variance 1 leaves means of n pixels 1 / n, correlated noise nearly all."""
+    random = np.random.default_rng(3)
+    noise = random.normal(0, 1, CAMERA.shape)
+    if width:
+        noise = smooth_field(CAMERA.shape, (width, width), random)
+    image = image_of(CAMERA.rays @ WALL + 0.002 * noise)
+    bins = Bins.of(image, side)
+    residual = bins.means.inverse - bins.means.rays @ WALL.astype(np.float32)
+    stated = SensorModel.from_config(Config())._replace(noise=float(residual.std()))
+    assert stated.noise**2 * bins.noise_of_pixels(stated) == pytest.approx(0.002**2, rel=0.1)
+
+
+@pytest.mark.parametrize(('correlation', 'white'), [(0.0, 1.0), (2.0, 0.1), (2.0, 0.5)])
+def test_the_model_of_bins_is_that_of_their_means(correlation, white):
+    random = np.random.default_rng(4)
+    smooth = smooth_field(CAMERA.shape, (2.0, 2.0), random) if correlation else 0.0
+    new = random.normal(0, 1, CAMERA.shape)
+    noise = np.sqrt(white) * new + np.sqrt(1 - white) * smooth
+    means = noise.reshape(240, 2, 320, 2).mean(axis=(1, 3))
+    pixels = SensorModel.from_config(Config())._replace(
+        noise=0.002, white=white, correlation=correlation
+    )
+    binned = pixels.binned(2)
+    assert binned.noise == pytest.approx(0.002 * means.std(), rel=0.1)
+    again = binned.of_pixels(2, (pixels.noise / binned.noise) ** 2)
+    assert again.noise == pytest.approx(pixels.noise)
+    # What means lose of correlated noise, 6 % here, counts as new as well.
+    assert white <= again.white + 1e-9 and again.white < white + 0.06
+    assert again.correlation == correlation
+
+
+def test_borders_are_those_of_pixels():
+    """A crease along odd columns and a card along odd rows, neither on a border of bins."""
+    rows, columns = np.indices(CAMERA.shape)
+    at = (300.5 - CAMERA.cx) / CAMERA.fx
+    right = WALL + np.array([0.5, 0, -0.5 * at])
+    truth = np.where(columns <= 300, 1, 2)
+    inverse = np.where(columns <= 300, CAMERA.rays @ WALL, CAMERA.rays @ right)
+    card = (rows >= 101) & (rows < 200) & (columns >= 51) & (columns < 150)
+    truth[card], inverse[card] = 3, 1.0
+    noise = np.random.default_rng(5).normal(0, 1e-4, CAMERA.shape)
+    result = Segmenter().segment(image_of(inverse + noise))
+    assert len(result.planes) == 3
+    for label in (1, 2, 3):
+        own = result.labels[truth == label]
+        found = result.labels == np.bincount(own[own > 0]).argmax()
+        wrong = np.count_nonzero(found != (truth == label))
+        assert wrong < 0.2 * 480, 'less than a fifth of a pixel along the border'
+    assert [plane.count for plane in result.planes] == sorted(
+        (int((result.labels == k).sum()) for k in (1, 2, 3)), reverse=True
+    )
