@@ -17,17 +17,15 @@ from rangeseg_ros.evaluation.terrain import TerrainTable
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.simulation.render import Frame, simulate
+from rangeseg_ros.simulation.render import Frame, TruePlane, simulate
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import NOISES, Kinect
 from rangeseg_ros.simulation.sensors.sensor import Sensor, resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.hard import HARD
-from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import Terrain
 from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
-from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
 _size = click.IntRange(16, 4096)

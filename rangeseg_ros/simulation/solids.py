@@ -8,61 +8,45 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.runtime.threads import run_rows
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Points p with normals @ p + offsets <= 0 and, when there is a quadric, p'Qp <= 0.
+    """Points p = (x, y, z, 1) with flat @ p <= 0 and, when there is a quadric, p'Qp <= 0.
 
     Attributes
     ----------
-    normals : (K, 3) float64
-        Outward unit normals of the planar faces.
-    offsets : (K,) float64
-        Offsets of the faces, metres.
+    flat : (K, 4) float64
+        Outward unit normals and offsets (metres) of the planar faces.
     quadric : (4, 4) float64 or None
-        Symmetric matrix of a convex quadric in homogeneous coordinates; the solid's last face.
+        Symmetric matrix of a convex quadric; the solid's last face.
     """
 
-    normals: NDArray[np.float64]
-    offsets: NDArray[np.float64]
+    flat: NDArray[np.float64]
     quadric: NDArray[np.float64] | None = None
 
     @property
-    def face_count(self) -> int:
-        """Number of faces, the curved one included."""
-        return len(self.offsets) + (self.quadric is not None)
-
-    @property
     def planes(self) -> NDArray[np.float64]:
-        """(face_count, 4) plane equations (normal, offset); NaN for the curved face."""
-        planes = np.full((self.face_count, 4), np.nan)
-        planes[: len(self.offsets)] = np.column_stack([self.normals, self.offsets])
-        return planes
+        """(F, 4) plane equations (normal, offset) of all faces; NaN for the curved one."""
+        curved = self.quadric is not None
+        return np.vstack([self.flat, np.full((int(curved), 4), np.nan)])
+
+    def transformed(self, back: NDArray[np.float64]) -> Solid:
+        """The solid whose points the matrix `back` (4, 4) takes to points of this one."""
+        quadric = None if self.quadric is None else back.T @ self.quadric @ back
+        return Solid(self.flat @ back, quadric)
 
 
 def cast(
     solids: Sequence[Solid], origins: ArrayLike, directions: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """First hit of every ray.
+    """First hit of every ray, of one origin (3,) or one for each (..., 3).
 
-    Parameters
-    ----------
-    solids : sequence of Solid
-        Faces are numbered through all solids, in their order.
-    origins : (3,) or (..., 3) array_like
-        One origin for all rays, or one for each.
-    directions : (..., 3) array_like
-        Directions, of any length.
-
-    Returns
-    -------
-    distance : (...) float64
-        Ray parameter of the hit, in lengths of the direction; inf where nothing is hit.
-    face : (...) int32
-        Number of the face hit, -1 where nothing is.
+    Returns its distance (...) in lengths of the direction (..., 3), inf where nothing is hit, and
+    the number (...) of the face, counted through all solids; -1 for none.
     """
     directions = np.asarray(directions, np.float64)
     shape = directions.shape[:-1]
@@ -78,14 +62,13 @@ def cast(
             len(directions),
             origins,
             directions,
-            solid.normals,
-            solid.offsets,
+            solid.flat,
             quadric,
             first,
             distance,
             face,
         )
-        first += solid.face_count
+        first += len(solid.planes)
     return distance.reshape(shape), face.reshape(shape)
 
 
@@ -98,8 +81,7 @@ def _enter(
     after: int,
     origins: NDArray[np.float64],
     directions: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    offsets: NDArray[np.float64],
+    flat: NDArray[np.float64],
     quadric: NDArray[np.float64],
     first: int,
     distance: NDArray[np.float64],
@@ -113,9 +95,9 @@ def _enter(
         x, y, z = origins[i if len(origins) > 1 else 0]
         u, v, w = directions[i]
         entry, exit_, entered = -np.inf, distance[i], -1
-        for k in range(len(offsets)):
-            rate = normals[k, 0] * u + normals[k, 1] * v + normals[k, 2] * w
-            height = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z + offsets[k]
+        for k in range(len(flat)):
+            rate = flat[k, 0] * u + flat[k, 1] * v + flat[k, 2] * w
+            height = flat[k, 0] * x + flat[k, 1] * y + flat[k, 2] * z + flat[k, 3]
             if rate < 0:
                 if -height / rate > entry:
                     entry, entered = -height / rate, k
@@ -128,7 +110,7 @@ def _enter(
         if len(quadric) and entry < exit_:
             inside, outside = _quadric_interval(quadric, x, y, z, u, v, w)
             if inside > entry:
-                entry, entered = inside, len(offsets)
+                entry, entered = inside, len(flat)
             exit_ = min(exit_, outside)
         if 0 < entry < exit_:
             distance[i] = entry
@@ -161,30 +143,21 @@ def half_space(normal: ArrayLike, point: ArrayLike) -> Solid:
     """Everything behind the plane through `point` whose outward normal is `normal`."""
     unit = np.asarray(normal, np.float64)
     unit = unit / np.linalg.norm(unit)
-    return Solid(unit[None], -np.array([unit @ np.asarray(point, np.float64)]))
+    return Solid(np.append(unit, -unit @ np.asarray(point, np.float64))[None])
 
 
 def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
-    """Right prism over a convex polygon.
+    """Right prism over a convex polygon, moved by `rotation` (3, 3) and then by `centre` (3,).
 
-    Parameters
-    ----------
-    outline : (M, 2) array_like
-        Corners of the base, counter-clockwise, metres.
-    height : float
-        Height of the prism along its own z axis; z runs from -height / 2 to height / 2.
-    rotation : (3, 3) array_like
-        World-from-solid rotation.
-    centre : (3,) array_like
-        World position of the solid's origin.
+    `outline` (M, 2) are the corners of its base, counter-clockwise, metres; its own z runs from
+    -height / 2 to height / 2.
     """
     corners = np.asarray(outline, np.float64)
     edges = np.roll(corners, -1, axis=0) - corners
     sides = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])
     sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    normals = np.vstack([sides, [[0, 0, 1], [0, 0, -1]]])
-    offsets = -np.append((sides[:, :2] * corners).sum(axis=1), [height / 2, height / 2])
-    return _placed(Solid(normals, offsets), rotation, centre)
+    upright = np.column_stack([sides, -(sides[:, :2] * corners).sum(axis=1)])
+    return _placed(Solid(np.vstack([upright, _ends(height)])), rotation, centre)
 
 
 def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
@@ -196,24 +169,29 @@ def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
 def sphere(radius: float, centre: ArrayLike) -> Solid:
     """Ball of a radius in metres."""
     quadric = np.diag([1.0, 1.0, 1.0, -(radius**2)])
-    return _placed(Solid(np.zeros((0, 3)), np.zeros(0), quadric), np.eye(3), centre)
+    return _placed(Solid(np.zeros((0, 4)), quadric), np.eye(3), centre)
 
 
 def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Cylinder along its own z axis, with flat ends."""
-    normals, offsets = np.array([[0.0, 0, 1], [0, 0, -1]]), np.full(2, -height / 2)
     quadric = np.diag([1.0, 1.0, 0.0, -(radius**2)])
-    return _placed(Solid(normals, offsets, quadric), rotation, centre)
+    return _placed(Solid(_ends(height), quadric), rotation, centre)
+
+
+def about_z(degrees: float) -> NDArray[np.float64]:
+    """Rotation about the vertical."""
+    rotation: NDArray[np.float64] = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return rotation
+
+
+def _ends(height: float) -> NDArray[np.float64]:
+    """Top and bottom of a solid of that height about its origin."""
+    return np.array([[0, 0, 1, -height / 2], [0, 0, -1, -height / 2]])
 
 
 def _placed(solid: Solid, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Return the solid after p -> rotation @ p + centre."""
-    rotation, centre = np.asarray(rotation, np.float64), np.asarray(centre, np.float64)
-    normals = solid.normals @ rotation.T
-    offsets = solid.offsets - normals @ centre
-    quadric = solid.quadric
-    if quadric is not None:
-        back = np.eye(4)
-        back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ centre
-        quadric = back.T @ quadric @ back
-    return Solid(normals, offsets, quadric)
+    back = np.eye(4)
+    back[:3, :3] = np.asarray(rotation, np.float64).T
+    back[:3, 3] = -back[:3, :3] @ np.asarray(centre, np.float64)
+    return solid.transformed(back)

@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.sensors.sensor import inverse_depth, slopes, unseen_from_the_right
+from rangeseg_ros.simulation.sensors.sensor import (
+    Sensor,
+    inverse_depth,
+    millimetres,
+    resize,
+    slopes,
+    unseen_from_the_right,
+)
 
 QUANTUM = 0.00290
 """Inverse depth of one disparity quantum, 1/m."""
@@ -24,19 +31,15 @@ BASELINE = 0.075
 """Distance of the projector to the right of the camera, metres."""
 SHADOW_SHARE = 0.75
 """Part of a shadow's geometric width that real sensors leave blank (median)."""
-
-
 NOISES = ('measured', 'correlated', 'independent', 'none')
 
 
 @dataclass(frozen=True)
-class Kinect:
+class Kinect(Sensor):
     """Kinect v1.
 
     Attributes
     ----------
-    seed : int
-        Which sensor: its fixed distortion and bands.
     noise : {'measured', 'correlated', 'independent', 'none'}
         measured: fixed distortion, vertical bands, correlated noise, blind zones. independent:
         sigma = 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the
@@ -50,22 +53,16 @@ class Kinect:
         Unknown noise.
     """
 
-    seed: int = 0
     noise: str = 'measured'
+    camera = Camera(640, 480, 585.0, 585.0, 319.5, 239.5)
 
     def __post_init__(self) -> None:
         if self.noise not in NOISES:
             raise ValueError(f'noise must be one of {", ".join(NOISES)}, not {self.noise!r}')
 
-    @property
-    def camera(self) -> Camera:
-        """640x480."""
-        return kinect_camera()
-
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16] | NDArray[np.float32]:
-        """See `Sensor.measure`."""
         inverse = inverse_depth(depth)
         share = SHADOW_SHARE if self.noise == 'measured' else 1.0
         blind = ~np.isfinite(depth) | unseen_from_the_right(inverse, camera, share * BASELINE)
@@ -81,14 +78,13 @@ class Kinect:
             error = 0.0012 + 0.0019 * (depth - 0.4) ** 2
             error *= smooth_field(depth.shape, width, random)
             disparity = 1 / (QUANTUM * np.maximum(depth + error, 0.1))
-        values = in_millimetres(disparity)
-        return np.where(blind | (values > 65535), 0, values).astype(np.uint16)
+        # One quantum of disparity stands for infinity: nothing is measured beyond 65 m.
+        return millimetres(1 / (QUANTUM * np.maximum(np.rint(disparity), 1)), ~blind)
 
 
 def kinect_camera(width: int = 640, height: int = 480) -> Camera:
     """Intrinsics of a Kinect whose image of the same field of view has that many columns."""
-    focal = 585.0 * width / 640
-    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    return resize(Kinect.camera, width, height)
 
 
 def measured_disparity(
@@ -101,19 +97,9 @@ def measured_disparity(
 
     The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame with
     a quarter of the pattern's variance, and pixel noise of 0.37 quanta correlated over 2 pixels
-    that grows with obliquity. These reproduce the 0.45 quanta of residual noise (quantisation
-    included) and its autocorrelation (0.5 at 1.4-1.9 pixels) of real frames.
-
-    Parameters
-    ----------
-    depth : (H, W) float64
-        True depth, metres.
-    slope : (H, W) float64
-        Tangent of the angle of incidence.
-    sensor_seed : int
-        Which sensor.
-    random : Generator
-        Source of what is new in every frame.
+    that grows with obliquity (`slope`, the tangent of the angle of incidence). These reproduce the
+    0.45 quanta of residual noise (quantisation included) and its autocorrelation (0.5 at 1.4-1.9
+    pixels) of real frames.
     """
     fresh = 0.25 * smooth_field(depth.shape, _distortion_scale(depth.shape[1]), random)
     noise = 0.37 * (1 + 0.25 * np.maximum(slope - 0.7, 0))
@@ -166,12 +152,3 @@ def blind_zones(
     blind |= depth < 0.8
     blind[:, -8:] = True
     return blind
-
-
-def in_millimetres(disparity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Depth, millimetres, of disparities in quanta, both rounded as the sensor does.
-
-    One quantum of disparity stands for infinity: nothing is measured beyond 65 m (65535 mm).
-    """
-    depth: NDArray[np.float64] = np.rint(1000 / (QUANTUM * np.maximum(np.rint(disparity), 1)))
-    return depth
