@@ -81,7 +81,7 @@ def overlay(
     base = cv2.cvtColor(grey(inverse), cv2.COLOR_GRAY2RGB)
     picture: NDArray = cv2.addWeighted(base, 0.45, look_up(palette, labels), 0.55, 0)
     cv2.copyTo(base, (labels == 0).view(np.uint8), picture)
-    cv2.copyTo(np.zeros_like(base), _borders(labels).view(np.uint8), picture)
+    cv2.copyTo(np.zeros_like(base), (borders(labels) & (labels > 0)).view(np.uint8), picture)
     half = labels[::2, ::2].copy()
     for plane in planes:
         _write_id(picture, half == plane.label, str(plane.id))
@@ -98,12 +98,12 @@ def normals_picture(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 
 
-def _borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Pixels of a region whose right or lower neighbour has another label."""
-    borders = np.zeros(labels.shape, bool)
-    borders[:, :-1] |= labels[:, :-1] != labels[:, 1:]
-    borders[:-1] |= labels[:-1] != labels[1:]
-    return borders & (labels > 0)
+def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Pixels whose right or lower neighbour has another label."""
+    border = np.zeros(labels.shape, bool)
+    border[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    border[:-1] |= labels[:-1] != labels[1:]
+    return border
 
 
 def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.evaluation.terrain import TerrainTable
+from rangeseg_ros.evaluation.terrain import TerrainRow, write_table
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
@@ -211,10 +211,8 @@ def _write_terrains(
 ) -> None:
     """Write scenes with numbers from `seed` on, as images of so many columns and rows."""
     camera = _camera(SENSORS[sensor](seed), *size)
-    with (
-        options.new_folder(output) as folder,
-        TerrainTable(folder / 'terrain.csv') as table,
-    ):
+    table = []
+    with options.new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
         for number, scene in options.progress(enumerate(scenes, seed), len(scenes), 'image'):
             frame = simulate_terrain(scene, SENSORS[sensor](number), camera, seed=number)
@@ -222,7 +220,9 @@ def _write_terrains(
             _write_depth(folder, name, frame.depth, frame.terrain)
             for part in ('height', 'size', 'crossing'):
                 write_image(folder / part / f'{name}.tiff', getattr(frame, part))
-            table.write(name, scene.kind, sensor, *stated(scene, number), scene.stairs)
+            known = stated(scene, number)
+            table.append(TerrainRow(name, scene.kind, sensor, *known, scene.stairs))
+        write_table(folder / 'terrain.csv', table)
     click.echo(f'{output}: {len(scenes)} images')
 
 

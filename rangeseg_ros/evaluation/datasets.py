@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -43,19 +44,7 @@ from rangeseg_ros.segcomp.geometry import (
 
 
 class Sample(NamedTuple):
-    """A range image and what is known about it.
-
-    Attributes
-    ----------
-    image : RangeImage
-        What is segmented.
-    truth : Truth
-        Its regions.
-    angles : list of RegionAngle
-        Angles between regions, where known, in the labels of `truth`.
-    planes : dict
-        Plane (nx, ny, nz, d) of each region of `truth`, where known.
-    """
+    """A range image, its true regions, and their angles and planes (nx, ny, nz, d) where known."""
 
     image: RangeImage
     truth: Truth
@@ -65,18 +54,9 @@ class Sample(NamedTuple):
 
 @dataclass(frozen=True)
 class Case:
-    """One image of a data set, not yet read.
+    """One image of a data set, not yet read: its name, unique there, and its two files.
 
-    Attributes
-    ----------
-    name : str
-        Unique in its data set.
-    image, truth : Path
-        Files of the range image and of the ground truth.
-    read : callable
-        (image, truth) -> Sample.
-    sensor, split : str
-        Of sets that tell them: 'abw' or 'perc', 'train' or 'test'.
+    `sensor` ('abw' or 'perc') and `split` ('train' or 'test') are those of sets that tell them.
     """
 
     name: str
@@ -87,14 +67,7 @@ class Case:
     split: str = ''
 
     def load(self) -> Sample:
-        """Read the files.
-
-        Raises
-        ------
-        ValueError
-            A missing or malformed file, or a truth of another size than the image; the message
-            names the file.
-        """
+        """Read the files; ValueError names one that is missing, malformed or of another size."""
         sample = self.read(self.image, self.truth)
         sizes = ['x'.join(map(str, a.shape[::-1])) for a in (sample.truth.labels, sample.image)]
         if sizes[0] != sizes[1]:
@@ -155,20 +128,11 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
     Known layouts: segcomp (`abw.test.N.range`, `perc.test.N` and train, with `.gt-seg`, perhaps
     `.gt-ang`); `depth/*.png` with `truth/*.png` and `camera.yaml` (perhaps `planes.csv`), as
     `rangeseg simulate kinect` writes it; folders of `depth.png` or `depth.tiff`, `truth.png` and
-    `camera.txt` or `camera.yaml`; labelled scans `*.pcd`.
+    `camera.txt` or `camera.yaml`; labelled scans `*.pcd`. EvaluationError tells of a folder of
+    another layout, or an image without ground truth.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder to look into.
-    min_pixels : int, optional
-        Regions of the truth of depth images that are smaller do not count; 1000 when not given,
-        as both simulated and hand-drawn truth have slivers.
-
-    Raises
-    ------
-    EvaluationError
-        None of the layouts, or an image without ground truth.
+    Regions of the truth of depth images that are smaller than `min_pixels` do not count; 1000 when
+    not given, as both simulated and hand-drawn truth have slivers.
     """
     least = 1000 if min_pixels is None else min_pixels
     for layout in (
@@ -188,16 +152,12 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
 
 def _distinct(cases: list[Case]) -> list[Case]:
     """The cases under names of their own: a/b and a_b have the same one at first."""
-    taken: set[str] = set()
-    distinct = []
+    distinct: dict[str, Case] = {}
     for case in cases:
-        number, name = 1, case.name
-        while name in taken:
-            number += 1
-            name = f'{case.name}_{number}'
-        taken.add(name)
-        distinct.append(replace(case, name=name))
-    return distinct
+        names = chain([case.name], (f'{case.name}_{number}' for number in count(2)))
+        name = next(name for name in names if name not in distinct)
+        distinct[name] = replace(case, name=name)
+    return list(distinct.values())
 
 
 def _segcomp_cases(folder: Path) -> Iterator[Case]:
@@ -217,11 +177,9 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     for path in _sorted(folder, 'depth/*.png'):
         truth = folder / 'truth' / path.name
         _require(path, truth)
+        known = planes.get(path.stem, {})
         read = partial(
-            read_depth_case,
-            camera=folder / 'camera.yaml',
-            min_pixels=min_pixels,
-            planes=planes.get(path.stem, {}),
+            read_depth_case, camera=folder / 'camera.yaml', min_pixels=min_pixels, planes=known
         )
         yield Case(path.stem, path, truth, read)
 

@@ -21,18 +21,8 @@ from rangeseg_ros.io.images import write_image
 class Measurement:
     """Everything the figures of an image are computed from.
 
-    Attributes
-    ----------
-    name : str
-        Of the image.
-    overlap : Overlap
-        Of truth and segmentation: gives every metric at every tolerance.
-    angles : list
-        (label, label, degrees) of the truth, where known.
-    true_planes, found_planes : mapping
-        Plane (nx, ny, nz, d) of each label, where known; of the found ones normals do.
-    timings : mapping
-        Milliseconds per stage.
+    Angles are (label, label, degrees) of the truth, planes (nx, ny, nz, d) of each label, where
+    known (of the found ones normals do), timings milliseconds per stage.
     """
 
     name: str
@@ -45,17 +35,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Task:
-    """An image, the parameters to segment it with, and where the results go.
-
-    Attributes
-    ----------
-    case : Case
-        The image.
-    config : Config
-        Parameters of the segmenter.
-    output : Path or None
-        Folder for <name>_labels.png and <name>_classes.png.
-    """
+    """An image, the parameters to segment it with, and a folder for its `pictures`, or None."""
 
     case: Case
     config: Config
@@ -82,5 +62,4 @@ class Task:
 
     def pictures(self, folder: Path) -> dict[str, Path]:
         """Where pictures of the image are left."""
-        kinds = 'labels', 'classes'
-        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}
+        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in ('labels', 'classes')}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.drawing import borders
 from rangeseg_ros.evaluation.datasets import Sample
 from rangeseg_ros.evaluation.hoover import Classification, RegionClass
 from rangeseg_ros.evaluation.overlap import Overlap
@@ -13,7 +14,6 @@ from rangeseg_ros.evaluation.overlap import Overlap
 CORRECT, OVER, UNDER = (255, 255, 255), (80, 200, 80), (90, 130, 255)
 MISSED, NOISE = (255, 190, 60), (230, 70, 70)
 NO_DATA, UNLABELLED = (128, 128, 128), (40, 40, 40)
-_BORDER = (0, 0, 0)
 
 
 def class_picture(
@@ -22,20 +22,7 @@ def class_picture(
     """Ground truth (left) and segmentation (right), each region in the colour of its class.
 
     Correct white, over-segmented green, under-segmented blue, missed orange, noise red; no
-    measurement grey, no region dark.
-
-    Parameters
-    ----------
-    sample : Sample
-        Image and truth.
-    labels : (H, W) uint16
-        The segmentation.
-    overlap, classes : Overlap, Classification
-        Their comparison.
-
-    Returns
-    -------
-    (H, 2 W + 4, 3) uint8 RGB
+    measurement grey, no region dark. (H, 2 W + 4, 3) uint8 RGB, for labels (H, W).
     """
     gap = np.full((labels.shape[0], 4, 3), 255, np.uint8)
     left = _coloured(sample.truth.labels, overlap.truth, classes.truth, MISSED)
@@ -60,6 +47,5 @@ def _coloured(
     ):
         palette[regions[kinds == kind]] = colour
     picture = palette[labels]
-    picture[:, :-1][labels[:, :-1] != labels[:, 1:]] = _BORDER
-    picture[:-1][labels[:-1] != labels[1:]] = _BORDER
+    picture[borders(labels)] = 0
     return picture

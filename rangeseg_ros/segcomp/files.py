@@ -1,4 +1,6 @@
-"""The file kinds of the segmentation comparison of Hoover et al.
+"""The file kinds of the segmentation comparison of Hoover et al.; all raise SegcompError.
+
+Their regions are numbered from 10; here they are 1, 2, ..., and 0 is none.
 
 References
 ----------
@@ -14,7 +16,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 FIRST_REGION = 10
 EDGE = 3
@@ -30,18 +32,7 @@ class SegcompError(ValueError):
 
 
 def read_raster(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Read an 8-bit Sun raster, such as an ABW range image.
-
-    Returns
-    -------
-    (H, W) uint8
-        The pixels; in a range image 0 is shadow.
-
-    Raises
-    ------
-    SegcompError
-        Wrong magic number, not 8 bits per pixel, a compressed or truncated file.
-    """
+    """Read an uncompressed 8-bit Sun raster (H, W), such as an ABW range image: 0 is shadow."""
     data = Path(path).read_bytes()
     if len(data) < 4 or struct.unpack_from('>I', data)[0] != _MAGIC:
         raise SegcompError(f'{path}: not a Sun raster (wrong magic number)')
@@ -56,62 +47,39 @@ def read_raster(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
         raise SegcompError(f'{path}: Sun raster of type {kind}; only uncompressed ones (0, 1)')
     pixels = data[32 + colormap : 32 + colormap + width * height]
     if len(pixels) < width * height:
-        raise SegcompError(
-            f'{path}: truncated Sun raster: {len(pixels)} of {width * height} pixels'
-        )
+        found = f'{len(pixels)} of {width * height} pixels'
+        raise SegcompError(f'{path}: truncated Sun raster: {found}')
     return np.frombuffer(pixels, np.uint8).reshape(height, width).copy()
 
 
-def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint8]:
-    """Read a `.gt-seg` or `.ms-seg` raster: 0 none, 1 noise, 2 shadow, 3 edge, regions from 10.
+def read_segmentation(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
+    """Read the labels (H, W) of a `.gt-seg` or `.ms-seg` raster.
 
-    Raises
-    ------
-    SegcompError
-        As `read_raster`, and labels 4..9.
+    In the file 0 is none, 1 noise, 2 shadow, 3 edge; 4 to 9 are not allowed.
     """
     image = read_raster(path)
     bad = image[(image > EDGE) & (image < FIRST_REGION)]
     if bad.size:
         raise SegcompError(f'{path}: label {bad.min()}; 4..9 are not allowed, regions begin at 10')
-    return image
-
-
-def from_segcomp(image: ArrayLike) -> NDArray[np.uint16]:
-    """Convert labels in segcomp's convention to ours: 0 = none, region k to k - 9."""
-    array = np.asarray(image)
-    return np.maximum(array.astype(np.int32) - FIRST_REGION + 1, 0).astype(np.uint16)
+    return np.maximum(image, FIRST_REGION - 1).astype(np.uint16) - np.uint16(FIRST_REGION - 1)
 
 
 def read_perceptron(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
-    """Read a Perceptron range image.
-
-    Returns
-    -------
-    (512, 512) uint16
-        12-bit range values; the reflectance and control bits of the file are dropped.
-
-    Raises
-    ------
-    SegcompError
-        A header that does not have the ten expected lines, or missing pixels.
-    """
+    """Read the 12-bit range values (512, 512) of a Perceptron image, not its reflectance."""
     data = Path(path).read_bytes()
     start = 0
     for number, words in enumerate(_PERCEPTRON_WORDS, start=1):
         end = data.find(b'\n', start, start + 1000)
         if end < 0 or len(data[start:end].split()) != words:
-            raise SegcompError(
-                f'{path}: not a Perceptron image: header line {number} must have {words} words'
-            )
+            problem = f'header line {number} must have {words} words'
+            raise SegcompError(f'{path}: not a Perceptron image: {problem}')
         start = end + 1
     pixels = data[start + 2 :]
-    if len(pixels) != 4 * SIZE * SIZE:
-        problem = 'truncated' if len(pixels) < 4 * SIZE * SIZE else 'oversized'
-        raise SegcompError(
-            f'{path}: {problem} Perceptron image: {len(pixels)} bytes of pixels, '
-            f'not {4 * SIZE * SIZE}'
-        )
+    expected = 4 * SIZE * SIZE
+    if len(pixels) != expected:
+        problem = 'truncated' if len(pixels) < expected else 'oversized'
+        found = f'{len(pixels)} bytes of pixels, not {expected}'
+        raise SegcompError(f'{path}: {problem} Perceptron image: {found}')
     values = np.frombuffer(pixels, '>i4').reshape(SIZE, SIZE)
     return (values & _RANGE_MASK).astype(np.uint16)
 
@@ -125,25 +93,19 @@ class RegionAngle(NamedTuple):
 
 
 def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
-    """Read a `.gt-ang` file: a count, then lines `regionA regionB degrees`.
-
-    Raises
-    ------
-    SegcompError
-        A wrong count or a malformed line.
-    """
-    return [RegionAngle(int(a), int(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
+    """Read a `.gt-ang` file: a count, then lines `regionA regionB degrees`."""
+    rows = _read_rows(path, 3, integers=2)
+    return [RegionAngle(_label(a), _label(b), angle) for a, b, angle in rows]
 
 
 def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:
-    """Read a `.ms-nor` file: a count, then lines `label nx ny nz`.
+    """Read a `.ms-nor` file: a count, then lines `label nx ny nz`."""
+    return {_label(row[0]): np.array(row[1:]) for row in _read_rows(path, 4, integers=1)}
 
-    Raises
-    ------
-    SegcompError
-        A wrong count or a malformed line.
-    """
-    return {int(row[0]): np.array(row[1:]) for row in _read_rows(path, 4, integers=1)}
+
+def _label(number: float) -> int:
+    """Label of a region, by its number in a file."""
+    return int(number) - FIRST_REGION + 1
 
 
 def _read_rows(path: str | os.PathLike[str], columns: int, integers: int) -> list[list[float]]:

@@ -28,15 +28,7 @@ class AbwCalibration:
     y = (255 - r) / aspect (v / scale + offset) / |f|, z = (255 - v) / scale describe rays through
     one centre at the depth v / scale + offset; here they are given in the optical frame of that
     centre (x right, y down, z forward, metres; the published unit is taken as the millimetre).
-
-    Attributes
-    ----------
-    offset : float
-        Depth of range value 0, mm.
-    scale : float
-        Range values per mm.
-    focal : float
-        Focal length in columns.
+    `offset` is the depth of range value 0, mm; `scale` range values per mm; `focal` in columns.
     """
 
     offset: float
@@ -67,13 +59,7 @@ def abw_calibration(number: int, split: str = 'test') -> AbwCalibration:
 
 
 def abw_range_image(values: ArrayLike, calibration: AbwCalibration) -> RangeImage:
-    """Range image of (512, 512) ABW range values.
-
-    Raises
-    ------
-    SegcompError
-        An image of another size.
-    """
+    """Range image of (512, 512) ABW range values."""
     _check_size(values, 'ABW')
     return RangeImage.from_depth(calibration.depth(values).astype(np.float32), calibration.camera)
 
@@ -87,19 +73,10 @@ _STANDOFF = 830.3
 
 
 def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
-    """Points of a range image of the Perceptron laser scanner, which has no single centre.
+    """Points (512, 512, 3) of range values (512, 512) of the Perceptron laser scanner, metres.
 
-    Its beams leave a rotating mirror and a nodding one.
-
-    Parameters
-    ----------
-    values : (512, 512) integer or float
-        Range values.
-
-    Returns
-    -------
-    (512, 512, 3) float64
-        Metres in the optical frame: x right, y down, z forward, the origin at the second mirror.
+    It has no single centre: its beams leave a rotating mirror and a nodding one. The origin is at
+    the second mirror.
     """
     h1, h2 = 3.0, 5.5
     gamma = theta = np.pi / 4
@@ -120,18 +97,13 @@ def perceptron_points(values: ArrayLike) -> NDArray[np.float64]:
 
 
 def perceptron_range_image(values: ArrayLike) -> RangeImage:
-    """Range image of (512, 512) Perceptron range values.
-
-    Raises
-    ------
-    SegcompError
-        An image of another size.
-    """
+    """Range image of (512, 512) Perceptron range values."""
     _check_size(values, 'Perceptron')
     return RangeImage.from_points(perceptron_points(values))
 
 
 def _check_size(values: ArrayLike, sensor: str) -> None:
+    """Raise SegcompError for an image of another size."""
     shape = np.shape(values)
     if shape != (SIZE, SIZE):
         raise SegcompError(f'{sensor} range images are {SIZE}x{SIZE}, not {shape}')
