@@ -50,10 +50,8 @@ def test_exact_hits(solid, direction, distance, face):
 def inside(solid: Solid, points, margin=1e-6):
     """Whether points lie in a solid, by a margin."""
     homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
-    deep = (homogeneous @ solid.flat.T < -margin).all(axis=-1)
-    if solid.quadric is not None:
-        deep &= np.einsum('...i,ij,...j', homogeneous, solid.quadric, homogeneous) < -margin
-    return deep
+    values = np.einsum('...i,fij,...j->...f', homogeneous, solid.faces, homogeneous)
+    return (values < -margin).all(axis=-1)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -72,7 +70,7 @@ def test_first_hit_is_on_the_face_and_nothing_lies_before_it(seed):
     ]
     origins, directions = random.uniform(-3, 3, (2, 40, 3))
     distance, face = cast(solids, origins, directions)
-    owner = np.repeat(np.arange(5), [len(solid.planes) for solid in solids])
+    owner = np.repeat(np.arange(5), [len(solid.faces) for solid in solids])
     planes = np.vstack([solid.planes for solid in solids])
     steps = np.linspace(0, 1, 400)
     for origin, direction, reach, hit in zip(origins, directions, distance, face, strict=True):

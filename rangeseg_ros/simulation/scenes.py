@@ -208,7 +208,7 @@ class _Room:
             place = self.random.uniform((near, -1.4), (far, 1.4))
             free = np.hypot(*place) - radius > 0.8 and abs(place[1]) < 0.45 * place[0]
             for wall in self.walls:
-                free &= wall.flat[0, :2] @ place + wall.flat[0, 3] > radius
+                free &= wall.planes[0] @ (*place, 0, 1) > radius
             for other, reach in self.occupied:
                 free &= np.hypot(*(place - other)) > radius + reach
             if free:

@@ -15,29 +15,27 @@ from rangeseg_ros.core.runtime.threads import run_rows
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Points p = (x, y, z, 1) with flat @ p <= 0 and, when there is a quadric, p'Qp <= 0.
+    """Points p = (x, y, z, 1) with p'Qp <= 0 for the matrix Q of every face.
 
     Attributes
     ----------
-    flat : (K, 4) float64
-        Outward unit normals and offsets (metres) of the planar faces.
-    quadric : (4, 4) float64 or None
-        Symmetric matrix of a convex quadric; the solid's last face.
+    faces : (F, 4, 4) float64
+        Symmetric matrices of planes, [[0, n / 2], [n / 2, d]] with the outward unit normal n and
+        the offset d (metres), and of convex quadrics.
     """
 
-    flat: NDArray[np.float64]
-    quadric: NDArray[np.float64] | None = None
+    faces: NDArray[np.float64]
 
     @property
     def planes(self) -> NDArray[np.float64]:
-        """(F, 4) plane equations (normal, offset) of all faces; NaN for the curved one."""
-        curved = self.quadric is not None
-        return np.vstack([self.flat, np.full((int(curved), 4), np.nan)])
+        """(F, 4) plane equations (normal, offset) of the faces; NaN for curved ones."""
+        planes = np.column_stack([2 * self.faces[:, 3, :3], self.faces[:, 3, 3]])
+        planes[self.faces[:, :3, :3].any(axis=(1, 2))] = np.nan
+        return planes
 
     def transformed(self, back: NDArray[np.float64]) -> Solid:
         """The solid whose points the matrix `back` (4, 4) takes to points of this one."""
-        quadric = None if self.quadric is None else back.T @ self.quadric @ back
-        return Solid(self.flat @ back, quadric)
+        return Solid(back.T @ self.faces @ back)
 
 
 def cast(
@@ -56,23 +54,9 @@ def cast(
     face = np.full(len(directions), -1, np.int32)
     first = 0
     for solid in solids:
-        quadric = _NONE if solid.quadric is None else solid.quadric
-        run_rows(
-            _enter,
-            len(directions),
-            origins,
-            directions,
-            solid.flat,
-            quadric,
-            first,
-            distance,
-            face,
-        )
-        first += len(solid.planes)
+        run_rows(_enter, len(directions), origins, directions, solid.faces, first, distance, face)
+        first += len(solid.faces)
     return distance.reshape(shape), face.reshape(shape)
-
-
-_NONE = np.zeros((0, 0))
 
 
 @njit(cache=True, nogil=True)
@@ -81,58 +65,49 @@ def _enter(
     after: int,
     origins: NDArray[np.float64],
     directions: NDArray[np.float64],
-    flat: NDArray[np.float64],
-    quadric: NDArray[np.float64],
+    faces: NDArray[np.float64],
     first: int,
     distance: NDArray[np.float64],
     face: NDArray[np.int32],
 ) -> None:
     """Where rays start...after enter a solid, if that is nearer than `distance`, which is set.
 
-    A ray is inside between its last entry into a half space (or the quadric) and its first exit.
+    A ray is inside between the last face that it enters by and the first that it leaves by.
     """
     for i in range(start, after):
-        x, y, z = origins[i if len(origins) > 1 else 0]
-        u, v, w = directions[i]
+        origin, direction = origins[i if len(origins) > 1 else 0], directions[i]
         entry, exit_, entered = -np.inf, distance[i], -1
-        for k in range(len(flat)):
-            rate = flat[k, 0] * u + flat[k, 1] * v + flat[k, 2] * w
-            height = flat[k, 0] * x + flat[k, 1] * y + flat[k, 2] * z + flat[k, 3]
-            if rate < 0:
-                if -height / rate > entry:
-                    entry, entered = -height / rate, k
-            elif rate > 0:
-                exit_ = min(exit_, -height / rate)
-            elif height > 0:
-                exit_ = -np.inf
+        for k in range(len(faces)):
+            inside, outside = _interval(faces[k], origin, direction)
+            if inside > entry:
+                entry, entered = inside, k
+            exit_ = min(exit_, outside)
             if entry >= exit_:
                 break
-        if len(quadric) and entry < exit_:
-            inside, outside = _quadric_interval(quadric, x, y, z, u, v, w)
-            if inside > entry:
-                entry, entered = inside, len(flat)
-            exit_ = min(exit_, outside)
         if 0 < entry < exit_:
             distance[i] = entry
             face[i] = first + entered
 
 
 @njit(cache=True)
-def _quadric_interval(
-    quadric: NDArray[np.float64], x: float, y: float, z: float, u: float, v: float, w: float
+def _interval(
+    face: NDArray[np.float64], origin: NDArray[np.float64], direction: NDArray[np.float64]
 ) -> tuple[float, float]:
-    """Ray parameters between which p'Qp <= 0; (inf, -inf) where that is nowhere."""
-    a = b = 0.0
-    c = quadric[3, 3]
+    """Ray parameters t between which p'Qp = a t^2 + 2 b t + c <= 0; (inf, -inf) for none."""
+    a = b = c = 0.0
     for i in range(3):
-        origin, direction = (x, y, z)[i], (u, v, w)[i]
-        gradient = quadric[i, 0] * x + quadric[i, 1] * y + quadric[i, 2] * z + quadric[i, 3]
-        bend = quadric[i, 0] * u + quadric[i, 1] * v + quadric[i, 2] * w
-        a += direction * bend
-        b += direction * gradient
-        c += origin * (gradient + quadric[i, 3])
-    if a < 1e-15:  # along a cylinder's axis: inside or not, but never across
-        return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
+        gradient, bend = face[i, 3], 0.0
+        for j in range(3):
+            gradient += face[i, j] * origin[j]
+            bend += face[i, j] * direction[j]
+        a += direction[i] * bend
+        b += direction[i] * gradient
+        c += origin[i] * (gradient + face[i, 3])
+    c += face[3, 3]
+    if a < 1e-15:  # a plane, or along a cylinder's axis
+        if b == 0:
+            return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
+        return (-np.inf, -c / (2 * b)) if b > 0 else (-c / (2 * b), np.inf)
     if b * b < a * c:
         return np.inf, -np.inf
     root = np.sqrt(b * b - a * c)
@@ -143,7 +118,7 @@ def half_space(normal: ArrayLike, point: ArrayLike) -> Solid:
     """Everything behind the plane through `point` whose outward normal is `normal`."""
     unit = np.asarray(normal, np.float64)
     unit = unit / np.linalg.norm(unit)
-    return Solid(np.append(unit, -unit @ np.asarray(point, np.float64))[None])
+    return _flat(np.append(unit, -unit @ np.asarray(point, np.float64))[None])
 
 
 def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
@@ -154,10 +129,10 @@ def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayL
     """
     corners = np.asarray(outline, np.float64)
     edges = np.roll(corners, -1, axis=0) - corners
-    sides = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])
-    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    upright = np.column_stack([sides, -(sides[:, :2] * corners).sum(axis=1)])
-    return _placed(Solid(np.vstack([upright, _ends(height)])), rotation, centre)
+    x, y = edges[:, ::-1].T * ([[1], [-1]] / np.linalg.norm(edges, axis=1))
+    offset = -(x * corners[:, 0] + y * corners[:, 1])
+    upright = np.column_stack([x, y, np.zeros(len(x)), offset])
+    return _placed(_flat(np.vstack([upright, _ends(height)])), rotation, centre)
 
 
 def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
@@ -168,14 +143,14 @@ def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
 
 def sphere(radius: float, centre: ArrayLike) -> Solid:
     """Ball of a radius in metres."""
-    quadric = np.diag([1.0, 1.0, 1.0, -(radius**2)])
-    return _placed(Solid(np.zeros((0, 4)), quadric), np.eye(3), centre)
+    return _placed(Solid(np.diag([1.0, 1.0, 1.0, -(radius**2)])[None]), np.eye(3), centre)
 
 
 def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Cylinder along its own z axis, with flat ends."""
-    quadric = np.diag([1.0, 1.0, 0.0, -(radius**2)])
-    return _placed(Solid(_ends(height), quadric), rotation, centre)
+    round_ = np.diag([1.0, 1.0, 0.0, -(radius**2)])
+    faces = np.concatenate([_flat(_ends(height)).faces, round_[None]])
+    return _placed(Solid(faces), rotation, centre)
 
 
 def about_z(degrees: float) -> NDArray[np.float64]:
@@ -185,8 +160,15 @@ def about_z(degrees: float) -> NDArray[np.float64]:
 
 
 def _ends(height: float) -> NDArray[np.float64]:
-    """Top and bottom of a solid of that height about its origin."""
+    """Top and bottom, (2, 4), of a solid of that height about its origin."""
     return np.array([[0, 0, 1, -height / 2], [0, 0, -1, -height / 2]])
+
+
+def _flat(planes: NDArray[np.float64]) -> Solid:
+    """The solid of planar faces: plane equations (F, 4)."""
+    faces = np.zeros((len(planes), 4, 4))
+    faces[:, 3] = faces[:, :, 3] = planes * (0.5, 0.5, 0.5, 1)
+    return Solid(faces)
 
 
 def _placed(solid: Solid, rotation: ArrayLike, centre: ArrayLike) -> Solid:

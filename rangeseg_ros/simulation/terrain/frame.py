@@ -53,7 +53,7 @@ def simulate_terrain(
     origin = scene.pose.position
     rays = camera.rays.astype(np.float64) @ scene.pose.rotation.T
     depth, face = cast([piece.solid for piece in scene.pieces], origin, rays)
-    last = np.cumsum([len(piece.solid.planes) for piece in scene.pieces])
+    last = np.cumsum([len(piece.solid.faces) for piece in scene.pieces])
     piece = np.where(face < 0, -1, np.searchsorted(last, face, side='right'))
     said = [(p.terrain, p.size, p.seen == 'mirror', p.seen == 'nothing') for p in scene.pieces]
     columns = zip(*said, (UNKNOWN, 0.0, False, False), strict=True)
