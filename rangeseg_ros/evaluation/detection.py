@@ -18,20 +18,11 @@ LEVEL = 0.95
 
 
 class Detection(NamedTuple):
-    """Scenes with a test piece of one size at one distance.
+    """Scenes with a test piece of one size (metres, of ramps degrees) at one distance (metres).
 
-    Attributes
-    ----------
-    kind : str
-    size, distance : float
-        Metres; the size of ramps is in degrees.
-    scenes, detected, ground : int
-        In which the piece is in sight, in which most of it has its class, and in which most of it
-        is called ground.
-    bound : float
-        Lower confidence bound of the probability that it is detected.
-    worst : str
-        The scene in which the least of it was found, and its share.
+    `scenes` are those in which it is in sight, `detected` those in which most of it has its class,
+    `ground` those in which most of it is called ground. `bound` is the lower confidence bound of
+    the probability that it is detected, `worst` the scene in which the least of it was found.
     """
 
     kind: str

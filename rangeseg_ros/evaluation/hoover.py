@@ -28,14 +28,10 @@ class RegionClass(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """Classes of all regions at one tolerance.
+    """`RegionClass` of all regions of the truth (G,) and the segmentation (M,) at one tolerance.
 
-    Attributes
-    ----------
-    truth, labels : (G,), (M,) int8
-        `RegionClass` of each region of the truth and the segmentation, in the order of `Overlap`.
-    matches : dict
-        Label in the truth -> label in the segmentation, for the regions in class CORRECT.
+    In the order of `Overlap`. `matches` takes labels of correct regions of the truth to those of
+    the segmentation.
     """
 
     truth: NDArray[np.int8]

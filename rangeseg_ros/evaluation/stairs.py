@@ -17,16 +17,10 @@ _LEAST = 2
 
 
 class StairsCheck(NamedTuple):
-    """The staircase of one scene, and what was found of it.
+    """The treads of a scene's staircase in sight, and what was found of it.
 
-    Attributes
-    ----------
-    in_sight : int
-        Treads of the true one in sight; 0 where there are no stairs.
-    found : (int, float, float) or None
-        Treads, and errors of rise and run, metres; None where it was not found.
-    false : int
-        Number of staircases found that are not there.
+    `found` are treads, and errors of rise and run, metres; `false` counts staircases that are not
+    there.
     """
 
     in_sight: int

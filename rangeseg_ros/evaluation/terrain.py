@@ -63,22 +63,12 @@ def write_table(path: Path, images: Iterable[TerrainRow]) -> None:
 
 
 class Shares(NamedTuple):
-    """What became of the pixels of one image.
+    """What became of the pixels of one image: (4, 4) by true and found class.
 
-    Attributes
-    ----------
-    name, kind : str
-        Of the image.
-    pixels : (4, 4) int64
-        By true and found class.
-    obstacles : (2, len(SIZES), 4) float64
-        Pixels of obstacles by height and distance in whole metres, and those that were found.
-    stairs : StairsCheck
-    confidence : float
-        That the ground seen is the one that the robot stands on.
-    own : bool
-        Whether it is: most of what is called ground, or where nothing is, of the nearest hundredth
-        of the pixels.
+    `obstacles` (2, len(SIZES), 4) are pixels of obstacles by height and distance in whole metres,
+    and those that were found. `confidence` is that the ground seen is the one that the robot
+    stands on; `own`, whether it is: most of what is called ground, or where nothing is, of the
+    nearest hundredth of the pixels.
     """
 
     name: str

@@ -20,21 +20,11 @@ NOT_PLANAR = 65535
 
 @dataclass(frozen=True, eq=False)
 class TruePlane:
-    """Exact plane of a visible region: normal . p + distance = 0 in the sensor's frame.
+    """Exact plane of a visible region of `count` pixels, in the sensor's frame, metres.
 
-    Attributes
-    ----------
-    label : int
-        Value in the truth image, 1...
-    face : int
-        Number of the face in its scene: the identity that persists from frame to frame, shared
-        by all regions into which occluders cut the face.
-    normal : (3,) float64
-        Unit normal towards the sensor.
-    distance : float
-        Distance of the origin from the plane, metres, positive.
-    count : int
-        Number of pixels.
+    normal . p + distance = 0, with the unit normal (3,) towards the sensor. `label` is its value
+    in the truth image, 1...; `face` the number of its face in the scene, which persists from frame
+    to frame, and which all regions share into which occluders cut the face.
     """
 
     label: int
@@ -46,18 +36,11 @@ class TruePlane:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A simulated depth image and its truth.
+    """A simulated depth image, its truth, and its camera.
 
-    Attributes
-    ----------
-    depth : (H, W) uint16 or float32
-        Along the optical axis: millimetres (uint16) or metres (float32); 0 = no measurement.
-    labels : (H, W) uint16
-        4-connected visible regions of planar faces; 0 = no measurement, 65535 = not planar.
-    planes : list of TruePlane
-        Their exact equations in the camera's optical frame.
-    camera : Camera
-        Intrinsics.
+    `depth` (H, W) is along the optical axis, millimetres (uint16) or metres (float32), 0 = no
+    measurement; `labels` (H, W) are the 4-connected visible regions of planar faces, 0 = no
+    measurement, `NOT_PLANAR` on curved ones.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]

@@ -36,21 +36,12 @@ NOISES = ('measured', 'correlated', 'independent', 'none')
 
 @dataclass(frozen=True)
 class Kinect(Sensor):
-    """Kinect v1.
+    """Kinect v1, with a choice of its noise.
 
-    Attributes
-    ----------
-    noise : {'measured', 'correlated', 'independent', 'none'}
-        measured: fixed distortion, vertical bands, correlated noise, blind zones. independent:
-        sigma = 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the
-        same, correlated over 1.5 pixels as by block matching. These three quantise disparity to
-        1/8 pixel and depth to millimetres. none: exact metres. All have the shadows of the
-        projector.
-
-    Raises
-    ------
-    ValueError
-        Unknown noise.
+    measured: fixed distortion, vertical bands, correlated noise, blind zones. independent: sigma =
+    0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the same, correlated
+    over 1.5 pixels as by block matching. These three quantise disparity to 1/8 pixel and depth to
+    millimetres. none: exact metres. All have the shadows of the projector.
     """
 
     noise: str = 'measured'
@@ -70,9 +61,8 @@ class Kinect(Sensor):
         if self.noise == 'none':
             return np.where(blind, 0, depth).astype(np.float32)
         if self.noise == 'measured':
-            slope = slopes(inverse, camera)
-            blind |= blind_zones(depth, slope, smooth_field(depth.shape, (2.5, 2.5), random))
-            disparity = measured_disparity(depth, slope, self.seed, random)
+            disparity, zones = self._measured(depth, slopes(inverse, camera), random)
+            blind |= zones
         else:
             width = (1.5, 1.5) if self.noise == 'correlated' else None
             error = 0.0012 + 0.0019 * (depth - 0.4) ** 2
@@ -81,30 +71,32 @@ class Kinect(Sensor):
         # One quantum of disparity stands for infinity: nothing is measured beyond 65 m.
         return millimetres(1 / (QUANTUM * np.maximum(np.rint(disparity), 1)), ~blind)
 
+    def _measured(
+        self, depth: NDArray[np.float64], slope: NDArray[np.float64], random: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Disparity as real sensors see `depth`, quanta before rounding, and what they do not see.
+
+        The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame
+        with a quarter of the pattern's variance, and pixel noise of 0.37 quanta correlated over 2
+        pixels that grows with the tangent `slope` of the angle of incidence. These reproduce the
+        0.45 quanta of residual noise (quantisation included) and its autocorrelation (0.5 at
+        1.4-1.9 pixels) of real frames. Nothing is seen nearer than 0.8 m, in the last eight
+        columns, and, with ragged borders, on surfaces seen at more than about 80 degrees.
+        """
+        ragged = 2 * smooth_field(depth.shape, (2.5, 2.5), random)
+        blind = np.degrees(np.arctan(slope)) + ragged > 80
+        blind |= depth < 0.8
+        blind[:, -8:] = True
+        fresh = 0.25 * smooth_field(depth.shape, _distortion_scale(depth.shape[1]), random)
+        noise = 0.37 * (1 + 0.25 * np.maximum(slope - 0.7, 0))
+        noise = noise * smooth_field(depth.shape, (2.0, 2.0), random)
+        pattern = sensor_pattern(depth.shape, self.seed)
+        return 1 / (QUANTUM * depth) + pattern + fresh + noise, blind
+
 
 def kinect_camera(width: int = 640, height: int = 480) -> Camera:
     """Intrinsics of a Kinect whose image of the same field of view has that many columns."""
     return resize(Kinect.camera, width, height)
-
-
-def measured_disparity(
-    depth: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    sensor_seed: int,
-    random: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Disparity, in quanta and before rounding, as real sensors see `depth`.
-
-    The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame with
-    a quarter of the pattern's variance, and pixel noise of 0.37 quanta correlated over 2 pixels
-    that grows with obliquity (`slope`, the tangent of the angle of incidence). These reproduce the
-    0.45 quanta of residual noise (quantisation included) and its autocorrelation (0.5 at 1.4-1.9
-    pixels) of real frames.
-    """
-    fresh = 0.25 * smooth_field(depth.shape, _distortion_scale(depth.shape[1]), random)
-    noise = 0.37 * (1 + 0.25 * np.maximum(slope - 0.7, 0))
-    noise = noise * smooth_field(depth.shape, (2.0, 2.0), random)
-    return 1 / (QUANTUM * depth) + sensor_pattern(depth.shape, sensor_seed) + fresh + noise
 
 
 @lru_cache(maxsize=4)
@@ -138,17 +130,3 @@ def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float
 def _distortion_scale(width: int) -> tuple[float, float]:
     """Kernel widths of the smooth distortion over columns and rows, pixels."""
     return 26 * width / 640, 45 * width / 640
-
-
-def blind_zones(
-    depth: NDArray[np.float64], slope: NDArray[np.float64], ragged: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """(H, W) True where real sensors measure nothing, shadows and dark surfaces apart.
-
-    Nearer than 0.8 m, in the last eight columns and, with borders as ragged as a field of unit
-    variance, on surfaces seen at more than about 80 degrees.
-    """
-    blind: NDArray[np.bool_] = np.degrees(np.arctan(slope)) + 2 * ragged > 80
-    blind |= depth < 0.8
-    blind[:, -8:] = True
-    return blind

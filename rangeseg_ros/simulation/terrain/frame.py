@@ -18,21 +18,12 @@ LEAST = 0.05
 
 
 class TerrainFrame(NamedTuple):
-    """A simulated depth image and its truth.
+    """A simulated depth image, as the sensor delivers it, and its truth; all (H, W), metres.
 
-    Attributes
-    ----------
-    depth : (H, W) uint16 or float32
-        As the sensor delivers it.
-    terrain : (H, W) uint8
-        True class; 0 where nothing is measured or the class is not judged (lower than
-        obstacles, less deep than drops).
-    height : (H, W) float32
-        True height above the ground below the point, metres; NaN where nothing is measured.
-    size : (H, W) float32
-        Height of the whole object, or depth of the drop, metres; 0 for ground.
-    crossing : (H, W) float32
-        Depth at which the ray crosses the ground continued, metres; inf where it does not.
+    `terrain` is the true class, 0 where nothing is measured or the class is not judged (lower than
+    obstacles, less deep than drops). `height` is that above the ground below the point, NaN where
+    nothing is measured; `size` the height of the whole object, or the depth of the drop, 0 for
+    ground; `crossing` the depth at which the ray crosses the ground continued, inf for none.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]

@@ -33,17 +33,10 @@ class Wave(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A solid and what it is to a robot.
+    """A solid and what it is to a robot: its class of terrain.
 
-    Attributes
-    ----------
-    solid : Solid
-    terrain : int
-        Its class.
-    size : float
-        How far the whole object stands above the ground, or how deep the drop is, metres.
-    seen : {'surface', 'mirror', 'nothing'}
-        Whether the surface is measured, the mirror image behind it, or nothing.
+    `size` tells how far the whole object stands above the ground, or how deep the drop is, metres;
+    `seen` whether the 'surface' is measured, the 'mirror' image behind it, or 'nothing'.
     """
 
     solid: Solid
@@ -56,22 +49,10 @@ class Piece(NamedTuple):
 class Terrain:
     """A scene: what there is, the ground as if nothing interrupted it, and the camera.
 
-    Attributes
-    ----------
-    kind : str
-        Of `KINDS` or `HARD`.
-    pieces : sequence of Piece
-    ground : sequence of Solid
-        The ground continued, without holes and edges.
-    pose : Pose
-    waves : sequence of Wave
-        Added to the ground.
-    stairs : dict
-        `direction`, `count`, `rise`, `run` of a staircase; empty without one.
-    errors : (float, float)
-        Of what the robot is told: degrees of up about each axis, metres of the height.
-    relief : float
-        Standard deviation of the height of rough ground, metres.
+    `ground` is that without holes and edges; the waves are added to it, and to rough ground noise
+    of the standard deviation `relief`, metres. `stairs` has `direction`, `count`, `rise`, `run` of
+    a staircase, or nothing; `errors` are those of what the robot is told: degrees of up about each
+    axis, metres of the height.
     """
 
     kind: str
