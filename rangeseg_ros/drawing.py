@@ -59,20 +59,9 @@ def grey(inverse: NDArray) -> NDArray[np.uint8]:
 def overlay(
     inverse: NDArray, labels: NDArray[np.uint16], planes: Sequence[Plane] = ()
 ) -> NDArray[np.uint8]:
-    """Colour the labels over a grey picture of the range image.
+    """Colour labels (H, W) over a grey picture of the inverse range; (H, W, 3) uint8 RGB.
 
-    Parameters
-    ----------
-    inverse : (H, W) float
-        Inverse range, 0 where nothing was measured (`RangeImage.inverse`).
-    labels : (H, W) uint16
-        0 = no plane, shown grey.
-    planes : sequence of Plane
-        When given, colours follow the planes' ids, which are also written on them.
-
-    Returns
-    -------
-    (H, W, 3) uint8 RGB
+    Colours follow the ids of `planes`, where they are given, which are also written on them.
     """
     numbers = np.arange(int(labels.max(initial=0)) + 1)
     for plane in planes:

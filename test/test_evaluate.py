@@ -11,7 +11,7 @@ from pcd_files import literal_lzf
 
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
-from rangeseg_ros.evaluation.pictures import (
+from rangeseg_ros.evaluation.measure import (
     CORRECT,
     MISSED,
     NO_DATA,

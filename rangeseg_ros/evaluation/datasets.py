@@ -36,11 +36,7 @@ from rangeseg_ros.segcomp.files import (
     read_perceptron,
     read_raster,
 )
-from rangeseg_ros.segcomp.geometry import (
-    abw_calibration,
-    abw_range_image,
-    perceptron_range_image,
-)
+from rangeseg_ros.segcomp.geometry import abw_calibration, abw_range_image, perceptron_range_image
 
 
 class Sample(NamedTuple):
@@ -142,6 +138,9 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
         (Case(path.stem, path, path, read_scan) for path in _sorted(folder, '*.pcd')),
     ):
         cases = list(layout)
+        for case in cases:
+            if not case.truth.is_file():
+                raise EvaluationError(f'{case.image}: no ground truth {case.truth.name}')
         if cases:
             return _distinct(cases)
     raise EvaluationError(
@@ -166,7 +165,6 @@ def _segcomp_cases(folder: Path) -> Iterator[Case]:
         if not match or path.name not in (match[0], f'{match[0]}.range'):
             continue
         truth = folder / f'{match[0]}.gt-seg'
-        _require(path, truth)
         sensor, split, number = match.groups()
         read = partial(read_segcomp, sensor=sensor, split=split, number=int(number))
         yield Case(match[0], path, truth, read, sensor, split)
@@ -176,7 +174,6 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     planes = _true_planes(folder / 'planes.csv')
     for path in _sorted(folder, 'depth/*.png'):
         truth = folder / 'truth' / path.name
-        _require(path, truth)
         known = planes.get(path.stem, {})
         read = partial(
             read_depth_case, camera=folder / 'camera.yaml', min_pixels=min_pixels, planes=known
@@ -187,7 +184,6 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
 def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     for path in sorted([*folder.glob('**/depth.png'), *folder.glob('**/depth.tiff')]):
         truth = path.with_name('truth.png')
-        _require(path, truth)
         camera = path.with_name('camera.txt')
         if not camera.exists():
             camera = path.with_name('camera.yaml')
@@ -198,11 +194,6 @@ def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
 
 def _sorted(folder: Path, pattern: str) -> list[Path]:
     return sorted(folder.glob(pattern), key=natural_order)
-
-
-def _require(image: Path, truth: Path) -> None:
-    if not truth.is_file():
-        raise EvaluationError(f'{image}: no ground truth {truth.name}')
 
 
 def _true_planes(path: Path) -> dict[str, dict[int, tuple[float, ...]]]:

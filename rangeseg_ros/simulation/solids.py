@@ -75,10 +75,11 @@ def _enter(
     A ray is inside between the last face that it enters by and the first that it leaves by.
     """
     for i in range(start, after):
-        origin, direction = origins[i if len(origins) > 1 else 0], directions[i]
+        x, y, z = origins[i if len(origins) > 1 else 0]
+        u, v, w = directions[i]
         entry, exit_, entered = -np.inf, distance[i], -1
         for k in range(len(faces)):
-            inside, outside = _interval(faces[k], origin, direction)
+            inside, outside = _interval(faces, k, x, y, z, u, v, w)
             if inside > entry:
                 entry, entered = inside, k
             exit_ = min(exit_, outside)
@@ -91,19 +92,17 @@ def _enter(
 
 @njit(cache=True)
 def _interval(
-    face: NDArray[np.float64], origin: NDArray[np.float64], direction: NDArray[np.float64]
+    q: NDArray[np.float64], k: int, x: float, y: float, z: float, u: float, v: float, w: float
 ) -> tuple[float, float]:
-    """Ray parameters t between which p'Qp = a t^2 + 2 b t + c <= 0; (inf, -inf) for none."""
-    a = b = c = 0.0
-    for i in range(3):
-        gradient, bend = face[i, 3], 0.0
-        for j in range(3):
-            gradient += face[i, j] * origin[j]
-            bend += face[i, j] * direction[j]
-        a += direction[i] * bend
-        b += direction[i] * gradient
-        c += origin[i] * (gradient + face[i, 3])
-    c += face[3, 3]
+    """Between which t on a ray p'Qp = a t^2 + 2 b t + c <= 0, Q = q[k]; (inf, -inf) for none."""
+    a, b = 0.0, q[k, 3, 0] * u + q[k, 3, 1] * v + q[k, 3, 2] * w
+    c = 2 * (q[k, 3, 0] * x + q[k, 3, 1] * y + q[k, 3, 2] * z) + q[k, 3, 3]
+    if q[k, 0, 0] + q[k, 1, 1] + q[k, 2, 2] > 0:  # no plane
+        for i in range(3):
+            gradient = q[k, i, 0] * x + q[k, i, 1] * y + q[k, i, 2] * z
+            a += (u, v, w)[i] * (q[k, i, 0] * u + q[k, i, 1] * v + q[k, i, 2] * w)
+            b += (u, v, w)[i] * gradient
+            c += (x, y, z)[i] * gradient
     if a < 1e-15:  # a plane, or along a cylinder's axis
         if b == 0:
             return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
