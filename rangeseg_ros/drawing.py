@@ -96,9 +96,9 @@ def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
 
 
 def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) -> None:
-    """Write `text` where the region is widest, if it is wide enough.
+    """Write `text` where the region is widest, if it is wide enough, inside of the picture.
 
-    `region` has every second row and column of `picture`.
+    White, with a black outline; `region` has every second row and column of `picture`.
     """
     x, y, width, height = cv2.boundingRect(region.view(np.uint8))
     part = region[y : y + height, x : x + width].view(np.uint8)
@@ -107,12 +107,7 @@ def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) 
     _, radius, _, (column, row) = cv2.minMaxLoc(inside)
     if radius < 4:
         return
-    scale = min(0.8, radius / 15 + 0.2)
-    _write(picture, text, (2 * (x + column - 1), 2 * (y + row - 1)), scale)
-
-
-def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale: float) -> None:
-    """Write white text with a black outline, moved where needed so that it lies inside."""
+    scale, centre = min(0.8, radius / 15 + 0.2), (2 * (y + row - 1), 2 * (x + column - 1))
     # The outline grows from the text itself: bold letters are wider in some versions of OpenCV.
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
     (wide, high), below = cv2.getTextSize(text, font, scale, 1)
@@ -121,7 +116,7 @@ def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale
     outline = cv2.dilate(letters, _SQUARE)
     top, left = (
         max(0, min(middle - size // 2, full - size))
-        for middle, size, full in zip(centre[::-1], letters.shape, picture.shape, strict=False)
+        for middle, size, full in zip(centre, letters.shape, picture.shape, strict=False)
     )
     part = picture[top : top + letters.shape[0], left : left + letters.shape[1]]
     rows, columns = part.shape[:2]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.evaluation.terrain import TerrainRow, write_table
+from rangeseg_ros.evaluation.terrain import write_table
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
@@ -220,8 +220,7 @@ def _write_terrains(
             _write_depth(folder, name, frame.depth, frame.terrain)
             for part in ('height', 'size', 'crossing'):
                 write_image(folder / part / f'{name}.tiff', getattr(frame, part))
-            known = stated(scene, number)
-            table.append(TerrainRow(name, scene.kind, sensor, *known, scene.stairs))
+            table.append((name, sensor, scene, stated(scene, number)))
         write_table(folder / 'terrain.csv', table)
     click.echo(f'{output}: {len(scenes)} images')
 

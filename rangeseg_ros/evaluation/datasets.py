@@ -31,7 +31,6 @@ from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.pcd import PcdError, read_pcd
 from rangeseg_ros.segcomp.files import (
     FIRST_REGION,
-    RegionAngle,
     SegcompError,
     read_perceptron,
     read_raster,
@@ -44,7 +43,7 @@ class Sample(NamedTuple):
 
     image: RangeImage
     truth: Truth
-    angles: list[RegionAngle]
+    angles: list[tuple[int, int, float]]
     planes: dict[int, NDArray[np.float64]]
 
 

@@ -12,12 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_labels
-from rangeseg_ros.segcomp.files import (
-    RegionAngle,
-    read_angles,
-    read_normals,
-    read_segmentation,
-)
+from rangeseg_ros.segcomp.files import read_angles, read_normals, read_segmentation
 from rangeseg_ros.simulation.render import NOT_PLANAR
 
 SEGCOMP_SUFFIXES = ('.gt-seg', '.ms-seg')
@@ -60,7 +55,7 @@ def read_label_image(path: Path) -> NDArray[np.uint16]:
     return read_labels(path)
 
 
-def read_angles_beside(path: Path) -> list[RegionAngle]:
+def read_angles_beside(path: Path) -> list[tuple[int, int, float]]:
     """Angles of the `.gt-ang` file beside a `.gt-seg`, if there is one."""
     path = path.with_suffix('.gt-ang')
     return read_angles(path) if path.exists() else []

@@ -27,6 +27,7 @@ from rangeseg_ros.evaluation.stairs import (
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image
+from rangeseg_ros.simulation.terrain.scene import Terrain
 
 REACH = {'realsense': 2.5}
 """Metres up to which a sensor's ground and obstacles count; 3.5 for all others."""
@@ -41,25 +42,17 @@ _STAIRS = ('direction', 'count', 'rise', 'run')
 _DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 'tiff'))
 
 
-class TerrainRow(NamedTuple):
-    """What is known of an image: `up` and `height` as the robot knows them."""
-
-    name: str
-    kind: str
-    sensor: str
-    up: NDArray[np.float64]
-    height: float
-    stairs: Mapping[str, Any]
-
-
-def write_table(path: Path, images: Iterable[TerrainRow]) -> None:
-    """Write the CSV of what is known of each image."""
+def write_table(
+    path: Path, images: Iterable[tuple[str, str, Terrain, tuple[NDArray[np.float64], float]]]
+) -> None:
+    """Write the CSV of images: name, sensor, scene, and up and height as the robot knows them."""
     with path.open('w', newline='') as file:
         rows = csv.writer(file, lineterminator='\n')
         rows.writerow([*_COLUMNS, *_STAIRS])
-        for *names, up, height, stairs in images:
+        for name, sensor, scene, (up, height) in images:
             known = [f'{value:.6f}' for value in (*up, height)]
-            rows.writerow([*names, *known, *(stairs.get(column, '') for column in _STAIRS)])
+            stairs = (scene.stairs.get(column, '') for column in _STAIRS)
+            rows.writerow([name, scene.kind, sensor, *known, *stairs])
 
 
 class Shares(NamedTuple):

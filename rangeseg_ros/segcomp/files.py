@@ -13,7 +13,6 @@ from __future__ import annotations
 import os
 import struct
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,18 +83,9 @@ def read_perceptron(path: str | os.PathLike[str]) -> NDArray[np.uint16]:
     return (values & _RANGE_MASK).astype(np.uint16)
 
 
-class RegionAngle(NamedTuple):
-    """Angle between the normals of two adjacent regions of a ground truth, degrees."""
-
-    first: int
-    second: int
-    degrees: float
-
-
-def read_angles(path: str | os.PathLike[str]) -> list[RegionAngle]:
+def read_angles(path: str | os.PathLike[str]) -> list[tuple[int, int, float]]:
     """Read a `.gt-ang` file: a count, then lines `regionA regionB degrees`."""
-    rows = _read_rows(path, 3, integers=2)
-    return [RegionAngle(_label(a), _label(b), angle) for a, b, angle in rows]
+    return [(_label(a), _label(b), angle) for a, b, angle in _read_rows(path, 3, integers=2)]
 
 
 def read_normals(path: str | os.PathLike[str]) -> dict[int, NDArray[np.float64]]:

@@ -67,7 +67,11 @@ class TimeOfFlight(Sensor):
         stray = _STRAY * _blurred(light, spread)
         weighted += _STRAY * _blurred(weighted, spread) + _DETOUR * stray
         measured = weighted / (light + stray)
-        measured += self._fixed(camera.shape, measured)
+        # What does not change from frame to frame.
+        fixed = np.random.default_rng([self.seed, 11])
+        pattern = _OFFSET * smooth_field(camera.shape, 2 * (0.12 * camera.width,), fixed)
+        phase = 2 * np.pi * measured / _PERIOD + fixed.uniform(0, 2 * np.pi)
+        measured += pattern + _WIGGLING * np.sin(phase)
         # Metres at 2 m head-on.
         noise = np.zeros(camera.shape)
         for deviation, columns, rows in _NOISE:
@@ -75,15 +79,6 @@ class TimeOfFlight(Sensor):
         measured += noise / np.sqrt(4 * light)
         dim = light < 0.015 * np.exp(0.3 * smooth_field(camera.shape, (2.0, 2.0), random))
         return millimetres(measured / ray, ~dim & np.isfinite(depth) & (measured > 0.1))
-
-    def _fixed(self, shape: tuple[int, int], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Error of the range that does not change from frame to frame, metres."""
-        random = np.random.default_rng([self.seed, 11])
-        width = 0.12 * shape[1]
-        pattern = _OFFSET * smooth_field(shape, (width, width), random)
-        phase = random.uniform(0, 2 * np.pi)
-        wiggling: NDArray[np.float64] = _WIGGLING * np.sin(2 * np.pi * distance / _PERIOD + phase)
-        return pattern + wiggling
 
 
 def _blurred(image: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:
