@@ -20,7 +20,7 @@ from rangeseg_ros.evaluation.measure import (
     class_picture,
 )
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.segcomp.geometry import abw_calibration
+from rangeseg_ros.segcomp import abw_calibration
 
 
 @pytest.fixture

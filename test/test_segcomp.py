@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from segcomp_files import raster
 
-from rangeseg_ros.segcomp import files as segcomp
-from rangeseg_ros.segcomp import geometry as geometry
-from rangeseg_ros.segcomp.files import SegcompError
+from rangeseg_ros import segcomp
+from rangeseg_ros.segcomp import SegcompError
 
 
 def abw_points(values, calibration):
@@ -153,7 +152,7 @@ def published_abw(v, r, c, offset, scale, f):
 def test_abw_points_are_the_published_ones(number, split, constants):
     values = np.random.default_rng(2).integers(0, 256, (512, 512))
     values[0, 0] = 0
-    points = abw_points(values, geometry.abw_calibration(number, split))
+    points = abw_points(values, segcomp.abw_calibration(number, split))
     assert np.isnan(points[values == 0]).all()
     # The published z counts from range value 255 towards the sensor, whose centre is where
     # x = y = 0 for all pixels, so where v / scale + offset = 0.
@@ -161,7 +160,7 @@ def test_abw_points_are_the_published_ones(number, split, constants):
     for r, c in ((0, 1), (511, 511), (100, 400), (255, 255)):
         x, y, z = published_abw(max(values[r, c], 1), r, c, *constants)
         values[r, c] = max(values[r, c], 1)
-        point = abw_points(values, geometry.abw_calibration(number, split))[r, c]
+        point = abw_points(values, segcomp.abw_calibration(number, split))[r, c]
         assert point * 1000 == pytest.approx((x, -y, centre - z), rel=1e-6)
 
 
@@ -183,7 +182,7 @@ def published_perceptron(v, r, c):
 
 def test_perceptron_points_are_the_published_ones():
     values = np.random.default_rng(3).integers(0, 4096, (512, 512))
-    points = geometry.perceptron_points(values)
+    points = segcomp.perceptron_points(values)
     for r, c in ((0, 0), (511, 511), (0, 511), (37, 402), (256, 255)):
         x, y, z = published_perceptron(values[r, c], r, c)
         assert points[r, c] * 100 == pytest.approx((-x, -y, z))

@@ -29,13 +29,15 @@ from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.pcd import PcdError, read_pcd
-from rangeseg_ros.segcomp.files import (
+from rangeseg_ros.segcomp import (
     FIRST_REGION,
     SegcompError,
+    abw_calibration,
+    abw_range_image,
+    perceptron_range_image,
     read_perceptron,
     read_raster,
 )
-from rangeseg_ros.segcomp.geometry import abw_calibration, abw_range_image, perceptron_range_image
 
 
 class Sample(NamedTuple):

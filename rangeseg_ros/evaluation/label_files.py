@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_labels
-from rangeseg_ros.segcomp.files import read_angles, read_normals, read_segmentation
+from rangeseg_ros.segcomp import read_angles, read_normals, read_segmentation
 from rangeseg_ros.simulation.render import NOT_PLANAR
 
 SEGCOMP_SUFFIXES = ('.gt-seg', '.ms-seg')
