@@ -20,7 +20,7 @@ from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.render import simulate
-from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
+from rangeseg_ros.simulation.scenes import kinect_room, walk
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM, sensor_pattern
 from rangeseg_ros.simulation.sensors.sensor import resize
@@ -102,8 +102,7 @@ def seen_by(name, camera, rooms, count):
     """Planes of so many frames of walks through rooms, as a sensor sees them."""
     sensor, segmenter, seen = SENSORS[name](SENSOR_SEED), Segmenter(), []
     for seed in rooms:
-        room = kinect_room(seed)
-        scene = Scene(room.solids, walk(room.poses[0], seed, 360), room.dark)
+        scene = kinect_room(seed, 360, walk)
         for k in np.arange(0, 360, 360 * len(rooms) / count).astype(int):
             view = simulate(scene, sensor, camera, frame=k, seed=seed)
             seen.append(sightings(segmenter, RangeImage.from_depth(view.depth, camera)))

@@ -5,6 +5,7 @@ World frame: x and y along the floor, z up, metres; the floor is z = 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -65,33 +66,6 @@ class Scene:
         return np.column_stack([world[:, :3] @ pose.rotation, distance])
 
 
-def kinect_room(seed: int, frames: int = 1) -> Scene:
-    """Floor, two walls and three to five boxes at any orientation, as a hand-held Kinect sees it.
-
-    The boxes rest on the floor, stand on one another, lie tilted or float; the camera is 0.8 to
-    1.8 m above the floor and tilted down; depth is about 0.8 to 5 m.
-
-    The same seed gives the same room and, for its first frames, the same `camera_motion`.
-    """
-    random = np.random.default_rng([seed, 1])
-    room = _Room(random)
-    for _ in range(random.integers(3, 6)):
-        room.add_box()
-    return room.scene(camera_motion(room.pose, seed, frames))
-
-
-def curved_scene(seed: int, frames: int = 1) -> Scene:
-    """`kinect_room` with a ball, a standing cylinder, and one or two boxes."""
-    random = np.random.default_rng([seed, 2])
-    # The curved objects stand in front, so that no box hides them.
-    room = _Room(random, nearest=2.5)
-    room.add_ball()
-    room.add_cylinder()
-    for _ in range(random.integers(1, 3)):
-        room.add_box()
-    return room.scene(camera_motion(room.pose, seed, frames))
-
-
 def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
     """Hand-held motion about a pose, smooth and seeded, at 30 frames per second.
 
@@ -128,6 +102,37 @@ def walk(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
         about = pose.position - (middle, 0, 0)
         poses.append(Pose(rotation @ pose.rotation, rotation @ about + (middle, 0, 0)))
     return tuple(poses)
+
+
+Motion = Callable[[Pose, int, int], tuple[Pose, ...]]
+"""Poses from a first one, a seed and a number of frames."""
+
+
+def kinect_room(seed: int, frames: int = 1, motion: Motion = camera_motion) -> Scene:
+    """Floor, two walls and three to five boxes at any orientation, as a hand-held Kinect sees it.
+
+    The boxes rest on the floor, stand on one another, lie tilted or float; the camera is 0.8 to
+    1.8 m above the floor and tilted down; depth is about 0.8 to 5 m.
+
+    The same seed gives the same room and, for its first frames, the same motion.
+    """
+    random = np.random.default_rng([seed, 1])
+    room = _Room(random)
+    for _ in range(random.integers(3, 6)):
+        room.add_box()
+    return room.scene(motion(room.pose, seed, frames))
+
+
+def curved_scene(seed: int, frames: int = 1) -> Scene:
+    """`kinect_room` with a ball, a standing cylinder, and one or two boxes."""
+    random = np.random.default_rng([seed, 2])
+    # The curved objects stand in front, so that no box hides them.
+    room = _Room(random, nearest=2.5)
+    room.add_ball()
+    room.add_cylinder()
+    for _ in range(random.integers(1, 3)):
+        room.add_box()
+    return room.scene(camera_motion(room.pose, seed, frames))
 
 
 class _Room:
