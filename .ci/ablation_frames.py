@@ -39,7 +39,7 @@ from rangeseg_ros.evaluation.plane_errors import plane_errors
 from rangeseg_ros.evaluation.terrain import TerrainTask, shares
 from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
+from rangeseg_ros.simulation.scenes import kinect_room, walk
 
 ROOT = Path(__file__).parents[1]
 # Commands of `rangeseg simulate`.
@@ -246,8 +246,7 @@ def track_run(frames: Sequence[Any], parameters: Mapping[str, Any]) -> Figures:
 
 def tracked_room(seed: int, count: int = 12) -> list[Any]:
     """A walk through a room, segmented, at 5 Hz."""
-    room, frames = kinect_room(seed), []
-    scene = Scene(room.solids, walk(room.poses[0], seed, 6 * count), room.dark)
+    scene, frames = kinect_room(seed, 6 * count, walk), []
     for k in range(count):
         view = simulate_kinect(scene, frame=6 * k, seed=seed, sensor_seed=seed)
         found = Segmenter().segment(RangeImage.from_depth(view.depth, view.camera))

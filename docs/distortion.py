@@ -19,11 +19,10 @@ from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
-from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
+from rangeseg_ros.simulation.scenes import kinect_room, walk
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera, sensor_pattern
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM, sensor_pattern
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.sensors.stereo import distortion
 from rangeseg_ros.simulation.sensors.time_of_flight import _OFFSET
@@ -74,17 +73,10 @@ def simulated(name, count):
 
 def errors(name, count):
     """Root mean squares: the true error, that of what is learned, and this by its deviation."""
-    camera, segmenter, seen = camera_of(name), Segmenter(), []
-    for seed in ROOMS:
-        room = kinect_room(seed)
-        scene = Scene(room.solids, walk(room.poses[0], seed, 360), room.dark)
-        for k in np.arange(0, 360, 360 * len(ROOMS) / count).astype(int):
-            if name == 'kinect':
-                view = simulate_kinect(scene, camera, frame=k, seed=seed, sensor_seed=SENSOR_SEED)
-            else:
-                view = simulate(scene, SENSORS[name](SENSOR_SEED), camera, frame=k, seed=seed)
-            seen.append(sightings(segmenter, RangeImage.from_depth(view.depth, view.camera)))
-    cells = concatenate(seen)
+    camera = SENSORS[name](SENSOR_SEED).camera
+    if name == 'kinect':
+        camera = resize(camera, 320, 240)
+    cells = seen_by(name, camera, ROOMS, count)
     learned, inverse = calibrate(cells, camera.shape).distortion, np.median(cells.inverse)
     known = learned.deviation > 0
     field = learned.offset
@@ -106,12 +98,15 @@ def true_error(name, camera, inverse):
     return -offset * inverse**2 / np.linalg.norm(camera.rays.astype(float), axis=-1)
 
 
-def camera_of(name):
-    """Of 320x240, of 848x480, or its own."""
-    if name == 'kinect':
-        return kinect_camera(320, 240)
-    own = SENSORS[name](0).camera
-    return resize(own, 848, 480) if name == 'realsense' else own
+def seen_by(name, camera, rooms, count):
+    """Planes of so many frames of walks through rooms, as a sensor sees them."""
+    sensor, segmenter, seen = SENSORS[name](SENSOR_SEED), Segmenter(), []
+    for seed in rooms:
+        scene = kinect_room(seed, 360, walk)
+        for k in np.arange(0, 360, 360 * len(rooms) / count).astype(int):
+            view = simulate(scene, sensor, camera, frame=k, seed=seed)
+            seen.append(sightings(segmenter, RangeImage.from_depth(view.depth, camera)))
+    return concatenate(seen)
 
 
 def sightings(segmenter, image):

@@ -1,14 +1,17 @@
 """Draw the figures of the documents: python docs/figures.py [FOLDER], docs/ by default.
 
-docs/comparison.png: one frame, and the planes of RANSAC, OpenCV and this package.
 docs/terrain.png: depth, planes, and what they are to a robot.
 docs/normals.png: jump edges, and the normals that both methods reconstruct.
 docs/figures/planes.png, uncertainty.png: a Kinect's frame of a room and a stereo camera's.
 docs/figures/distortion.png: fixed pattern of a simulated Kinect, what is learned, what is left.
 docs/figures/map.png: the map of a walk through a room, from above and from a side.
 
-python docs/figures.py --detection DETECTION.json PICTURE.png draws what `rangeseg evaluate --json`
-says of test pieces.
+python docs/figures.py --detection DETECTION.json PICTURE.png: what `rangeseg evaluate --json` says
+of test pieces.
+
+python docs/figures.py --comparison DEPTH CAMERA.yaml PICTURE.png: a frame, and the planes of
+RANSAC, OpenCV and this package. docs/comparison.png is of the third depth image of ch5/rgbd of
+https://github.com/gaoxiang12/slambook2 (MIT licence).
 """
 
 import json
@@ -17,16 +20,17 @@ from pathlib import Path
 
 import benchmark
 import cv2
+import distortion as calibration
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from rangeseg_ros import Config, RangeImage, Segmenter, SequenceSegmenter, Transform
-from rangeseg_ros.core.calibration.calibrate import calibrate
-from rangeseg_ros.core.calibration.sightings import concatenate, find_sightings
+from rangeseg_ros.core.calibration.calibrate import calibrate, without_plane
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
-from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.cameras import read_camera
+from rangeseg_ros.io.images import read_depth, write_image
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
@@ -46,9 +50,13 @@ def main():
         found, picture = map(Path, sys.argv[2:])
         write_image(picture, detection(json.loads(found.read_text())['detection']))
         return
+    if sys.argv[1:2] == ['--comparison']:
+        depth, camera, picture = map(Path, sys.argv[2:])
+        image = RangeImage.from_depth(read_depth(depth), read_camera(camera))
+        write_image(picture, comparison(image))
+        return
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
     kinect, stereo = frame('kinect', 8, 1), frame('realsense', 3, 1)
-    write_image(folder / 'comparison.png', comparison(kinect))
     robots = [terrain('hole', 2), terrain('stairs up', 2)]
     write_image(folder / 'terrain.png', np.vstack(robots))
     write_image(folder / 'normals.png', normals(kinect))
@@ -56,7 +64,7 @@ def main():
     for name, picture in (('planes', in_colour), ('uncertainty', uncertainty)):
         pair = [fitted(picture(result)) for result in results]
         write_image(folder / 'figures' / f'{name}.png', np.hstack(pair))
-    write_image(folder / 'figures' / 'distortion.png', distortion(sensor_seed=1))
+    write_image(folder / 'figures' / 'distortion.png', distortion())
     write_image(folder / 'figures' / 'map.png', room_map(scene=8, seed=1))
 
 
@@ -82,6 +90,11 @@ def detection(rows):
         axes.set_yticks(range(len(sizes)), [f'{size:g}{unit}' for size in sizes])
         axes.tick_params(labelsize=7)
         axes.set_title(kind, fontsize=9)
+    return drawn(figure)
+
+
+def drawn(figure):
+    """Picture of a figure."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3]
@@ -126,13 +139,6 @@ def in_colour(result):
     return overlay(result.image.inverse, result.labels, result.planes)
 
 
-def without_plane(field, known):
-    """A field (H, W) less its least-squares plane over the known pixels: that part is free."""
-    v, u = np.indices(field.shape)
-    terms = np.stack([u, v, np.ones(field.shape)], axis=2)
-    return field - terms @ np.linalg.lstsq(terms[known], field[known], rcond=None)[0]
-
-
 def normals(image):
     """Jump edges, and the normals of methods normals and planes."""
     results = [Segmenter(Config(method=name)).segment(image) for name in METHODS]
@@ -141,19 +147,13 @@ def normals(image):
     return np.hstack([fitted(one) for one in pictures])
 
 
-def distortion(sensor_seed):
+def distortion():
     """Error of the inverse depth, blue to red for -0.004 to 0.004 / m: true, learned, left."""
-    camera, segmenter, seen = kinect_camera(320, 240), Segmenter(), []
-    for seed in range(4):
-        room = kinect_room(seed)
-        scene = Scene(room.solids, walk(room.poses[0], seed, 360), room.dark)
-        for k in range(0, 360, 36):
-            view = simulate_kinect(scene, camera, frame=k, seed=seed, sensor_seed=sensor_seed)
-            image = RangeImage.from_depth(view.depth, camera)
-            seen.append(find_sightings(segmenter.segment(image).labels, image))
-    learned = calibrate(concatenate(seen), camera.shape, camera).distortion.offset
+    camera = kinect_camera(320, 240)
+    cells = calibration.seen_by('kinect', camera, range(4), 40)
+    learned = calibrate(cells, camera.shape, camera).distortion.offset
     known = learned != 0
-    true = without_plane(QUANTUM * sensor_pattern(camera.shape, sensor_seed), known)
+    true = without_plane(QUANTUM * sensor_pattern(camera.shape, calibration.SENSOR_SEED), known)
     pictures = []
     for field in (true, learned, true - learned):
         shown = 255 * colormaps['RdBu_r'](np.clip(field / 0.008 + 0.5, 0, 1))[..., :3]
@@ -198,7 +198,6 @@ def room_map(scene, seed):
         pose = Transform(poses[k].rotation, poses[k].position)
         sequence.segment(image, k * 10**9 // 30, poses[k].rotation.T @ (0, 0, 1), pose)
     figure = Figure(figsize=(9, 4), layout='constrained')
-    canvas = FigureCanvasAgg(figure)
     # From above, and from a side: what is nearer covers the rest, what faces away is left out.
     for axes, (x, y, depth) in zip(figure.subplots(1, 2), ((0, 1, 2), (0, 2, 1)), strict=True):
         facing = [plane for plane in sequence.map.planes if plane.normal[depth] > 0]
@@ -207,8 +206,7 @@ def room_map(scene, seed):
                 axes.fill(ring[:, x], ring[:, y], color=colours([plane.id])[0] / 255)
         axes.set_aspect('equal')
         axes.grid()
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())[..., :3]
+    return drawn(figure)
 
 
 def frame(sensor, scene, seed):

@@ -65,17 +65,11 @@ def walked(scene: Scene, seed: int) -> Iterator[Frame]:
         yield Frame(stamp, image, *seen, pose, number[view.labels])
 
 
-def room_of(seed: int) -> Scene:
-    """A room and a walk through it."""
-    room = kinect_room(seed)
-    return Scene(room.solids, walk(room.poses[0], seed, FRAMES * STEP), room.dark)
-
-
 def measure_map(*seeds: str) -> None:
     """Planes per face, faces missed, errors, NEES and time, before and after the solution."""
     rows, solved, poses, single, found, seen, ghosts = [], [], [], [], 0, 0, 0
     for seed in map(int, seeds):
-        scene, random = room_of(seed), np.random.default_rng(seed)
+        scene, random = kinect_room(seed, FRAMES * STEP, walk), np.random.default_rng(seed)
         truth = np.vstack([solid.planes for solid in scene.solids])
         plane_map, spent, pixels = PlaneMap(CONFIG), [], np.zeros(len(truth), int)
         adjustment, walls = Adjustment(PoseNoise(0.005, np.radians(0.3))), []
@@ -176,7 +170,7 @@ def measure_odometry(*seeds: str) -> None:
     rows = {1: [], 2: [], 99: []}
     for seed in map(int, seeds):
         frames: list[Frame] = []
-        for frame in walked(room_of(seed), seed):
+        for frame in walked(kinect_room(seed, FRAMES * STEP, walk), seed):
             frames.append(frame)
             if len(frames) == 11:
                 for most, into in rows.items():

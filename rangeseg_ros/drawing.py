@@ -59,20 +59,9 @@ def grey(inverse: NDArray) -> NDArray[np.uint8]:
 def overlay(
     inverse: NDArray, labels: NDArray[np.uint16], planes: Sequence[Plane] = ()
 ) -> NDArray[np.uint8]:
-    """Colour the labels over a grey picture of the range image.
+    """Colour labels (H, W) over a grey picture of the inverse range; (H, W, 3) uint8 RGB.
 
-    Parameters
-    ----------
-    inverse : (H, W) float
-        Inverse range, 0 where nothing was measured (`RangeImage.inverse`).
-    labels : (H, W) uint16
-        0 = no plane, shown grey.
-    planes : sequence of Plane
-        When given, colours follow the planes' ids, which are also written on them.
-
-    Returns
-    -------
-    (H, W, 3) uint8 RGB
+    Colours follow the ids of `planes`, where they are given, which are also written on them.
     """
     numbers = np.arange(int(labels.max(initial=0)) + 1)
     for plane in planes:
@@ -81,7 +70,7 @@ def overlay(
     base = cv2.cvtColor(grey(inverse), cv2.COLOR_GRAY2RGB)
     picture: NDArray = cv2.addWeighted(base, 0.45, look_up(palette, labels), 0.55, 0)
     cv2.copyTo(base, (labels == 0).view(np.uint8), picture)
-    cv2.copyTo(np.zeros_like(base), _borders(labels).view(np.uint8), picture)
+    cv2.copyTo(np.zeros_like(base), (borders(labels) & (labels > 0)).view(np.uint8), picture)
     half = labels[::2, ::2].copy()
     for plane in planes:
         _write_id(picture, half == plane.label, str(plane.id))
@@ -98,18 +87,18 @@ def normals_picture(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 
 
-def _borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Pixels of a region whose right or lower neighbour has another label."""
-    borders = np.zeros(labels.shape, bool)
-    borders[:, :-1] |= labels[:, :-1] != labels[:, 1:]
-    borders[:-1] |= labels[:-1] != labels[1:]
-    return borders & (labels > 0)
+def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """Pixels whose right or lower neighbour has another label."""
+    border = np.zeros(labels.shape, bool)
+    border[:, :-1] |= labels[:, :-1] != labels[:, 1:]
+    border[:-1] |= labels[:-1] != labels[1:]
+    return border
 
 
 def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) -> None:
-    """Write `text` where the region is widest, if it is wide enough.
+    """Write `text` where the region is widest, if it is wide enough, inside of the picture.
 
-    `region` has every second row and column of `picture`.
+    White, with a black outline; `region` has every second row and column of `picture`.
     """
     x, y, width, height = cv2.boundingRect(region.view(np.uint8))
     part = region[y : y + height, x : x + width].view(np.uint8)
@@ -118,12 +107,7 @@ def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) 
     _, radius, _, (column, row) = cv2.minMaxLoc(inside)
     if radius < 4:
         return
-    scale = min(0.8, radius / 15 + 0.2)
-    _write(picture, text, (2 * (x + column - 1), 2 * (y + row - 1)), scale)
-
-
-def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale: float) -> None:
-    """Write white text with a black outline, moved where needed so that it lies inside."""
+    scale, centre = min(0.8, radius / 15 + 0.2), (2 * (y + row - 1), 2 * (x + column - 1))
     # The outline grows from the text itself: bold letters are wider in some versions of OpenCV.
     font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
     (wide, high), below = cv2.getTextSize(text, font, scale, 1)
@@ -132,7 +116,7 @@ def _write(picture: NDArray[np.uint8], text: str, centre: tuple[int, int], scale
     outline = cv2.dilate(letters, _SQUARE)
     top, left = (
         max(0, min(middle - size // 2, full - size))
-        for middle, size, full in zip(centre[::-1], letters.shape, picture.shape, strict=False)
+        for middle, size, full in zip(centre, letters.shape, picture.shape, strict=False)
     )
     part = picture[top : top + letters.shape[0], left : left + letters.shape[1]]
     rows, columns = part.shape[:2]

@@ -4,7 +4,7 @@ import numpy as np
 from segcomp_files import raster
 
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.segcomp.geometry import abw_calibration
+from rangeseg_ros.segcomp import abw_calibration
 
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 # Two walls that meet in the vertical line x = 0, z = 2.

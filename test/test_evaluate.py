@@ -11,7 +11,7 @@ from pcd_files import literal_lzf
 
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
-from rangeseg_ros.evaluation.pictures import (
+from rangeseg_ros.evaluation.measure import (
     CORRECT,
     MISSED,
     NO_DATA,
@@ -20,7 +20,7 @@ from rangeseg_ros.evaluation.pictures import (
     class_picture,
 )
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.segcomp.geometry import abw_calibration
+from rangeseg_ros.segcomp import abw_calibration
 
 
 @pytest.fixture

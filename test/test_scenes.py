@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.simulation import scenes
 from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import NOT_PLANAR, visible_regions
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, prism, sphere
-from rangeseg_ros.simulation.truth import NOT_PLANAR, visible_regions
 
 ORIGIN = np.zeros(3)
 UPRIGHT = np.eye(3)
@@ -49,11 +49,9 @@ def test_exact_hits(solid, direction, distance, face):
 
 def inside(solid: Solid, points, margin=1e-6):
     """Whether points lie in a solid, by a margin."""
-    deep = (points @ solid.normals.T + solid.offsets < -margin).all(axis=-1)
-    if solid.quadric is not None:
-        homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
-        deep &= np.einsum('...i,ij,...j', homogeneous, solid.quadric, homogeneous) < -margin
-    return deep
+    homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1)
+    values = np.einsum('...i,fij,...j->...f', homogeneous, solid.faces, homogeneous)
+    return (values < -margin).all(axis=-1)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -72,7 +70,7 @@ def test_first_hit_is_on_the_face_and_nothing_lies_before_it(seed):
     ]
     origins, directions = random.uniform(-3, 3, (2, 40, 3))
     distance, face = cast(solids, origins, directions)
-    owner = np.repeat(np.arange(5), [solid.face_count for solid in solids])
+    owner = np.repeat(np.arange(5), [len(solid.faces) for solid in solids])
     planes = np.vstack([solid.planes for solid in solids])
     steps = np.linspace(0, 1, 400)
     for origin, direction, reach, hit in zip(origins, directions, distance, face, strict=True):

@@ -124,4 +124,4 @@ def test_a_tilted_camera_is_noticed_and_said(axis, tmp_path):
     names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
     paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
     said = CliRunner().invoke(command, paths)
-    assert said.exit_code == 0 and 'the camera looks tilted by' in said.output
+    assert said.exit_code == 0 and 'the stated up is off by' in said.output

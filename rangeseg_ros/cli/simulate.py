@@ -13,21 +13,19 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.evaluation.terrain import TerrainTable
+from rangeseg_ros.evaluation.terrain import write_table
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.simulation.render import Frame, simulate
+from rangeseg_ros.simulation.render import Frame, TruePlane, simulate
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import NOISES, Kinect
 from rangeseg_ros.simulation.sensors.sensor import Sensor, resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.hard import HARD
-from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.terrain.scene import Terrain
 from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
-from rangeseg_ros.simulation.truth import TruePlane
 
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
 _size = click.IntRange(16, 4096)
@@ -213,10 +211,8 @@ def _write_terrains(
 ) -> None:
     """Write scenes with numbers from `seed` on, as images of so many columns and rows."""
     camera = _camera(SENSORS[sensor](seed), *size)
-    with (
-        options.new_folder(output) as folder,
-        TerrainTable(folder / 'terrain.csv') as table,
-    ):
+    table = []
+    with options.new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
         for number, scene in options.progress(enumerate(scenes, seed), len(scenes), 'image'):
             frame = simulate_terrain(scene, SENSORS[sensor](number), camera, seed=number)
@@ -224,7 +220,8 @@ def _write_terrains(
             _write_depth(folder, name, frame.depth, frame.terrain)
             for part in ('height', 'size', 'crossing'):
                 write_image(folder / part / f'{name}.tiff', getattr(frame, part))
-            table.write(name, scene.kind, sensor, *stated(scene, number), scene.stairs)
+            table.append((name, sensor, scene, stated(scene, number)))
+        write_table(folder / 'terrain.csv', table)
     click.echo(f'{output}: {len(scenes)} images')
 
 

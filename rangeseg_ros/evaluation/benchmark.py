@@ -31,17 +31,7 @@ Progress = Callable[[Iterable[Path], int], Iterable[Path]]
 
 @dataclass(frozen=True)
 class Frames:
-    """Depth images of one camera.
-
-    Attributes
-    ----------
-    paths : tuple of Path
-        Files, at least one.
-    camera : Camera
-        Intrinsics of all of them.
-    scale : float or None
-        Metres per unit, as `RangeImage.from_depth` takes it.
-    """
+    """Depth images of one camera, at least one; `scale` as `RangeImage.from_depth` takes it."""
 
     paths: tuple[Path, ...]
     camera: Camera
@@ -64,27 +54,15 @@ def measure(
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
 
-    Parameters
-    ----------
-    frames : Frames
-    config : Config
-    rounds : int
-        How many times all frames are segmented.
-    progress : callable
-        Shows the progress through the paths of so many frames; can be pickled.
-    threads : int, optional
-        At most so many; as many as OpenCV takes by itself when not given.
+    All frames are segmented `rounds` times, with so many threads, or as many as OpenCV takes by
+    itself; `progress`, which can be pickled, shows the way through the paths.
 
-    Returns
-    -------
-    dict
-        `stages` and `total`: `median_ms` and `p95_ms`, from the content of the file to the planes
-        (stage `image` is the conversion to a range image), reading the file apart.
-        `cpu_ms`: median processor time of a frame, summed over threads. `first_frame_ms`: the
-        first in a process. `frames_per_second`: 1 / mean total.
-        `peak_memory_mb`: of the process, Python and all libraries included; NaN where the
-        system has no /proc. `frames`, `rounds`, `width`, `height`, `method`,
-        `threads`.
+    The figures are `stages` and `total`: `median_ms` and `p95_ms`, from the content of the file to
+    the planes (stage `image` is the conversion to a range image), reading the file apart;
+    `cpu_ms`: median processor time of a frame, summed over threads; `first_frame_ms`: the first
+    in a process; `frames_per_second`: 1 / mean total; `peak_memory_mb`: of the process, Python and
+    all libraries included, NaN where the system has no /proc; `frames`, `rounds`, `width`,
+    `height`, `method`, `threads`.
     """
     # What numba has not compiled yet is compiled and cached here, not where it is measured.
     first = frames.paths[0]

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, count
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -28,55 +29,31 @@ from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.io.pcd import PcdError, read_pcd
-from rangeseg_ros.segcomp.files import (
+from rangeseg_ros.segcomp import (
     FIRST_REGION,
-    RegionAngle,
     SegcompError,
-    read_perceptron,
-    read_raster,
-)
-from rangeseg_ros.segcomp.geometry import (
     abw_calibration,
     abw_range_image,
     perceptron_range_image,
+    read_perceptron,
+    read_raster,
 )
 
 
 class Sample(NamedTuple):
-    """A range image and what is known about it.
-
-    Attributes
-    ----------
-    image : RangeImage
-        What is segmented.
-    truth : Truth
-        Its regions.
-    angles : list of RegionAngle
-        Angles between regions, where known, in the labels of `truth`.
-    planes : dict
-        Plane (nx, ny, nz, d) of each region of `truth`, where known.
-    """
+    """A range image, its true regions, and their angles and planes (nx, ny, nz, d) where known."""
 
     image: RangeImage
     truth: Truth
-    angles: list[RegionAngle]
+    angles: list[tuple[int, int, float]]
     planes: dict[int, NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One image of a data set, not yet read.
+    """One image of a data set, not yet read: its name, unique there, and its two files.
 
-    Attributes
-    ----------
-    name : str
-        Unique in its data set.
-    image, truth : Path
-        Files of the range image and of the ground truth.
-    read : callable
-        (image, truth) -> Sample.
-    sensor, split : str
-        Of sets that tell them: 'abw' or 'perc', 'train' or 'test'.
+    `sensor` ('abw' or 'perc') and `split` ('train' or 'test') are those of sets that tell them.
     """
 
     name: str
@@ -87,14 +64,7 @@ class Case:
     split: str = ''
 
     def load(self) -> Sample:
-        """Read the files.
-
-        Raises
-        ------
-        ValueError
-            A missing or malformed file, or a truth of another size than the image; the message
-            names the file.
-        """
+        """Read the files; ValueError names one that is missing, malformed or of another size."""
         sample = self.read(self.image, self.truth)
         sizes = ['x'.join(map(str, a.shape[::-1])) for a in (sample.truth.labels, sample.image)]
         if sizes[0] != sizes[1]:
@@ -155,20 +125,11 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
     Known layouts: segcomp (`abw.test.N.range`, `perc.test.N` and train, with `.gt-seg`, perhaps
     `.gt-ang`); `depth/*.png` with `truth/*.png` and `camera.yaml` (perhaps `planes.csv`), as
     `rangeseg simulate kinect` writes it; folders of `depth.png` or `depth.tiff`, `truth.png` and
-    `camera.txt` or `camera.yaml`; labelled scans `*.pcd`.
+    `camera.txt` or `camera.yaml`; labelled scans `*.pcd`. EvaluationError tells of a folder of
+    another layout, or an image without ground truth.
 
-    Parameters
-    ----------
-    folder : Path
-        Folder to look into.
-    min_pixels : int, optional
-        Regions of the truth of depth images that are smaller do not count; 1000 when not given,
-        as both simulated and hand-drawn truth have slivers.
-
-    Raises
-    ------
-    EvaluationError
-        None of the layouts, or an image without ground truth.
+    Regions of the truth of depth images that are smaller than `min_pixels` do not count; 1000 when
+    not given, as both simulated and hand-drawn truth have slivers.
     """
     least = 1000 if min_pixels is None else min_pixels
     for layout in (
@@ -178,6 +139,9 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
         (Case(path.stem, path, path, read_scan) for path in _sorted(folder, '*.pcd')),
     ):
         cases = list(layout)
+        for case in cases:
+            if not case.truth.is_file():
+                raise EvaluationError(f'{case.image}: no ground truth {case.truth.name}')
         if cases:
             return _distinct(cases)
     raise EvaluationError(
@@ -188,16 +152,12 @@ def find_cases(folder: Path, min_pixels: int | None = None) -> list[Case]:
 
 def _distinct(cases: list[Case]) -> list[Case]:
     """The cases under names of their own: a/b and a_b have the same one at first."""
-    taken: set[str] = set()
-    distinct = []
+    distinct: dict[str, Case] = {}
     for case in cases:
-        number, name = 1, case.name
-        while name in taken:
-            number += 1
-            name = f'{case.name}_{number}'
-        taken.add(name)
-        distinct.append(replace(case, name=name))
-    return distinct
+        names = chain([case.name], (f'{case.name}_{number}' for number in count(2)))
+        name = next(name for name in names if name not in distinct)
+        distinct[name] = replace(case, name=name)
+    return list(distinct.values())
 
 
 def _segcomp_cases(folder: Path) -> Iterator[Case]:
@@ -206,7 +166,6 @@ def _segcomp_cases(folder: Path) -> Iterator[Case]:
         if not match or path.name not in (match[0], f'{match[0]}.range'):
             continue
         truth = folder / f'{match[0]}.gt-seg'
-        _require(path, truth)
         sensor, split, number = match.groups()
         read = partial(read_segcomp, sensor=sensor, split=split, number=int(number))
         yield Case(match[0], path, truth, read, sensor, split)
@@ -216,12 +175,9 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     planes = _true_planes(folder / 'planes.csv')
     for path in _sorted(folder, 'depth/*.png'):
         truth = folder / 'truth' / path.name
-        _require(path, truth)
+        known = planes.get(path.stem, {})
         read = partial(
-            read_depth_case,
-            camera=folder / 'camera.yaml',
-            min_pixels=min_pixels,
-            planes=planes.get(path.stem, {}),
+            read_depth_case, camera=folder / 'camera.yaml', min_pixels=min_pixels, planes=known
         )
         yield Case(path.stem, path, truth, read)
 
@@ -229,7 +185,6 @@ def _depth_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
 def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
     for path in sorted([*folder.glob('**/depth.png'), *folder.glob('**/depth.tiff')]):
         truth = path.with_name('truth.png')
-        _require(path, truth)
         camera = path.with_name('camera.txt')
         if not camera.exists():
             camera = path.with_name('camera.yaml')
@@ -240,11 +195,6 @@ def _nested_cases(folder: Path, min_pixels: int) -> Iterator[Case]:
 
 def _sorted(folder: Path, pattern: str) -> list[Path]:
     return sorted(folder.glob(pattern), key=natural_order)
-
-
-def _require(image: Path, truth: Path) -> None:
-    if not truth.is_file():
-        raise EvaluationError(f'{image}: no ground truth {truth.name}')
 
 
 def _true_planes(path: Path) -> dict[str, dict[int, tuple[float, ...]]]:

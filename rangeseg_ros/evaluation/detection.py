@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
+from scipy.special import betaincinv
 
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.terrain import Shares
@@ -18,20 +18,11 @@ LEVEL = 0.95
 
 
 class Detection(NamedTuple):
-    """Scenes with a test piece of one size at one distance.
+    """Scenes with a test piece of one size (metres, of ramps degrees) at one distance (metres).
 
-    Attributes
-    ----------
-    kind : str
-    size, distance : float
-        Metres; the size of ramps is in degrees.
-    scenes, detected, ground : int
-        In which the piece is in sight, in which most of it has its class, and in which most of it
-        is called ground.
-    bound : float
-        Lower confidence bound of the probability that it is detected.
-    worst : str
-        The scene in which the least of it was found, and its share.
+    `scenes` are those in which it is in sight, `detected` those in which most of it has its class,
+    `ground` those in which most of it is called ground. `bound` is the lower confidence bound of
+    the probability that it is detected, `worst` the scene in which the least of it was found.
     """
 
     kind: str
@@ -46,45 +37,32 @@ class Detection(NamedTuple):
 
 def lower_bound(successes: int, trials: int) -> float:
     """One-sided lower bound of a probability at `LEVEL` (C. Clopper and E. Pearson 1934)."""
-    if not successes:
-        return 0.0
-    low, high = 0.0, 1.0
-    while low < (middle := (low + high) / 2) < high:
-        # The probability of so many successes or more.
-        terms = (
-            _binomial(trials, k) * middle**k * (1 - middle) ** (trials - k)
-            for k in range(successes, trials + 1)
-        )
-        low, high = (middle, high) if sum(terms) < 1 - LEVEL else (low, middle)
-    return low
-
-
-def _binomial(n: int, k: int) -> float:
-    return float(np.prod([(n - k + i) / i for i in range(1, k + 1)]))
+    return float(betaincinv(successes, trials - successes + 1, 1 - LEVEL)) if successes else 0.0
 
 
 def detections(images: Sequence[Shares]) -> list[Detection]:
     """A row for each kind, size and distance of test pieces, in the order of the images."""
+    found: dict[tuple[str, float, float], list[tuple[float, float, str]]] = {}
+    for image in images:
+        name, *numbers = image.kind.split()
+        if name not in PIECES or len(numbers) != 2:
+            continue
+        of_piece = found.setdefault((name, float(numbers[0]), float(numbers[1])), [])
+        # Of ramps that are ground, the ground is what is to be found.
+        flat = name == 'ramp' and not image.pixels[[OBSTACLE, DROP]].any()
+        true = [GROUND] if flat else [OBSTACLE, DROP]
+        total = image.pixels[true].sum()
+        if total >= FEWEST:
+            right = image.pixels[true, true].sum() / total
+            ground = 0.0 if flat else image.pixels[true, GROUND].sum() / total
+            of_piece.append((float(right), float(ground), image.name))
     rows = []
-    kinds = dict.fromkeys(image.kind for image in images)
-    for kind in (kind for kind in kinds if kind.split()[0] in PIECES and len(kind.split()) == 3):
-        name, size, distance = kind.split()
-        found = []
-        for image in images:
-            # Of ramps that are ground, the ground is what is to be found.
-            flat = name == 'ramp' and not image.pixels[[OBSTACLE, DROP]].any()
-            true = [GROUND] if flat else [OBSTACLE, DROP]
-            total = image.pixels[true].sum()
-            if image.kind == kind and total >= FEWEST:
-                right = sum(image.pixels[k, k] for k in true) / total
-                ground = 0.0 if flat else image.pixels[true, GROUND].sum() / total
-                found.append((float(right), float(ground), image.name))
-        detected = sum(right > 0.5 for right, _, _ in found)
-        worst = f'{min(found)[2]}: {min(found)[0]:.2f}' if found else ''
-        danger = sum(ground > 0.5 for _, ground, _ in found)
-        bound = lower_bound(detected, len(found))
-        size_, at = float(size), float(distance)
-        rows.append(Detection(name, size_, at, len(found), detected, danger, bound, worst))
+    for piece, scenes in found.items():
+        detected = sum(right > 0.5 for right, _, _ in scenes)
+        danger = sum(ground > 0.5 for _, ground, _ in scenes)
+        worst = f'{min(scenes)[2]}: {min(scenes)[0]:.2f}' if scenes else ''
+        bound = lower_bound(detected, len(scenes))
+        rows.append(Detection(*piece, len(scenes), detected, danger, bound, worst))
     return rows
 
 

@@ -29,16 +29,13 @@ def evaluation_figures(
 ) -> dict[str, Any]:
     """Figures of one or more images.
 
-    Returns
-    -------
-    dict
-        `images`, their number; `tolerances`, for each tolerance the sums of the counts over the
-        images, `mean_iou` and `pixel_accuracy` over all their regions and pixels (which do not
-        depend on the tolerance), where angles are known `angle_mean` and `angle_std`, degrees, of
-        an image's errors, averaged over the images, and where planes are, of those of all correct
-        regions, `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`,
-        metres; `precision` and `recall` at intersection over union 0.8; `per_image`, the same for
-        each image but errors of planes; `milliseconds`, median time of a segmentation where known.
+    `images`, their number; `tolerances`, for each tolerance the sums of the counts over the
+    images, `mean_iou` and `pixel_accuracy` over all their regions and pixels (which do not depend
+    on the tolerance), where angles are known `angle_mean` and `angle_std`, degrees, of an image's
+    errors, averaged over the images, and where planes are, of those of all correct regions,
+    `normal_median`, `normal_worst`, degrees, and `offset_median`, `offset_worst`, metres;
+    `precision` and `recall` at intersection over union 0.8; `per_image`, the same for each image
+    but errors of planes; `milliseconds`, median time of a segmentation where known.
     """
     figures = {'images': len(measurements), **_figures(measurements, tolerances)}
     figures['per_image'] = {item.name: _figures([item], tolerances) for item in measurements}
@@ -50,38 +47,29 @@ def evaluation_figures(
 
 
 def _plane_figures(measurements: Sequence[Measurement], tolerance: float) -> dict[str, float]:
-    errors = np.vstack(
-        [
-            plane_errors(
-                item.true_planes, item.found_planes, classify(item.overlap, tolerance).matches
-            )
-            for item in measurements
-        ]
-    )
+    """Over the correct regions of all images whose planes are known."""
+    of_images = []
+    for item in measurements:
+        matches = classify(item.overlap, tolerance).matches
+        of_images.append(plane_errors(item.true_planes, item.found_planes, matches))
+    errors = np.vstack(of_images)
     if not len(errors):
         return {}
-    median, worst = np.median(errors, axis=0), errors.max(axis=0)
-    return {
-        'normal_median': float(median[0]),
-        'normal_worst': float(worst[0]),
-        'offset_median': float(median[1]),
-        'offset_worst': float(worst[1]),
-    }
+    names = ('normal_median', 'normal_worst', 'offset_median', 'offset_worst')
+    values = np.stack([np.median(errors, axis=0), errors.max(axis=0)], axis=1)
+    return dict(zip(names, values.ravel().tolist(), strict=True))
 
 
 def _angle_figures(
     images: Sequence[Measurement], classes: Sequence[Classification]
 ) -> dict[str, float]:
-    errors = [
-        angle_errors(
-            image.angles,
-            {label: plane[:3] for label, plane in image.found_planes.items()},
-            of_image.matches,
-        )
-        for image, of_image in zip(images, classes, strict=True)
-        if image.angles and image.found_planes
-    ]
-    moments = [(each.mean(), each.std()) for each in errors if each.size]
+    """Averages over the images whose angles are known."""
+    moments = []
+    for image, of_image in zip(images, classes, strict=True):
+        normals = {label: plane[:3] for label, plane in image.found_planes.items()}
+        if normals:
+            errors = angle_errors(image.angles, normals, of_image.matches)
+            moments += [(errors.mean(), errors.std())] if errors.size else []
     if not moments:
         return {}
     mean, std = np.mean(moments, axis=0)

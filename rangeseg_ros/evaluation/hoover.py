@@ -28,16 +28,10 @@ class RegionClass(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Classification:
-    """Classes of all regions at one tolerance.
+    """`RegionClass` of all regions of the truth (G,) and the segmentation (M,) at one tolerance.
 
-    Attributes
-    ----------
-    truth : (G,) int8
-        `RegionClass` of each region of the truth, in the order of `Overlap.truth`.
-    labels : (M,) int8
-        The same for the segmentation.
-    matches : dict
-        Label in the truth -> label in the segmentation, for the regions in class CORRECT.
+    In the order of `Overlap`. `matches` takes labels of correct regions of the truth to those of
+    the segmentation.
     """
 
     truth: NDArray[np.int8]
@@ -57,22 +51,10 @@ class Classification:
 
 
 def classify(overlap: Overlap, tolerance: float) -> Classification:
-    """Classify every region as the reference tool does (eqs. 6.1, 6.2).
+    """Classify every region as the reference tool does (eqs. 6.1, 6.2), at T in (0.5, 1].
 
     Correct pairs first; then over-segmentation, which takes a region of the truth unless its
     present class has a mean measure at least as high; then under-segmentation, the mirror image.
-
-    Parameters
-    ----------
-    overlap : Overlap
-        Overlaps of the two label images.
-    tolerance : float
-        T of the thesis, in (0.5, 1].
-
-    Raises
-    ------
-    ComparisonError
-        A tolerance out of range.
 
     Notes
     -----
@@ -80,27 +62,21 @@ def classify(overlap: Overlap, tolerance: float) -> Classification:
     regions of the same image ever claim the same partner, and the order among them is immaterial.
     """
     check_tolerance(tolerance)
-    g, m = overlap.pairs.T
-    truth = _Classes(overlap.truth_sizes)
-    labels = _Classes(overlap.label_sizes)
+    truth, labels = _Classes(overlap.truth_sizes), _Classes(overlap.label_sizes)
     inside_truth = overlap.of_labels >= tolerance
     inside_labels = overlap.of_truth >= tolerance
 
-    correct = inside_truth & inside_labels
-    mean = (overlap.of_truth[correct] + overlap.of_labels[correct]) / 2
-    truth.assign(g[correct], RegionClass.CORRECT, mean)
-    labels.assign(m[correct], RegionClass.CORRECT, mean)
-    matched = dict(zip(g[correct], m[correct], strict=True))
+    g, m = np.nonzero(inside_truth & inside_labels)
+    mean = (overlap.of_truth[g, m] + overlap.of_labels[g, m]) / 2
+    truth.assign(g, RegionClass.CORRECT, mean)
+    labels.assign(m, RegionClass.CORRECT, mean)
 
-    truth.split(RegionClass.OVER, labels, g, m, overlap.shared, inside_truth, tolerance)
-    labels.split(RegionClass.UNDER, truth, m, g, overlap.shared, inside_labels, tolerance)
+    truth.split(RegionClass.OVER, labels, overlap.shared * inside_truth, tolerance)
+    labels.split(RegionClass.UNDER, truth, (overlap.shared * inside_labels).T, tolerance)
 
-    matches = {
-        int(overlap.truth[i]): int(overlap.labels[j])
-        for i, j in matched.items()
-        if truth.kind[i] == RegionClass.CORRECT
-    }
-    return Classification(truth.kind, labels.kind, matches)
+    still = truth.kind[g] == RegionClass.CORRECT
+    pairs = zip(overlap.truth[g[still]].tolist(), overlap.labels[m[still]].tolist(), strict=True)
+    return Classification(truth.kind, labels.kind, dict(pairs))
 
 
 class _Classes:
@@ -116,30 +92,18 @@ class _Classes:
         self.mean[index] = mean
 
     def split(
-        self,
-        kind: RegionClass,
-        other: _Classes,
-        whole: NDArray[np.int64],
-        part: NDArray[np.int64],
-        shared: NDArray[np.int64],
-        inside: NDArray[np.bool_],
-        tolerance: float,
+        self, kind: RegionClass, other: _Classes, shared: NDArray[np.int64], tolerance: float
     ) -> None:
         """Assign `kind` to the regions that consist of two or more regions of `other`.
 
-        `whole` and `part` are the pairs' indices here and in `other`; `inside` marks the pairs
-        whose part lies within the whole to the share `tolerance`.
+        `shared` are the pixels that a region here has of one of `other` that lies within it.
         """
-        whole, part, shared = whole[inside], part[inside], shared[inside]
-        count = len(self.sizes)
-        parts = np.bincount(whole, minlength=count)
-        covered = np.bincount(whole, shared, count)
-        spent = np.bincount(whole, other.sizes[part], count)
+        covered = shared.sum(axis=1)
         of_whole = covered / self.sizes
-        of_parts = covered / np.maximum(spent, 1)
+        of_parts = covered / np.maximum((shared > 0) @ other.sizes, 1)
         mean = (of_whole + of_parts) / 2
-        taken = (parts >= 2) & (of_whole >= tolerance) & (of_parts >= tolerance)
+        taken = ((shared > 0).sum(axis=1) >= 2) & (of_whole >= tolerance) & (of_parts >= tolerance)
         taken &= (self.kind == RegionClass.UNMATCHED) | (mean > self.mean)
-        self.assign(np.flatnonzero(taken), kind, mean[taken])
-        taken_pairs = taken[whole]
-        other.assign(part[taken_pairs], kind, mean[whole[taken_pairs]])
+        self.assign(taken, kind, mean[taken])
+        whole, part = np.nonzero((shared > 0) & taken[:, None])
+        other.assign(part, kind, mean[whole])

@@ -12,17 +12,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.io.files import natural_order
 from rangeseg_ros.io.images import read_labels
-from rangeseg_ros.segcomp.files import (
-    FIRST_REGION,
-    RegionAngle,
-    from_segcomp,
-    read_angles,
-    read_normals,
-    read_segmentation,
-)
+from rangeseg_ros.segcomp import read_angles, read_normals, read_segmentation
+from rangeseg_ros.simulation.render import NOT_PLANAR
 
-NOT_PLANAR = 65535
-_SHIFT = FIRST_REGION - 1
 SEGCOMP_SUFFIXES = ('.gt-seg', '.ms-seg')
 
 
@@ -31,16 +23,9 @@ class EvaluationError(ValueError):
 
 
 class Truth(NamedTuple):
-    """Ground truth of one image.
+    """Ground truth of one image: regions (H, W), 0 = none, which pixels count (None for all).
 
-    Attributes
-    ----------
-    labels : (H, W) uint16
-        0 = no region.
-    judged : (H, W) bool or None
-        Pixels that count; None for all.
-    min_pixels : int
-        Size from which regions count.
+    Regions count from `min_pixels` on.
     """
 
     labels: NDArray[np.uint16]
@@ -64,46 +49,31 @@ class Truth(NamedTuple):
 
 
 def read_label_image(path: Path) -> NDArray[np.uint16]:
-    """Read labels, 0 = none: a segcomp raster (regions from 10), or a PNG of 8 or 16 bits.
-
-    Raises
-    ------
-    SegcompError, ImageFileError
-        A missing or malformed file.
-    """
+    """Read labels, 0 = none: a segcomp raster (regions from 10), or a PNG of 8 or 16 bits."""
     if path.suffix in SEGCOMP_SUFFIXES:
-        return from_segcomp(read_segmentation(path))
+        return read_segmentation(path)
     return read_labels(path)
 
 
-def read_angles_beside(path: Path) -> list[RegionAngle]:
-    """Angles of the `.gt-ang` file beside a `.gt-seg`, in the labels of `read_label_image`."""
+def read_angles_beside(path: Path) -> list[tuple[int, int, float]]:
+    """Angles of the `.gt-ang` file beside a `.gt-seg`, if there is one."""
     path = path.with_suffix('.gt-ang')
-    angles = read_angles(path) if path.exists() else []
-    return [RegionAngle(a - _SHIFT, b - _SHIFT, degrees) for a, b, degrees in angles]
+    return read_angles(path) if path.exists() else []
 
 
 def read_normals_beside(path: Path) -> dict[int, NDArray[np.float64]]:
-    """Normals of the `.ms-nor` file beside a `.ms-seg`, in the labels of `read_label_image`."""
+    """Normals of the `.ms-nor` file beside a `.ms-seg`, if there is one."""
     path = path.with_suffix('.ms-nor')
-    normals = read_normals(path) if path.exists() else {}
-    return {label - _SHIFT: normal for label, normal in normals.items()}
+    return read_normals(path) if path.exists() else {}
 
 
 def as_truth(labels: NDArray[np.uint16], min_pixels: int = 1) -> Truth:
-    """Ground truth from a label image.
+    """Ground truth from a label image (H, W).
 
     Where the image has the label 65535, judged not to be planar, its 0 means not judged, and
     regions are compared over the judged pixels only: a found region that covers something curved
     pays for it, one that extends into unjudged pixels does not. Otherwise all pixels count, as in
-    the reference tool.
-
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        0 = no region (or not judged), 65535 = judged not to be planar.
-    min_pixels : int
-        Smaller regions are no regions; their pixels stay judged.
+    the reference tool. Regions below `min_pixels` are none; their pixels stay judged.
     """
     curved = labels == NOT_PLANAR
     judged = labels > 0 if curved.any() else None
@@ -118,17 +88,8 @@ def pair_files(truth: Path, labels: Path) -> dict[str, tuple[Path, Path]]:
 
     In a folder the images are its `.gt-seg` or `.ms-seg` files; else its `*_truth.png` or
     `*_labels.png`; else all its PNGs. Names are equal when they agree without suffix and without
-    `_truth`, `_labels`, `_depth` at the end.
-
-    Returns
-    -------
-    dict
-        Name -> (truth, labels), in natural order.
-
-    Raises
-    ------
-    EvaluationError
-        No label images, or one without its counterpart.
+    `_truth`, `_labels`, `_depth` at the end. EvaluationError tells of a folder without label
+    images, or one without its counterpart.
     """
     if truth.is_file() and labels.is_file():
         return {_key(truth): (truth, labels)}

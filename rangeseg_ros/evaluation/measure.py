@@ -1,4 +1,4 @@
-"""Running the segmenter over a data set, and what is kept of each image."""
+"""Running the segmenter over a data set: what is kept of each image, and its pictures."""
 
 from __future__ import annotations
 
@@ -7,32 +7,30 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.evaluation.datasets import Case
-from rangeseg_ros.evaluation.hoover import classify
+from rangeseg_ros.drawing import borders
+from rangeseg_ros.evaluation.datasets import Case, Sample
+from rangeseg_ros.evaluation.hoover import Classification, RegionClass, classify
 from rangeseg_ros.evaluation.overlap import Overlap
-from rangeseg_ros.evaluation.pictures import class_picture
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import write_image
+
+# White, green and grey are those of figures C.1 and 6.6; the others are ours.
+CORRECT, OVER, UNDER = (255, 255, 255), (80, 200, 80), (90, 130, 255)
+MISSED, NOISE = (255, 190, 60), (230, 70, 70)
+NO_DATA, UNLABELLED = (128, 128, 128), (40, 40, 40)
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
     """Everything the figures of an image are computed from.
 
-    Attributes
-    ----------
-    name : str
-        Of the image.
-    overlap : Overlap
-        Of truth and segmentation: gives every metric at every tolerance.
-    angles : list
-        (label, label, degrees) of the truth, where known.
-    true_planes, found_planes : mapping
-        Plane (nx, ny, nz, d) of each label, where known; of the found ones normals do.
-    timings : mapping
-        Milliseconds per stage.
+    Angles are (label, label, degrees) of the truth, planes (nx, ny, nz, d) of each label, where
+    known (of the found ones normals do), timings milliseconds per stage.
     """
 
     name: str
@@ -45,17 +43,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Task:
-    """An image, the parameters to segment it with, and where the results go.
-
-    Attributes
-    ----------
-    case : Case
-        The image.
-    config : Config
-        Parameters of the segmenter.
-    output : Path or None
-        Folder for <name>_labels.png and <name>_classes.png.
-    """
+    """An image, the parameters to segment it with, and a folder for its `pictures`, or None."""
 
     case: Case
     config: Config
@@ -82,5 +70,39 @@ class Task:
 
     def pictures(self, folder: Path) -> dict[str, Path]:
         """Where pictures of the image are left."""
-        kinds = 'labels', 'classes'
-        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in kinds}
+        return {kind: folder / f'{self.case.name}_{kind}.png' for kind in ('labels', 'classes')}
+
+
+def class_picture(
+    sample: Sample, labels: NDArray[np.uint16], overlap: Overlap, classes: Classification
+) -> NDArray[np.uint8]:
+    """Ground truth (left) and segmentation (right), each region in the colour of its class.
+
+    Correct white, over-segmented green, under-segmented blue, missed orange, noise red; no
+    measurement grey, no region dark. (H, 2 W + 4, 3) uint8 RGB, for labels (H, W).
+    """
+    gap = np.full((labels.shape[0], 4, 3), 255, np.uint8)
+    left = _coloured(sample.truth.labels, overlap.truth, classes.truth, MISSED)
+    right = _coloured(labels, overlap.labels, classes.labels, NOISE)
+    for picture, regions in ((left, sample.truth.labels), (right, labels)):
+        picture[~sample.image.valid & (regions == 0)] = NO_DATA
+    return np.hstack([left, gap, right])
+
+
+def _coloured(
+    labels: NDArray[np.uint16],
+    regions: NDArray[np.integer],
+    kinds: NDArray[np.int8],
+    unmatched: tuple[int, int, int],
+) -> NDArray[np.uint8]:
+    palette = np.full((int(labels.max(initial=0)) + 1, 3), UNLABELLED, np.uint8)
+    for kind, colour in (
+        (RegionClass.UNMATCHED, unmatched),
+        (RegionClass.CORRECT, CORRECT),
+        (RegionClass.OVER, OVER),
+        (RegionClass.UNDER, UNDER),
+    ):
+        palette[regions[kinds == kind]] = colour
+    picture = palette[labels]
+    picture[borders(labels)] = 0
+    return picture

@@ -17,16 +17,10 @@ _LEAST = 2
 
 
 class StairsCheck(NamedTuple):
-    """The staircase of one scene, and what was found of it.
+    """The treads of a scene's staircase in sight, and what was found of it.
 
-    Attributes
-    ----------
-    in_sight : int
-        Treads of the true one in sight; 0 where there are no stairs.
-    found : (int, float, float) or None
-        Treads, and errors of rise and run, metres; None where it was not found.
-    false : int
-        Number of staircases found that are not there.
+    `found` are treads, and errors of rise and run, metres; `false` counts staircases that are not
+    there.
     """
 
     in_sight: int
@@ -37,48 +31,39 @@ class StairsCheck(NamedTuple):
 def check_stairs(
     row: Mapping[str, str], height: NDArray[np.float32], found: Sequence[Stairs]
 ) -> StairsCheck:
-    """Compare stairs with the truth.
+    """Compare stairs with those of a row of the table of scenes.
 
-    Parameters
-    ----------
-    row : mapping
-        Of the table of the scenes: `direction`, `count`, `rise`, `run`, empty without stairs.
-    height : (H, W) float32
-        True height above the ground, metres; NaN where nothing is measured.
-    found : sequence of Stairs
+    The row has `direction`, `count`, `rise`, `run`, empty without stairs; `height` (H, W) is the
+    true height above the ground, metres, NaN where nothing is measured.
     """
     true = row.get('direction', '')
-    false = sum(stairs.direction != true for stairs in found)
+    right = [stairs for stairs in found if stairs.direction == true]
+    false = len(found) - len(right)
     if not true:
         return StairsCheck(0, None, false)
     rise, run = float(row['rise']), float(row['run'])
     levels = rise * np.arange(1, int(row['count']) + 1) * (1 if true == 'up' else -1)
     in_sight = sum(int((np.abs(height - level) < _OFF).sum() >= _FEWEST) for level in levels)
-    for stairs in found:
-        if stairs.direction == true:
-            return StairsCheck(
-                in_sight, (stairs.count, stairs.rise - rise, stairs.run - run), false
-            )
-    return StairsCheck(in_sight, None, false)
+    errors = [(stairs.count, stairs.rise - rise, stairs.run - run) for stairs in right]
+    return StairsCheck(in_sight, errors[0] if errors else None, false)
 
 
 def stairs_figures(checks: Sequence[StairsCheck]) -> dict[str, Any]:
     """Figures over scenes; those with fewer than two treads in sight need not be found."""
     there = [check for check in checks if check.in_sight >= _LEAST]
     found = [(check.in_sight, *check.found) for check in there if check.found]
-    table = np.array(found, np.float64).reshape(-1, 4)
-    with np.errstate(invalid='ignore'):
-        middle = np.median(np.abs(table[:, 2:]), axis=0) if len(table) else np.full(2, np.nan)
+    in_sight, count, *errors = np.abs(np.array(found, np.float64).reshape(-1, 4)).T
+    rise, run = (float(np.median(error)) if found else float('nan') for error in errors)
     return {
         'scenes_with_stairs': len(there),
         'found': len(found),
-        'treads_in_sight': int(table[:, 0].sum()),
-        'treads_found': int(table[:, 1].sum()),
-        'count_within_1': int((np.abs(table[:, 0] - table[:, 1]) <= 1).sum()),
-        'median_rise_error': float(middle[0]),
-        'median_run_error': float(middle[1]),
-        'largest_rise_error': float(np.abs(table[:, 2]).max(initial=0)),
-        'largest_run_error': float(np.abs(table[:, 3]).max(initial=0)),
+        'treads_in_sight': int(in_sight.sum()),
+        'treads_found': int(count.sum()),
+        'count_within_1': int((np.abs(in_sight - count) <= 1).sum()),
+        'median_rise_error': rise,
+        'median_run_error': run,
+        'largest_rise_error': float(errors[0].max(initial=0)),
+        'largest_run_error': float(errors[1].max(initial=0)),
         'false_alarms': sum(check.false for check in checks),
         'scenes_without_stairs': sum(not check.in_sight for check in checks),
     }

@@ -27,6 +27,7 @@ from rangeseg_ros.evaluation.stairs import (
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image
+from rangeseg_ros.simulation.terrain.scene import Terrain
 
 REACH = {'realsense': 2.5}
 """Metres up to which a sensor's ground and obstacles count; 3.5 for all others."""
@@ -41,59 +42,32 @@ _STAIRS = ('direction', 'count', 'rise', 'run')
 _DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 'tiff'))
 
 
-class TerrainTable:
-    """CSV of what is known of each image."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def __enter__(self) -> TerrainTable:
-        self._file = self._path.open('w', newline='')
-        self._rows = csv.writer(self._file, lineterminator='\n')
-        self._rows.writerow([*_COLUMNS, *_STAIRS])
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._file.close()
-
-    def write(
-        self,
-        name: str,
-        kind: str,
-        sensor: str,
-        up: NDArray[np.float64],
-        height: float,
-        stairs: Mapping[str, Any],
-    ) -> None:
-        """Append an image: `up` and `height` as the robot knows them."""
-        known = [f'{value:.6f}' for value in (*up, height)]
-        self._rows.writerow([name, kind, sensor, *known, *(stairs.get(x, '') for x in _STAIRS)])
+def write_table(
+    path: Path, images: Iterable[tuple[str, str, Terrain, tuple[NDArray[np.float64], float]]]
+) -> None:
+    """Write the CSV of images: name, sensor, scene, and up and height as the robot knows them."""
+    with path.open('w', newline='') as file:
+        rows = csv.writer(file, lineterminator='\n')
+        rows.writerow([*_COLUMNS, *_STAIRS])
+        for name, sensor, scene, (up, height) in images:
+            known = [f'{value:.6f}' for value in (*up, height)]
+            stairs = (scene.stairs.get(column, '') for column in _STAIRS)
+            rows.writerow([name, scene.kind, sensor, *known, *stairs])
 
 
 class Shares(NamedTuple):
-    """What became of the pixels of one image.
+    """What became of the pixels of one image: (4, 4) by true and found class.
 
-    Attributes
-    ----------
-    name, kind : str
-        Of the image.
-    pixels : (4, 4) int64
-        By true and found class.
-    found : dict
-        (height of the obstacle: index in `SIZES`, distance in whole metres) to pixels of
-        obstacles, and how many of them were found.
-    stairs : StairsCheck
-    confidence : float
-        That the ground seen is the one that the robot stands on.
-    own : bool
-        Whether it is: most of what is called ground, or where nothing is, of the nearest hundredth
-        of the pixels.
+    `obstacles` (2, len(SIZES), 4) are pixels of obstacles by height and distance in whole metres,
+    and those that were found. `confidence` is that the ground seen is the one that the robot
+    stands on; `own`, whether it is: most of what is called ground, or where nothing is, of the
+    nearest hundredth of the pixels.
     """
 
     name: str
     kind: str
     pixels: NDArray[np.int64]
-    found: dict[tuple[int, int], tuple[int, int]]
+    obstacles: NDArray[np.float64]
     stairs: StairsCheck
     confidence: float = 0.0
     own: bool = False
@@ -101,16 +75,9 @@ class Shares(NamedTuple):
 
 @dataclass(frozen=True)
 class TerrainTask:
-    """An image with its truth, and the parameters to find the terrain with.
+    """An image with its row of the table, and the parameters to find the terrain with.
 
-    Attributes
-    ----------
-    folder : Path
-    row : dict
-        Of the table.
-    config : Config
-    output : Path or None
-        Folder for pictures: truth, what was found, and where they differ.
+    Pictures go to the folder `output`: truth, what was found, and where they differ.
     """
 
     folder: Path
@@ -134,13 +101,14 @@ class TerrainTask:
         judged = (truth > UNKNOWN) & (metres <= reach) & ~_near_borders(truth)
         pixels = np.zeros((4, 4), np.int64)
         np.add.at(pixels, (truth[judged], found[judged]), 1)
-        table: dict[tuple[int, int], tuple[int, int]] = {}
         obstacle = judged & (truth == OBSTACLE)
-        sizes = np.searchsorted(SIZES, size[obstacle] + 1e-6) - 1
-        at = metres[obstacle].astype(int)
-        for key in {(int(a), int(b)) for a, b in zip(sizes, at, strict=True)}:
-            here = (sizes == key[0]) & (at == key[1])
-            table[key] = int(here.sum()), int((found[obstacle][here] == OBSTACLE).sum())
+        bins = [(*SIZES, np.inf), range(5)]
+        obstacles = np.stack(
+            [
+                np.histogram2d(size[some] + 1e-6, metres[some], bins)[0]
+                for some in (obstacle, obstacle & (found == OBSTACLE))
+            ]
+        )
         confidence = result.ground.stand.confidence if result.ground else 0.0
         limit = np.quantile(metres[judged], 0.01) if judged.any() else 0.0
         called = judged & (found == GROUND)
@@ -150,7 +118,7 @@ class TerrainTask:
             wrong = judged & (found != truth)
             picture = np.hstack([_COLOURS[truth], _COLOURS[found], _COLOURS[found * wrong]])
             write_image(self.output / f'{name}_{self.row["kind"].replace(" ", "_")}.png', picture)
-        return Shares(name, self.row['kind'], pixels, table, stairs, confidence, own)
+        return Shares(name, self.row['kind'], pixels, obstacles, stairs, confidence, own)
 
 
 def _read_truth(path: Path, shape: tuple[int, int]) -> NDArray[np.uint8]:
@@ -179,22 +147,9 @@ def _near_borders(truth: NDArray[np.uint8]) -> NDArray[np.bool_]:
 def terrain_tasks(
     folder: Path, config: Config, know_height: bool, output: Path | None
 ) -> list[TerrainTask]:
-    """A task for each image of `rangeseg simulate terrain`.
+    """A task for each image of `rangeseg simulate terrain`; EvaluationError of a malformed table.
 
-    Parameters
-    ----------
-    folder : Path
-    config : Config
-        Its `up_x`, `up_y`, `up_z` and `sensor_height` are replaced by those of the images.
-    know_height : bool
-        Whether the height of the sensor is told.
-    output : Path or None
-        See `TerrainTask`.
-
-    Raises
-    ------
-    EvaluationError
-        A malformed table.
+    `up_x`, `up_y`, `up_z` and, if it shall be known, `sensor_height` are those of the images.
     """
     path = folder / 'terrain.csv'
     tasks = []
@@ -261,14 +216,13 @@ def _reliability(images: Sequence[Shares]) -> list[dict[str, float]]:
 
 def _by_size(images: Sequence[Shares]) -> dict[str, dict[str, float]]:
     """Share of the pixels of obstacles that were found, by height and distance."""
-    result: dict[str, dict[str, float]] = {}
-    for k, least in enumerate(SIZES):
-        row = {}
-        for metre in range(4):
-            counts = np.array([image.found.get((k, metre), (0, 0)) for image in images]).sum(0)
-            row[f'{metre}'] = float(counts[1] / counts[0]) if counts[0] else float('nan')
-        result[f'{least:g}'] = row
-    return result
+    there, found = sum((i.obstacles for i in images), np.zeros((2, len(SIZES), 4)))
+    with np.errstate(invalid='ignore'):
+        shares = (found / there).tolist()
+    return {
+        f'{least:g}': {f'{metre}': share for metre, share in enumerate(row)}
+        for least, row in zip(SIZES, shares, strict=True)
+    }
 
 
 def terrain_table(figures: Mapping[str, Any]) -> str:

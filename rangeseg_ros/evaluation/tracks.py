@@ -21,36 +21,21 @@ def ids_of_faces(
     faces: Mapping[int, int],
     min_pixels: int = 1000,
 ) -> dict[int, list[int]]:
-    """Ids of the planes found on each physical face in a frame.
+    """Ids of the planes found on each physical face in a frame, that of the largest one first.
 
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        0 = no plane.
-    ids : mapping of label to int
-        The id of each plane, or that of its surface.
-    truth : (H, W) uint16
-        True regions.
-    faces : mapping of int to int
-        The face, 0 or more, that a region of `truth` is part of; others do not count.
-    min_pixels : int
-        Faces with fewer pixels in the frame do not count.
-
-    Returns
-    -------
-    dict
-        For each face in sight the ids of the planes with more than half their pixels on it,
-        that of the largest plane first.
+    `ids` are those of the labels (H, W) of planes, or of their surfaces; `faces` those (0 or more)
+    that the regions `truth` (H, W) are parts of. A plane lies on a face with more than half of
+    its pixels. Faces with fewer than `min_pixels` in the frame do not count.
     """
     table = np.zeros(65536, np.int64)
     table[list(faces)] = np.array(list(faces.values()), np.int64) + 1
     overlap = Overlap.between(table[truth], labels)
     sizes = zip((overlap.truth - 1).tolist(), overlap.truth_sizes, strict=True)
     found: dict[int, list[int]] = {face: [] for face, size in sizes if size >= min_pixels}
-    for pair in np.argsort(-overlap.shared, kind='stable'):
-        g, m = overlap.pairs[pair]
-        face, label = int(overlap.truth[g]) - 1, int(overlap.labels[m])
-        if overlap.of_labels[pair] > 0.5 and face in found and label in ids:
+    on, which = np.nonzero(overlap.of_labels > 0.5)
+    for pair in np.argsort(-overlap.shared[on, which], kind='stable'):
+        face, label = int(overlap.truth[on[pair]]) - 1, int(overlap.labels[which[pair]])
+        if face in found and label in ids:
             found[face].append(ids[label])
     return found
 
@@ -59,15 +44,10 @@ def track_figures(frames: Sequence[Mapping[int, Sequence[int]]]) -> dict[str, fl
     """Figures of the ids in a sequence, of faces as `ids_of_faces` returns them.
 
     A face stays with its id as long as any plane on it has that id; otherwise the first id on it
-    takes over.
-
-    Returns
-    -------
-    dict
-        `switches`, how often a face was taken over by another id than it had when last found;
-        `transfers`, how often an id was found on another face than before; `coverage`, share of
-        the faces in sight that were found, over all frames; `track_length`, mean number of
-        frames in which a face kept one id.
+    takes over. `switches` tells how often a face was taken over by another id than it had when
+    last found; `transfers`, how often an id was found on another face than before; `coverage`, the
+    share of the faces in sight that were found, over all frames; `track_length`, the mean number
+    of frames in which a face kept one id.
     """
     current: dict[int, int] = {}
     owner: dict[int, int] = {}

@@ -16,15 +16,9 @@ from rangeseg_ros.report.page import write_page
 
 
 class Shown(NamedTuple):
-    """Residuals of the planes of a frame.
+    """Residuals of the planes of a frame, without and with the correction, and how many planes.
 
-    Attributes
-    ----------
-    frame : int
-    residuals : (2, H, W) float32
-        Without and with the correction, 1/m, NaN where there is no plane.
-    planes : (int, int)
-        Number of planes.
+    `residuals` (2, H, W) are in 1/m, NaN where there is no plane.
     """
 
     frame: int
@@ -39,92 +33,62 @@ def write_calibration(
     parameters: Mapping[str, object],
     shown: Sequence[Shown],
 ) -> None:
-    """Write the page.
-
-    Parameters
-    ----------
-    path : Path
-    names : sequence of str
-        Recordings.
-    result : Calibration
-    parameters : mapping
-        Of the sensor, as measured.
-    shown : sequence of Shown
-        Frames to show.
-    """
+    """Write the page of recordings: `parameters` of the sensor, and frames to show."""
     distortion = result.distortion
-    limit = float(np.quantile(np.abs(distortion.offset), 0.99)) or 1e-6
-    fields = {
-        'Distortion of the inverse depth, 1/m': (distortion.offset, -limit, limit, 'RdBu_r'),
-    }
-    if distortion.slope is not None:
-        largest = float(np.quantile(np.abs(distortion.slope), 0.99)) or 1e-6
-        fields['Change with the inverse depth'] = (distortion.slope, -largest, largest, 'RdBu_r')
-    deviation = distortion.deviation
+    offset, slope, deviation = distortion.offset, distortion.slope, distortion.deviation
     assert deviation is not None
-    fields['Standard deviation, 1/m'] = (deviation, 0.0, limit, 'viridis')
+    limit = _extent(offset)
+    fields = [('Distortion of the inverse depth, 1/m', offset, -limit, limit, 'RdBu_r')]
+    if slope is not None:
+        largest = _extent(slope)
+        fields.append(('Change with the inverse depth', slope, -largest, largest, 'RdBu_r'))
+    fields.append(('Standard deviation, 1/m', deviation, 0.0, limit, 'viridis'))
     views = result.views.astype(np.float32)
-    fields['Distances at which it was seen'] = (views, 0.0, float(views.max()), 'viridis')
+    fields.append(('Distances at which it was seen', views, 0.0, float(views.max()), 'viridis'))
+    walls = []
+    for frame, residuals, planes in shown:
+        titled = zip(('before', 'after'), residuals, strict=True)
+        pictures = [(title, image, -limit, limit, 'RdBu_r') for title, image in titled]
+        walls.append((frame, planes, [_rms(image) for image in residuals], _images(pictures)))
+    ninths = [
+        (_rms(a), _rms(b), float(np.median(c)))
+        for a, b, c in zip(*map(_ninths, (offset, deviation, views)), strict=True)
+    ]
     write_page(
         path,
         'calibration.html',
         name=', '.join(names),
         result=result,
-        rms=float(np.sqrt((distortion.offset**2).mean())),
-        known=float(np.sqrt((deviation**2).mean())),
-        regions=_regions(result),
-        fields=_images([(title, *field) for title, field in fields.items()], 2),
-        profiles=_profiles(distortion.offset),
-        walls=[
-            (
-                frame.frame,
-                frame.planes,
-                [float(np.sqrt(np.nanmean(image**2))) for image in frame.residuals],
-                _images(
-                    [
-                        (title, image, -limit, limit, 'RdBu_r')
-                        for title, image in zip(('before', 'after'), frame.residuals, strict=True)
-                    ],
-                    2,
-                ),
-            )
-            for frame in shown
-        ],
+        rms=_rms(offset),
+        known=_rms(deviation),
+        regions=[ninths[:3], ninths[3:6], ninths[6:]],
+        fields=_images(fields),
+        profiles=_profiles(offset),
+        walls=walls,
         parameters=parameters,
     )
 
 
-def _regions(result: Calibration) -> list[list[tuple[float, float, float]]]:
-    """Distortion, uncertainty and views, of a ninth of the image each, row by row."""
-    distortion = result.distortion
-    assert distortion.deviation is not None
-    table = []
-    for rows in zip(
-        *(np.array_split(a, 3) for a in (distortion.offset, distortion.deviation, result.views)),
-        strict=True,
-    ):
-        columns = zip(*(np.array_split(part, 3, axis=1) for part in rows), strict=True)
-        table.append(
-            [
-                (
-                    float(np.sqrt((offset**2).mean())),
-                    float(np.sqrt((deviation**2).mean())),
-                    float(np.median(views)),
-                )
-                for offset, deviation, views in columns
-            ]
-        )
-    return table
+def _extent(field: NDArray[np.float32]) -> float:
+    """Where the colours of a field end."""
+    return float(np.quantile(np.abs(field), 0.99)) or 1e-6
 
 
-def _images(
-    images: Sequence[tuple[str, NDArray[np.float32], float, float, str]], columns: int
-) -> str:
-    """Pictures with a title, a range and a colour map each, side by side."""
-    rows = -(-len(images) // columns)
+def _ninths(field: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    """Three by three parts of a field, row by row; fields may differ in size."""
+    return [part for rows in np.array_split(field, 3) for part in np.array_split(rows, 3, axis=1)]
+
+
+def _rms(field: NDArray[np.float32]) -> float:
+    return float(np.sqrt(np.nanmean(field**2)))
+
+
+def _images(images: Sequence[tuple[str, NDArray[np.float32], float, float, str]]) -> str:
+    """Pictures with a title, a range and a colour map each, two in a row."""
+    rows = -(-len(images) // 2)
     figure = Figure(figsize=(10, 3.6 * rows), layout='constrained')
     for place, (title, image, low, high, colours) in enumerate(images, 1):
-        axes = figure.add_subplot(rows, columns, place)
+        axes = figure.add_subplot(rows, 2, place)
         # No more pixels than the page shows.
         step = max(image.shape[1] // 320, 1)
         drawn = axes.imshow(image[::step, ::step], vmin=low, vmax=high, cmap=colours)
@@ -137,12 +101,11 @@ def _images(
 def _profiles(offset: NDArray[np.float32]) -> str:
     """Mean of the field over rows and over columns."""
     figure = Figure(figsize=(10, 3.2), layout='constrained')
-    left, right = figure.subplots(1, 2, sharey=True)
-    left.plot(offset.mean(axis=0))
-    left.set_xlabel('column, mean over the rows')
-    left.set_ylabel('1/m')
-    right.plot(offset.mean(axis=1))
-    right.set_xlabel('row, mean over the columns')
-    for axes in (left, right):
+    both = figure.subplots(1, 2, sharey=True)
+    labels = 'column, mean over the rows', 'row, mean over the columns'
+    for axis, (axes, label) in enumerate(zip(both, labels, strict=True)):
+        axes.plot(offset.mean(axis=axis))
+        axes.set_xlabel(label)
         axes.grid(alpha=0.3)
+    both[0].set_ylabel('1/m')
     return svg(figure)

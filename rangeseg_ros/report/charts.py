@@ -6,7 +6,6 @@ import io
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -48,8 +47,9 @@ def id_bars(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
         axes.broken_barh(spans, (row - 0.4, 0.8), color=colour)
     axes.set_yticks(range(len(ids)), [str(number) for number in ids], fontsize=8)
     axes.invert_yaxis()
-    axes.set_ylabel('id')
-    return _finished(figure, axes, 'seconds')
+    axes.set(xlabel='seconds', ylabel='id')
+    axes.grid(alpha=0.3)
+    return svg(figure)
 
 
 def drifts(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
@@ -70,17 +70,12 @@ def drifts(sightings: NDArray[np.void], times: NDArray[np.float64]) -> str:
             y = np.insert(y, gaps, np.nan)
             axes.plot(x, y, color=colour, marker='.', markersize=3, linewidth=1, label=number)
     upper.set_ylabel('distance, mm')
-    lower.set_ylabel('normal, degrees')
+    lower.set(xlabel='seconds', ylabel='normal, degrees')
     lower.set_ylim(bottom=0)
-    upper.grid(alpha=0.3)
+    for axes in (upper, lower):
+        axes.grid(alpha=0.3)
     if len(ids):
         figure.legend(*upper.get_legend_handles_labels(), title='id', loc='outside right upper')
-    return _finished(figure, lower, 'seconds')
-
-
-def _finished(figure: Figure, axes: Axes, label: str) -> str:
-    axes.set_xlabel(label)
-    axes.grid(alpha=0.3)
     return svg(figure)
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import re
 from base64 import b64encode
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +13,6 @@ import cv2
 import jinja2
 import numpy as np
 
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.files import replacing
 
 MAX_PICTURES = 48
@@ -54,27 +51,6 @@ def evenly_spaced(pictures: Sequence[Picture]) -> list[Picture]:
     count = min(len(pictures), MAX_PICTURES)
     chosen = np.linspace(0, len(pictures) - 1, count).round().astype(int)
     return [pictures[index] for index in chosen]
-
-
-def shared_values(
-    config: Config, timings: Sequence[Mapping[str, float]], reasons: Mapping[str, int]
-) -> dict[str, Any]:
-    """What every page shows: stages with their statistics, reasons, parameters."""
-    names = dict.fromkeys(name for laps in timings for name in laps)
-    # 0 where a frame has not come to the stage.
-    stages = {name: np.array([laps.get(name, 0.0) for laps in timings]) for name in names}
-    total = {'total': np.sum(list(stages.values()), axis=0)} if stages else {}
-    return {
-        'stages': [
-            (name, np.median(times), np.percentile(times, 95), times.max())
-            for name, times in {**stages, **total}.items()
-        ],
-        'reasons': Counter(reasons).most_common(),
-        'parameters': [
-            (option.name, getattr(config, option.name), option.default, option.metadata)
-            for option in fields(Config)
-        ],
-    }
 
 
 @cache

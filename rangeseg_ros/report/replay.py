@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,23 +14,13 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import Picture, evenly_spaced, shared_values, write_page
+from rangeseg_ros.report.page import Picture, evenly_spaced, write_page
 
 
 class ReplayReport:
     """Collects the frames of a recording and writes their page.
 
-    Parameters
-    ----------
-    name : str
-        Of the recording.
-    config : Config
-        Parameters that were used.
-
-    Attributes
-    ----------
-    reasons : Counter
-        Why frames have no planes -> number of these frames.
+    `reasons` counts why frames have no planes.
     """
 
     def __init__(self, name: str, config: Config) -> None:
@@ -72,16 +63,17 @@ class ReplayReport:
     def write(self, path: Path, damage: str = '', doubts: Sequence[str] = ()) -> None:
         """Write the page.
 
-        Parameters
-        ----------
-        path : Path
-        damage : str
-            What of the recording could not be read.
-        doubts : sequence of str
-            What the planes say against the poses.
+        `damage` tells what of the recording could not be read, `doubts` what the planes say
+        against the poses.
         """
         sightings = np.concatenate(self._sightings)
         times = (np.array(self._stamps) - self._stamps[0]) / 1e9 if self._stamps else np.empty(0)
+        sensor = SensorModel(*np.median(self._sensors, axis=0)) if self._sensors else ''
+        names = dict.fromkeys(name for laps in self._timings for name in laps)
+        # 0 where a frame has not come to the stage.
+        stages = {n: np.array([laps.get(n, 0.0) for laps in self._timings]) for n in names}
+        if stages:
+            stages['total'] = np.sum(list(stages.values()), axis=0)
         write_page(
             path,
             'replay.html',
@@ -89,15 +81,21 @@ class ReplayReport:
             damage=damage,
             doubts=doubts,
             frames=self.frames,
-            sensor=str(SensorModel(*np.median(self._sensors, axis=0).tolist()))
-            if self._sensors
-            else '',
+            sensor=sensor,
             **self.figures(),
             pictures=evenly_spaced(self._pictures),
             limits=(charts.MAX_BARS, charts.MAX_LINES),
             id_bars=charts.id_bars(sightings, times) if len(sightings) else '',
             drifts=charts.drifts(sightings, times) if len(sightings) else '',
-            **shared_values(self.config, self._timings, self.reasons),
+            stages=[
+                (name, np.median(times), np.percentile(times, 95), times.max())
+                for name, times in stages.items()
+            ],
+            reasons=self.reasons.most_common(),
+            parameters=[
+                (option.name, getattr(self.config, option.name), option.default, option.metadata)
+                for option in fields(Config)
+            ],
         )
 
 

@@ -10,17 +10,9 @@ from numpy.typing import NDArray
 def smooth_field(
     shape: tuple[int, ...], sigma: tuple[float, float] | None, random: np.random.Generator
 ) -> NDArray[np.float64]:
-    """Gaussian random field of unit variance: white noise smoothed over columns and rows.
+    """Gaussian random field (H, W) of unit variance: white noise, smoothed unless `sigma` is None.
 
-    Parameters
-    ----------
-    shape : (int, int)
-        Height and width.
-    sigma : (float, float) or None
-        Standard deviations of the Gaussian kernel along a row and along a column, pixels;
-        None for white noise.
-    random : Generator
-        Source of randomness.
+    `sigma` are the standard deviations of the Gaussian kernel along a row and a column, pixels.
     """
     if sigma is None:
         return random.standard_normal(shape)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,23 +13,34 @@ from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.scenes import Scene
 from rangeseg_ros.simulation.sensors.sensor import Sensor
 from rangeseg_ros.simulation.solids import cast
-from rangeseg_ros.simulation.truth import TruePlane, visible_regions
+
+NOT_PLANAR = 65535
+"""Truth label of pixels on curved surfaces."""
+
+
+@dataclass(frozen=True, eq=False)
+class TruePlane:
+    """Exact plane of a visible region of `count` pixels, in the sensor's frame, metres.
+
+    normal . p + distance = 0, with the unit normal (3,) towards the sensor. `label` is its value
+    in the truth image, 1...; `face` the number of its face in the scene, which persists from frame
+    to frame, and which all regions share into which occluders cut the face.
+    """
+
+    label: int
+    face: int
+    normal: NDArray[np.float64]
+    distance: float
+    count: int
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A simulated depth image and its truth.
+    """A simulated depth image, its truth, and its camera.
 
-    Attributes
-    ----------
-    depth : (H, W) uint16 or float32
-        Along the optical axis: millimetres (uint16) or metres (float32); 0 = no measurement.
-    labels : (H, W) uint16
-        4-connected visible regions of planar faces; 0 = no measurement, 65535 = not planar.
-    planes : list of TruePlane
-        Their exact equations in the camera's optical frame.
-    camera : Camera
-        Intrinsics.
+    `depth` (H, W) is along the optical axis, millimetres (uint16) or metres (float32), 0 = no
+    measurement; `labels` (H, W) are the 4-connected visible regions of planar faces, 0 = no
+    measurement, `NOT_PLANAR` on curved ones.
     """
 
     depth: NDArray[np.uint16] | NDArray[np.float32]
@@ -42,18 +54,8 @@ def simulate(
 ) -> Frame:
     """Depth image of a scene with its truth: the face in the direction of each pixel.
 
-    Parameters
-    ----------
-    scene : Scene
-        Solids and camera poses.
-    sensor : Sensor
-        How it is measured.
-    camera : Camera, optional
-        The sensor's own when not given.
-    frame : int
-        Which of the scene's poses.
-    seed : int
-        Noise of the frame, together with `frame`.
+    The camera is the sensor's own when none is given, the pose that of the number `frame`; the
+    noise follows from `seed` and `frame`.
     """
     camera = camera or sensor.camera
     pose = scene.poses[frame]
@@ -69,3 +71,30 @@ def simulate(
             image[np.linalg.norm(points - centre, axis=-1) < radius * ragged] = 0
     labels, planes = visible_regions(np.where(image > 0, face, -1), scene.planes(pose))
     return Frame(image, labels, planes, camera)
+
+
+def visible_regions(
+    face: NDArray[np.int32], planes: NDArray[np.float64]
+) -> tuple[NDArray[np.uint16], list[TruePlane]]:
+    """4-connected regions of the planar faces seen in an image.
+
+    `face` (H, W) is the number of the face that each pixel sees, -1 where nothing was measured;
+    `planes` (F, 4) are the equations of all faces, NaN of curved ones. The labels (H, W) are 0
+    where nothing was measured, `NOT_PLANAR` on curved faces, else 1, 2, ... by face and then in
+    reading order, as the regions are.
+    """
+    labels = np.zeros(face.shape, np.uint16)
+    regions: list[TruePlane] = []
+    for number in np.unique(face[face >= 0]).tolist():
+        mask = face == number
+        normal, distance = planes[number, :3], float(planes[number, 3])
+        if np.isnan(distance):
+            labels[mask] = NOT_PLANAR
+            continue
+        count, components = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+        if len(regions) + count > NOT_PLANAR:
+            raise ValueError(f'more than {NOT_PLANAR - 1} visible regions')
+        labels[mask] = components[mask] + len(regions)
+        for size in np.bincount(components[mask])[1:].tolist():
+            regions.append(TruePlane(len(regions) + 1, number, normal, distance, size))
+    return labels, regions

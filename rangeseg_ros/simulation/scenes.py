@@ -5,13 +5,22 @@ World frame: x and y along the floor, z up, metres; the floor is z = 0.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, sphere
+from rangeseg_ros.simulation.solids import (
+    Solid,
+    about_z,
+    box,
+    cast,
+    cylinder,
+    half_space,
+    sphere,
+)
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of the optical frame (z forward, REP 103) in a body frame with x forward, z up."""
@@ -19,15 +28,7 @@ OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where a sensor stands.
-
-    Attributes
-    ----------
-    rotation : (3, 3) float64
-        World-from-sensor rotation.
-    position : (3,) float64
-        Sensor's origin in the world, metres.
-    """
+    """Where a sensor stands: world-from-sensor rotation (3, 3), and its origin (3,), metres."""
 
     rotation: NDArray[np.float64]
     position: NDArray[np.float64]
@@ -44,16 +45,10 @@ class Pose:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Solids and the poses of the camera that looks at them, one per frame.
+    """Solids, the poses of the camera that looks at them, one per frame, and dark places.
 
-    Attributes
-    ----------
-    solids : tuple of Solid
-        In the world frame.
-    poses : tuple of Pose
-        At least one.
-    dark : (N, 4) float64
-        Centres and radii of balls in which surfaces return too little light to be measured.
+    `dark` (N, 4) are centres and radii of balls in which surfaces return too little light to be
+    measured.
     """
 
     solids: tuple[Solid, ...]
@@ -69,44 +64,6 @@ class Scene:
         world = np.vstack([solid.planes for solid in self.solids])
         distance = world[:, :3] @ pose.position + world[:, 3]
         return np.column_stack([world[:, :3] @ pose.rotation, distance])
-
-
-def kinect_room(seed: int, frames: int = 1) -> Scene:
-    """Floor, two walls and three to five boxes at any orientation, as a hand-held Kinect sees it.
-
-    The boxes rest on the floor, stand on one another, lie tilted or float; the camera is 0.8 to
-    1.8 m above the floor and tilted down; depth is about 0.8 to 5 m.
-
-    Parameters
-    ----------
-    seed : int
-        The same seed gives the same room and, for its first frames, the same motion.
-    frames : int
-        Number of camera poses at 30 Hz; see `camera_motion`.
-    """
-    random = np.random.default_rng([seed, 1])
-    room = _Room(random)
-    for _ in range(random.integers(3, 6)):
-        room.add_box()
-    return room.scene(camera_motion(room.pose, seed, frames))
-
-
-def curved_scene(seed: int, frames: int = 1) -> Scene:
-    """Room with a ball and a standing cylinder on the floor, and one or two boxes.
-
-    Parameters
-    ----------
-    seed, frames : int
-        As for `kinect_room`.
-    """
-    random = np.random.default_rng([seed, 2])
-    # The curved objects stand in front, so that no box hides them.
-    room = _Room(random, nearest=2.5)
-    room.add_ball()
-    room.add_cylinder()
-    for _ in range(random.integers(1, 3)):
-        room.add_box()
-    return room.scene(camera_motion(room.pose, seed, frames))
 
 
 def camera_motion(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
@@ -133,14 +90,8 @@ def walk(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
     """Walk with the camera in the hand along an arc about the room, at 30 frames per second.
 
     From one side to the other and back at up to 0.5 m/s, 1.2 m to both sides, looking at the
-    middle of the room, with the swings of `camera_motion` on top.
-
-    Parameters
-    ----------
-    start : Pose
-        Over the origin, looking along x, as in `kinect_room`.
-    seed, frames : int
-        As for `camera_motion`.
+    middle of the room, with the swings of `camera_motion` on top. `start` is over the origin and
+    looks along x, as in `kinect_room`.
     """
     middle, reach, period = 2.2, 0.55, 16.0
     swings = camera_motion(start, seed, frames)
@@ -151,6 +102,37 @@ def walk(start: Pose, seed: int, frames: int) -> tuple[Pose, ...]:
         about = pose.position - (middle, 0, 0)
         poses.append(Pose(rotation @ pose.rotation, rotation @ about + (middle, 0, 0)))
     return tuple(poses)
+
+
+Motion = Callable[[Pose, int, int], tuple[Pose, ...]]
+"""Poses from a first one, a seed and a number of frames."""
+
+
+def kinect_room(seed: int, frames: int = 1, motion: Motion = camera_motion) -> Scene:
+    """Floor, two walls and three to five boxes at any orientation, as a hand-held Kinect sees it.
+
+    The boxes rest on the floor, stand on one another, lie tilted or float; the camera is 0.8 to
+    1.8 m above the floor and tilted down; depth is about 0.8 to 5 m.
+
+    The same seed gives the same room and, for its first frames, the same motion.
+    """
+    random = np.random.default_rng([seed, 1])
+    room = _Room(random)
+    for _ in range(random.integers(3, 6)):
+        room.add_box()
+    return room.scene(motion(room.pose, seed, frames))
+
+
+def curved_scene(seed: int, frames: int = 1) -> Scene:
+    """`kinect_room` with a ball, a standing cylinder, and one or two boxes."""
+    random = np.random.default_rng([seed, 2])
+    # The curved objects stand in front, so that no box hides them.
+    room = _Room(random, nearest=2.5)
+    room.add_ball()
+    room.add_cylinder()
+    for _ in range(random.integers(1, 3)):
+        room.add_box()
+    return room.scene(camera_motion(room.pose, seed, frames))
 
 
 class _Room:
@@ -187,7 +169,7 @@ class _Room:
             size[:2] = self.random.uniform(0.4, 0.9, 2) * width
             size[2] = self.random.uniform(0.1, 0.4)
             angle = yaw + self.random.uniform(-20, 20)
-            self.solids.append(box(size, _about_z(angle), (*place, top + size[2] / 2)))
+            self.solids.append(box(size, about_z(angle), (*place, top + size[2] / 2)))
         elif kind == 'tilted':
             rotation = Rotation.from_quat(self.random.standard_normal(4)).as_matrix()
             reach = np.abs(rotation) @ size / 2
@@ -197,7 +179,7 @@ class _Room:
         else:
             yaw = self.random.uniform(0, 90)
             place = self._free_place(np.hypot(*size[:2]) / 2, self.nearest, self.depth)
-            self.solids.append(box(size, _about_z(yaw), (*place, size[2] / 2)))
+            self.solids.append(box(size, about_z(yaw), (*place, size[2] / 2)))
             self.tops.append((place, size[2], min(size[:2]), yaw))
 
     def add_ball(self) -> None:
@@ -231,16 +213,10 @@ class _Room:
             place = self.random.uniform((near, -1.4), (far, 1.4))
             free = np.hypot(*place) - radius > 0.8 and abs(place[1]) < 0.45 * place[0]
             for wall in self.walls:
-                free &= wall.normals[0, :2] @ place + wall.offsets[0] > radius
+                free &= wall.planes[0] @ (*place, 0, 1) > radius
             for other, reach in self.occupied:
                 free &= np.hypot(*(place - other)) > radius + reach
             if free:
                 break
         self.occupied.append((place, radius))
         return place
-
-
-def _about_z(degrees: float) -> NDArray[np.float64]:
-    """Rotation about the vertical."""
-    rotation: NDArray[np.float64] = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
-    return rotation

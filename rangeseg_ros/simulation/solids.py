@@ -8,61 +8,43 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.runtime.threads import run_rows
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """Points p with normals @ p + offsets <= 0 and, when there is a quadric, p'Qp <= 0.
+    """Points p = (x, y, z, 1) with p'Qp <= 0 for the matrix Q of every face.
 
     Attributes
     ----------
-    normals : (K, 3) float64
-        Outward unit normals of the planar faces.
-    offsets : (K,) float64
-        Offsets of the faces, metres.
-    quadric : (4, 4) float64 or None
-        Symmetric matrix of a convex quadric in homogeneous coordinates; the solid's last face.
+    faces : (F, 4, 4) float64
+        Symmetric matrices of planes, [[0, n / 2], [n / 2, d]] with the outward unit normal n and
+        the offset d (metres), and of convex quadrics.
     """
 
-    normals: NDArray[np.float64]
-    offsets: NDArray[np.float64]
-    quadric: NDArray[np.float64] | None = None
-
-    @property
-    def face_count(self) -> int:
-        """Number of faces, the curved one included."""
-        return len(self.offsets) + (self.quadric is not None)
+    faces: NDArray[np.float64]
 
     @property
     def planes(self) -> NDArray[np.float64]:
-        """(face_count, 4) plane equations (normal, offset); NaN for the curved face."""
-        planes = np.full((self.face_count, 4), np.nan)
-        planes[: len(self.offsets)] = np.column_stack([self.normals, self.offsets])
+        """(F, 4) plane equations (normal, offset) of the faces; NaN for curved ones."""
+        planes = np.column_stack([2 * self.faces[:, 3, :3], self.faces[:, 3, 3]])
+        planes[self.faces[:, :3, :3].any(axis=(1, 2))] = np.nan
         return planes
+
+    def transformed(self, back: NDArray[np.float64]) -> Solid:
+        """The solid whose points the matrix `back` (4, 4) takes to points of this one."""
+        return Solid(back.T @ self.faces @ back)
 
 
 def cast(
     solids: Sequence[Solid], origins: ArrayLike, directions: ArrayLike
 ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """First hit of every ray.
+    """First hit of every ray, of one origin (3,) or one for each (..., 3).
 
-    Parameters
-    ----------
-    solids : sequence of Solid
-        Faces are numbered through all solids, in their order.
-    origins : (3,) or (..., 3) array_like
-        One origin for all rays, or one for each.
-    directions : (..., 3) array_like
-        Directions, of any length.
-
-    Returns
-    -------
-    distance : (...) float64
-        Ray parameter of the hit, in lengths of the direction; inf where nothing is hit.
-    face : (...) int32
-        Number of the face hit, -1 where nothing is.
+    Returns its distance (...) in lengths of the direction (..., 3), inf where nothing is hit, and
+    the number (...) of the face, counted through all solids; -1 for none.
     """
     directions = np.asarray(directions, np.float64)
     shape = directions.shape[:-1]
@@ -72,24 +54,9 @@ def cast(
     face = np.full(len(directions), -1, np.int32)
     first = 0
     for solid in solids:
-        quadric = _NONE if solid.quadric is None else solid.quadric
-        run_rows(
-            _enter,
-            len(directions),
-            origins,
-            directions,
-            solid.normals,
-            solid.offsets,
-            quadric,
-            first,
-            distance,
-            face,
-        )
-        first += solid.face_count
+        run_rows(_enter, len(directions), origins, directions, solid.faces, first, distance, face)
+        first += len(solid.faces)
     return distance.reshape(shape), face.reshape(shape)
-
-
-_NONE = np.zeros((0, 0))
 
 
 @njit(cache=True, nogil=True)
@@ -98,59 +65,48 @@ def _enter(
     after: int,
     origins: NDArray[np.float64],
     directions: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    offsets: NDArray[np.float64],
-    quadric: NDArray[np.float64],
+    faces: NDArray[np.float64],
     first: int,
     distance: NDArray[np.float64],
     face: NDArray[np.int32],
 ) -> None:
     """Where rays start...after enter a solid, if that is nearer than `distance`, which is set.
 
-    A ray is inside between its last entry into a half space (or the quadric) and its first exit.
+    A ray is inside between the last face that it enters by and the first that it leaves by.
     """
     for i in range(start, after):
         x, y, z = origins[i if len(origins) > 1 else 0]
         u, v, w = directions[i]
         entry, exit_, entered = -np.inf, distance[i], -1
-        for k in range(len(offsets)):
-            rate = normals[k, 0] * u + normals[k, 1] * v + normals[k, 2] * w
-            height = normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z + offsets[k]
-            if rate < 0:
-                if -height / rate > entry:
-                    entry, entered = -height / rate, k
-            elif rate > 0:
-                exit_ = min(exit_, -height / rate)
-            elif height > 0:
-                exit_ = -np.inf
+        for k in range(len(faces)):
+            inside, outside = _interval(faces, k, x, y, z, u, v, w)
+            if inside > entry:
+                entry, entered = inside, k
+            exit_ = min(exit_, outside)
             if entry >= exit_:
                 break
-        if len(quadric) and entry < exit_:
-            inside, outside = _quadric_interval(quadric, x, y, z, u, v, w)
-            if inside > entry:
-                entry, entered = inside, len(offsets)
-            exit_ = min(exit_, outside)
         if 0 < entry < exit_:
             distance[i] = entry
             face[i] = first + entered
 
 
 @njit(cache=True)
-def _quadric_interval(
-    quadric: NDArray[np.float64], x: float, y: float, z: float, u: float, v: float, w: float
+def _interval(
+    q: NDArray[np.float64], k: int, x: float, y: float, z: float, u: float, v: float, w: float
 ) -> tuple[float, float]:
-    """Ray parameters between which p'Qp <= 0; (inf, -inf) where that is nowhere."""
-    a = b = 0.0
-    c = quadric[3, 3]
-    for i in range(3):
-        origin, direction = (x, y, z)[i], (u, v, w)[i]
-        gradient = quadric[i, 0] * x + quadric[i, 1] * y + quadric[i, 2] * z + quadric[i, 3]
-        bend = quadric[i, 0] * u + quadric[i, 1] * v + quadric[i, 2] * w
-        a += direction * bend
-        b += direction * gradient
-        c += origin * (gradient + quadric[i, 3])
-    if a < 1e-15:  # along a cylinder's axis: inside or not, but never across
-        return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
+    """Between which t on a ray p'Qp = a t^2 + 2 b t + c <= 0, Q = q[k]; (inf, -inf) for none."""
+    a, b = 0.0, q[k, 3, 0] * u + q[k, 3, 1] * v + q[k, 3, 2] * w
+    c = 2 * (q[k, 3, 0] * x + q[k, 3, 1] * y + q[k, 3, 2] * z) + q[k, 3, 3]
+    if q[k, 0, 0] + q[k, 1, 1] + q[k, 2, 2] > 0:  # no plane
+        for i in range(3):
+            gradient = q[k, i, 0] * x + q[k, i, 1] * y + q[k, i, 2] * z
+            a += (u, v, w)[i] * (q[k, i, 0] * u + q[k, i, 1] * v + q[k, i, 2] * w)
+            b += (u, v, w)[i] * gradient
+            c += (x, y, z)[i] * gradient
+    if a < 1e-15:  # a plane, or along a cylinder's axis
+        if b == 0:
+            return (-np.inf, np.inf) if c <= 0 else (np.inf, -np.inf)
+        return (-np.inf, -c / (2 * b)) if b > 0 else (-c / (2 * b), np.inf)
     if b * b < a * c:
         return np.inf, -np.inf
     root = np.sqrt(b * b - a * c)
@@ -161,30 +117,21 @@ def half_space(normal: ArrayLike, point: ArrayLike) -> Solid:
     """Everything behind the plane through `point` whose outward normal is `normal`."""
     unit = np.asarray(normal, np.float64)
     unit = unit / np.linalg.norm(unit)
-    return Solid(unit[None], -np.array([unit @ np.asarray(point, np.float64)]))
+    return _flat(np.append(unit, -unit @ np.asarray(point, np.float64))[None])
 
 
 def prism(outline: ArrayLike, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
-    """Right prism over a convex polygon.
+    """Right prism over a convex polygon, moved by `rotation` (3, 3) and then by `centre` (3,).
 
-    Parameters
-    ----------
-    outline : (M, 2) array_like
-        Corners of the base, counter-clockwise, metres.
-    height : float
-        Height of the prism along its own z axis; z runs from -height / 2 to height / 2.
-    rotation : (3, 3) array_like
-        World-from-solid rotation.
-    centre : (3,) array_like
-        World position of the solid's origin.
+    `outline` (M, 2) are the corners of its base, counter-clockwise, metres; its own z runs from
+    -height / 2 to height / 2.
     """
     corners = np.asarray(outline, np.float64)
     edges = np.roll(corners, -1, axis=0) - corners
-    sides = np.column_stack([edges[:, 1], -edges[:, 0], np.zeros(len(edges))])
-    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-    normals = np.vstack([sides, [[0, 0, 1], [0, 0, -1]]])
-    offsets = -np.append((sides[:, :2] * corners).sum(axis=1), [height / 2, height / 2])
-    return _placed(Solid(normals, offsets), rotation, centre)
+    x, y = edges[:, ::-1].T * ([[1], [-1]] / np.linalg.norm(edges, axis=1))
+    offset = -(x * corners[:, 0] + y * corners[:, 1])
+    upright = np.column_stack([x, y, np.zeros(len(x)), offset])
+    return _placed(_flat(np.vstack([upright, _ends(height)])), rotation, centre)
 
 
 def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
@@ -195,25 +142,37 @@ def box(size: ArrayLike, rotation: ArrayLike, centre: ArrayLike) -> Solid:
 
 def sphere(radius: float, centre: ArrayLike) -> Solid:
     """Ball of a radius in metres."""
-    quadric = np.diag([1.0, 1.0, 1.0, -(radius**2)])
-    return _placed(Solid(np.zeros((0, 3)), np.zeros(0), quadric), np.eye(3), centre)
+    return _placed(Solid(np.diag([1.0, 1.0, 1.0, -(radius**2)])[None]), np.eye(3), centre)
 
 
 def cylinder(radius: float, height: float, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Cylinder along its own z axis, with flat ends."""
-    normals, offsets = np.array([[0.0, 0, 1], [0, 0, -1]]), np.full(2, -height / 2)
-    quadric = np.diag([1.0, 1.0, 0.0, -(radius**2)])
-    return _placed(Solid(normals, offsets, quadric), rotation, centre)
+    round_ = np.diag([1.0, 1.0, 0.0, -(radius**2)])
+    faces = np.concatenate([_flat(_ends(height)).faces, round_[None]])
+    return _placed(Solid(faces), rotation, centre)
+
+
+def about_z(degrees: float) -> NDArray[np.float64]:
+    """Rotation about the vertical."""
+    rotation: NDArray[np.float64] = Rotation.from_euler('z', degrees, degrees=True).as_matrix()
+    return rotation
+
+
+def _ends(height: float) -> NDArray[np.float64]:
+    """Top and bottom, (2, 4), of a solid of that height about its origin."""
+    return np.array([[0, 0, 1, -height / 2], [0, 0, -1, -height / 2]])
+
+
+def _flat(planes: NDArray[np.float64]) -> Solid:
+    """The solid of planar faces: plane equations (F, 4)."""
+    faces = np.zeros((len(planes), 4, 4))
+    faces[:, 3] = faces[:, :, 3] = planes * (0.5, 0.5, 0.5, 1)
+    return Solid(faces)
 
 
 def _placed(solid: Solid, rotation: ArrayLike, centre: ArrayLike) -> Solid:
     """Return the solid after p -> rotation @ p + centre."""
-    rotation, centre = np.asarray(rotation, np.float64), np.asarray(centre, np.float64)
-    normals = solid.normals @ rotation.T
-    offsets = solid.offsets - normals @ centre
-    quadric = solid.quadric
-    if quadric is not None:
-        back = np.eye(4)
-        back[:3, :3], back[:3, 3] = rotation.T, -rotation.T @ centre
-        quadric = back.T @ quadric @ back
-    return Solid(normals, offsets, quadric)
+    back = np.eye(4)
+    back[:3, :3] = np.asarray(rotation, np.float64).T
+    back[:3, 3] = -back[:3, :3] @ np.asarray(centre, np.float64)
+    return solid.transformed(back)

@@ -204,8 +204,8 @@ class Tilt(NamedTuple):
         """What to do about it, in one line."""
         x, y, z = (f'{part:.3f}' for part in self.up)
         return (
-            f'the camera looks tilted by {self.degrees:.0f} degrees against the stated up: floor, '
-            f'roles and terrain are not to be trusted; by the planes, up is ({x}, {y}, {z})'
+            f'the stated up is off by {self.degrees:.0f} degrees, so that roles and terrain are '
+            f'unreliable; the planes say up_x: {x}, up_y: {y}, up_z: {z}'
         )
 
 

@@ -286,7 +286,7 @@ def _without_ground(
     elif height > 0:
         reasons = (f'no ground that is seen is {height:.2f} m below, as is known',)
     elif seen:
-        reasons = (f'no height is stated, and {seen.size:.1f} m of a surface may be a table',)
+        reasons = (f'without sensor_height, what is below {FURNITURE:g} m long may be a table',)
     confidence = seen.confidence if seen and height > 0 else 0.0
     nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
     stand = Stand(np.zeros(3), confidence, reasons)

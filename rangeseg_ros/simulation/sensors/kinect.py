@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.sensors.sensor import inverse_depth, slopes, unseen_from_the_right
+from rangeseg_ros.simulation.sensors.sensor import (
+    Sensor,
+    inverse_depth,
+    millimetres,
+    resize,
+    slopes,
+    unseen_from_the_right,
+)
 
 QUANTUM = 0.00290
 """Inverse depth of one disparity quantum, 1/m."""
@@ -24,48 +31,29 @@ BASELINE = 0.075
 """Distance of the projector to the right of the camera, metres."""
 SHADOW_SHARE = 0.75
 """Part of a shadow's geometric width that real sensors leave blank (median)."""
-
-
 NOISES = ('measured', 'correlated', 'independent', 'none')
 
 
 @dataclass(frozen=True)
-class Kinect:
-    """Kinect v1.
+class Kinect(Sensor):
+    """Kinect v1, with a choice of its noise.
 
-    Attributes
-    ----------
-    seed : int
-        Which sensor: its fixed distortion and bands.
-    noise : {'measured', 'correlated', 'independent', 'none'}
-        measured: fixed distortion, vertical bands, correlated noise, blind zones. independent:
-        sigma = 0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the
-        same, correlated over 1.5 pixels as by block matching. These three quantise disparity to
-        1/8 pixel and depth to millimetres. none: exact metres. All have the shadows of the
-        projector.
-
-    Raises
-    ------
-    ValueError
-        Unknown noise.
+    measured: fixed distortion, vertical bands, correlated noise, blind zones. independent: sigma =
+    0.0012 + 0.0019 (z - 0.4)^2 m (Nguyen, Izadi and Lovell 2012); correlated: the same, correlated
+    over 1.5 pixels as by block matching. These three quantise disparity to 1/8 pixel and depth to
+    millimetres. none: exact metres. All have the shadows of the projector.
     """
 
-    seed: int = 0
     noise: str = 'measured'
+    camera = Camera(640, 480, 585.0, 585.0, 319.5, 239.5)
 
     def __post_init__(self) -> None:
         if self.noise not in NOISES:
             raise ValueError(f'noise must be one of {", ".join(NOISES)}, not {self.noise!r}')
 
-    @property
-    def camera(self) -> Camera:
-        """640x480."""
-        return kinect_camera()
-
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16] | NDArray[np.float32]:
-        """See `Sensor.measure`."""
         inverse = inverse_depth(depth)
         share = SHADOW_SHARE if self.noise == 'measured' else 1.0
         blind = ~np.isfinite(depth) | unseen_from_the_right(inverse, camera, share * BASELINE)
@@ -73,52 +61,42 @@ class Kinect:
         if self.noise == 'none':
             return np.where(blind, 0, depth).astype(np.float32)
         if self.noise == 'measured':
-            slope = slopes(inverse, camera)
-            blind |= blind_zones(depth, slope, smooth_field(depth.shape, (2.5, 2.5), random))
-            disparity = measured_disparity(depth, slope, self.seed, random)
+            disparity, zones = self._measured(depth, slopes(inverse, camera), random)
+            blind |= zones
         else:
             width = (1.5, 1.5) if self.noise == 'correlated' else None
             error = 0.0012 + 0.0019 * (depth - 0.4) ** 2
             error *= smooth_field(depth.shape, width, random)
             disparity = 1 / (QUANTUM * np.maximum(depth + error, 0.1))
-        values = in_millimetres(disparity)
-        return np.where(blind | (values > 65535), 0, values).astype(np.uint16)
+        # One quantum of disparity stands for infinity: nothing is measured beyond 65 m.
+        return millimetres(1 / (QUANTUM * np.maximum(np.rint(disparity), 1)), ~blind)
+
+    def _measured(
+        self, depth: NDArray[np.float64], slope: NDArray[np.float64], random: np.random.Generator
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Disparity as real sensors see `depth`, quanta before rounding, and what they do not see.
+
+        The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame
+        with a quarter of the pattern's variance, and pixel noise of 0.37 quanta correlated over 2
+        pixels that grows with the tangent `slope` of the angle of incidence. These reproduce the
+        0.45 quanta of residual noise (quantisation included) and its autocorrelation (0.5 at
+        1.4-1.9 pixels) of real frames. Nothing is seen nearer than 0.8 m, in the last eight
+        columns, and, with ragged borders, on surfaces seen at more than about 80 degrees.
+        """
+        ragged = 2 * smooth_field(depth.shape, (2.5, 2.5), random)
+        blind = np.degrees(np.arctan(slope)) + ragged > 80
+        blind |= depth < 0.8
+        blind[:, -8:] = True
+        fresh = 0.25 * smooth_field(depth.shape, _distortion_scale(depth.shape[1]), random)
+        noise = 0.37 * (1 + 0.25 * np.maximum(slope - 0.7, 0))
+        noise = noise * smooth_field(depth.shape, (2.0, 2.0), random)
+        pattern = sensor_pattern(depth.shape, self.seed)
+        return 1 / (QUANTUM * depth) + pattern + fresh + noise, blind
 
 
 def kinect_camera(width: int = 640, height: int = 480) -> Camera:
     """Intrinsics of a Kinect whose image of the same field of view has that many columns."""
-    focal = 585.0 * width / 640
-    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-
-
-def measured_disparity(
-    depth: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    sensor_seed: int,
-    random: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Disparity, in quanta and before rounding, as real sensors see `depth`.
-
-    The sum of the true disparity, `sensor_pattern`, a smooth distortion new in every frame with
-    a quarter of the pattern's variance, and pixel noise of 0.37 quanta correlated over 2 pixels
-    that grows with obliquity. These reproduce the 0.45 quanta of residual noise (quantisation
-    included) and its autocorrelation (0.5 at 1.4-1.9 pixels) of real frames.
-
-    Parameters
-    ----------
-    depth : (H, W) float64
-        True depth, metres.
-    slope : (H, W) float64
-        Tangent of the angle of incidence.
-    sensor_seed : int
-        Which sensor.
-    random : Generator
-        Source of what is new in every frame.
-    """
-    fresh = 0.25 * smooth_field(depth.shape, _distortion_scale(depth.shape[1]), random)
-    noise = 0.37 * (1 + 0.25 * np.maximum(slope - 0.7, 0))
-    noise = noise * smooth_field(depth.shape, (2.0, 2.0), random)
-    return 1 / (QUANTUM * depth) + sensor_pattern(depth.shape, sensor_seed) + fresh + noise
+    return resize(Kinect.camera, width, height)
 
 
 @lru_cache(maxsize=4)
@@ -152,26 +130,3 @@ def sensor_pattern(shape: tuple[int, ...], sensor_seed: int) -> NDArray[np.float
 def _distortion_scale(width: int) -> tuple[float, float]:
     """Kernel widths of the smooth distortion over columns and rows, pixels."""
     return 26 * width / 640, 45 * width / 640
-
-
-def blind_zones(
-    depth: NDArray[np.float64], slope: NDArray[np.float64], ragged: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """(H, W) True where real sensors measure nothing, shadows and dark surfaces apart.
-
-    Nearer than 0.8 m, in the last eight columns and, with borders as ragged as a field of unit
-    variance, on surfaces seen at more than about 80 degrees.
-    """
-    blind: NDArray[np.bool_] = np.degrees(np.arctan(slope)) + 2 * ragged > 80
-    blind |= depth < 0.8
-    blind[:, -8:] = True
-    return blind
-
-
-def in_millimetres(disparity: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Depth, millimetres, of disparities in quanta, both rounded as the sensor does.
-
-    One quantum of disparity stands for infinity: nothing is measured beyond 65 m (65535 mm).
-    """
-    depth: NDArray[np.float64] = np.rint(1000 / (QUANTUM * np.maximum(np.rint(disparity), 1)))
-    return depth

@@ -13,15 +13,13 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.sensors.sensor import inverse_depth, millimetres
+from rangeseg_ros.simulation.sensors.sensor import Sensor, inverse_depth, millimetres
 
 POINTS = 24
 """Points measured along each side of the image."""
@@ -33,19 +31,14 @@ _WAVES, _NOISE = 0.008, 0.0006
 _BLUR = 1.5
 
 
-@dataclass(frozen=True)
-class Lidar:
-    """Lidar of a tablet; every sensor is alike, and nothing is fixed from frame to frame."""
+class Lidar(Sensor):
+    """Lidar of a tablet, 62 degrees wide; all are alike, nothing is fixed from frame to frame."""
 
-    @property
-    def camera(self) -> Camera:
-        """256x192, 62 degrees wide."""
-        return Camera(256, 192, 212.0, 212.0, 127.5, 95.5)
+    camera = Camera(256, 192, 212.0, 212.0, 127.5, 95.5)
 
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """See `Sensor.measure`."""
         # Blurred in inverse depth, in which surfaces stay plane.
         inverse = cv2.GaussianBlur(inverse_depth(depth), (0, 0), _BLUR)
         spacing = 2.0 * camera.width / POINTS

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,36 +11,44 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.camera import Camera
 
 
-class Sensor(Protocol):
+@dataclass(frozen=True)
+class Sensor:
     """A depth camera: how it errs, and what it does not see.
 
     Sizes in pixels that come from matching windows and filters are those of the image at hand;
     fixed patterns stretch with the image.
+
+    Attributes
+    ----------
+    seed : int
+        Which one of its kind: its fixed errors.
+    camera : Camera
+        Intrinsics of its usual mode.
     """
 
-    @property
-    def camera(self) -> Camera:
-        """Intrinsics of the sensor's usual mode."""
+    seed: int = 0
+    camera: ClassVar[Camera]
 
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16] | NDArray[np.float32]:
-        """Depth image as the sensor delivers it.
+        """Depth image (H, W) as the sensor delivers it: millimetres, or metres as float32.
 
-        Parameters
-        ----------
-        depth : (H, W) float64
-            True depth along the optical axis, metres; inf where there is nothing.
-        camera : Camera
-            Intrinsics of the image.
-        random : Generator
-            Source of what is new in every frame.
-
-        Returns
-        -------
-        (H, W) uint16 or float32
-            Along the optical axis: millimetres, or metres; 0 = no measurement.
+        Both the image, where 0 stands for no measurement, and the true `depth` (metres, inf where
+        there is nothing) are along the optical axis; `random` gives what is new in every frame.
         """
+        raise NotImplementedError
+
+
+class Ideal(Sensor):
+    """Exact depth in metres (float32), everywhere: renderings."""
+
+    camera = Camera(640, 480, 585.0, 585.0, 319.5, 239.5)
+
+    def measure(
+        self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
+    ) -> NDArray[np.float32]:
+        return np.where(np.isfinite(depth), depth, 0).astype(np.float32)
 
 
 def resize(camera: Camera, width: int, height: int) -> Camera:

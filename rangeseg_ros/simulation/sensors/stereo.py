@@ -28,7 +28,6 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import cv2
@@ -38,6 +37,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.sensor import (
+    Sensor,
     inverse_depth,
     millimetres,
     slopes,
@@ -57,27 +57,14 @@ _WHITE = 0.02
 _BOWL, _WAVES = 0.003, 0.0008
 
 
-@dataclass(frozen=True)
-class RealSense:
-    """D435 at 848x480.
+class RealSense(Sensor):
+    """D435 at 848x480, 90 degrees wide."""
 
-    Attributes
-    ----------
-    seed : int
-        Which sensor: its fixed distortion.
-    """
-
-    seed: int = 0
-
-    @property
-    def camera(self) -> Camera:
-        """848x480, 90 degrees wide."""
-        return Camera(848, 480, 424.0, 424.0, 423.5, 239.5)
+    camera = Camera(848, 480, 424.0, 424.0, 423.5, 239.5)
 
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """See `Sensor.measure`."""
         true = inverse_depth(depth)
         inverse = _fattened(true, random)
         scale = camera.fx * BASELINE

@@ -28,15 +28,13 @@ References
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.sensors.sensor import inverse_depth, millimetres, slopes
+from rangeseg_ros.simulation.sensors.sensor import Sensor, inverse_depth, millimetres, slopes
 
 # Noise of the range at 2 m head-on, metres, and the filter's widths over columns and rows, pixels.
 _NOISE = ((0.006, 0.8, 0.8), (0.004, 3.0, 3.0), (0.003, 8.0, 0.7))
@@ -48,27 +46,14 @@ _FOOTPRINT = 0.7
 """Width of the Gaussian that a pixel gathers light from, pixels."""
 
 
-@dataclass(frozen=True)
-class TimeOfFlight:
-    """ToF camera of a phone.
+class TimeOfFlight(Sensor):
+    """ToF camera of a phone, 68 degrees wide."""
 
-    Attributes
-    ----------
-    seed : int
-        Which sensor: its fixed offsets.
-    """
-
-    seed: int = 0
-
-    @property
-    def camera(self) -> Camera:
-        """240x180, 68 degrees wide."""
-        return Camera(240, 180, 179.0, 179.0, 119.5, 89.5)
+    camera = Camera(240, 180, 179.0, 179.0, 119.5, 89.5)
 
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16]:
-        """See `Sensor.measure`."""
         ray = np.linalg.norm(camera.rays.astype(np.float64), axis=-1)
         inverse = inverse_depth(depth)
         distance = ray / np.maximum(inverse, 0.01)
@@ -82,27 +67,18 @@ class TimeOfFlight:
         stray = _STRAY * _blurred(light, spread)
         weighted += _STRAY * _blurred(weighted, spread) + _DETOUR * stray
         measured = weighted / (light + stray)
-        measured += self._fixed(camera.shape, measured)
-        measured += _noise(camera.shape, random) / np.sqrt(4 * light)
+        # What does not change from frame to frame.
+        fixed = np.random.default_rng([self.seed, 11])
+        pattern = _OFFSET * smooth_field(camera.shape, 2 * (0.12 * camera.width,), fixed)
+        phase = 2 * np.pi * measured / _PERIOD + fixed.uniform(0, 2 * np.pi)
+        measured += pattern + _WIGGLING * np.sin(phase)
+        # Metres at 2 m head-on.
+        noise = np.zeros(camera.shape)
+        for deviation, columns, rows in _NOISE:
+            noise += deviation * smooth_field(camera.shape, (columns, rows), random)
+        measured += noise / np.sqrt(4 * light)
         dim = light < 0.015 * np.exp(0.3 * smooth_field(camera.shape, (2.0, 2.0), random))
         return millimetres(measured / ray, ~dim & np.isfinite(depth) & (measured > 0.1))
-
-    def _fixed(self, shape: tuple[int, int], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Error of the range that does not change from frame to frame, metres."""
-        random = np.random.default_rng([self.seed, 11])
-        width = 0.12 * shape[1]
-        pattern = _OFFSET * smooth_field(shape, (width, width), random)
-        phase = random.uniform(0, 2 * np.pi)
-        wiggling: NDArray[np.float64] = _WIGGLING * np.sin(2 * np.pi * distance / _PERIOD + phase)
-        return pattern + wiggling
-
-
-def _noise(shape: tuple[int, int], random: np.random.Generator) -> NDArray[np.float64]:
-    """Noise of the range at 2 m head-on, metres."""
-    noise: NDArray[np.float64] = np.zeros(shape)
-    for deviation, columns, rows in _NOISE:
-        noise += deviation * smooth_field(shape, (columns, rows), random)
-    return noise
 
 
 def _blurred(image: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:

@@ -1,7 +1,4 @@
-"""Test pieces: one object of a known size at a known distance on level ground, or none of it.
-
-World frame: x ahead, y to the left, z up, metres; the robot stands at the origin on z = 0.
-"""
+"""Test pieces: one object of a known size at a known distance on level ground, or none of it."""
 
 from __future__ import annotations
 
@@ -10,10 +7,9 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.classes import DROP, OBSTACLE
 from rangeseg_ros.simulation.solids import box, cylinder
-from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Terrain, slab
-from rangeseg_ros.simulation.terrain.site import Site
+from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Site, Terrain, slab
 
 SIZES = (0.05, 0.1, 0.2, 0.3)
 """Heights of cylinders, boxes and kerbs, depths of edges, widths of gaps, metres."""
@@ -39,37 +35,28 @@ def _box(site: Site, ahead: float, size: float) -> None:
 
 def _kerb(site: Site, ahead: float, size: float) -> None:
     site.floor()
-    site.piece(slab(ahead, FAR, size, size, ALL), OBSTACLE, size)
+    site.off_level(ahead, FAR, size, size)
 
 
 def _edge(site: Site, ahead: float, size: float) -> None:
-    site.floor(end=ahead)
-    site.continued(ahead)
-    site.piece(slab(ahead, FAR, -size, -size, ALL), DROP, size)
+    site.step(ahead, -size)
 
 
 def _gap(site: Site, ahead: float, size: float) -> None:
-    """1 m deep; the ground behind it is not judged."""
-    site.floor(end=ahead)
-    site.continued(ahead, ahead + size)
-    site.piece(slab(ahead, ahead + size, -1, -1, ALL), DROP, 1.0)
-    # Its far side belongs to it.
+    """Its far side belongs to it."""
+    site.gap(ahead, size)
     site.piece(slab(ahead + size - 0.01, ahead + size, -0.002, -0.002, ALL), DROP, 1.0)
-    site.ground.append(slab(ahead + size, FAR, 0, 0, ALL))
-    site.piece(site.ground[-1], UNKNOWN, 0.0)
 
 
 def _ramp(site: Site, ahead: float, slope: float) -> None:
     """1 m long, up; an obstacle where it is steeper than ground may be."""
-    site.floor(end=ahead)
     top = float(np.tan(np.radians(slope)))
-    ground = slope <= Config().ground_slope
-    for solid in (slab(ahead, ahead + 1, 0, top, ALL), slab(ahead + 1, FAR, top, top, ALL)):
-        site.piece(solid, GROUND if ground else OBSTACLE, 0.0 if ground else top)
-        if ground:
-            site.ground.append(solid)
-    if not ground:
-        site.continued(ahead)
+    if slope > Config().ground_slope:
+        site.slope(ahead, 1, top)
+    else:
+        site.floor(end=ahead)
+        site.floor(ahead, ahead + 1, 0, top)
+        site.floor(ahead + 1, FAR, top, top)
 
 
 PIECES: dict[str, Callable[[Site, float, float], None]] = {

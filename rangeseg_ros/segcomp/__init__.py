@@ -1,1 +1,0 @@
-"""File formats and scanners of the segmentation comparison of Hoover et al."""
