@@ -131,7 +131,7 @@ MECHANISMS = (
               option=True),
     # Regions.
     Mechanism('patches as wide as the distortion',
-              'by_planes/patches.py by_planes/surfaces.py:Patches,_patches,_put_together',
+              'by_planes/patches.py',
               {'by_planes.method.Patches.of': _without_distortion_length}),
     Mechanism('parts merge by the energy', 'by_planes/surfaces.py:_apart',
               {'by_planes.method.join_surfaces': _given(3, _NO_BORDER),

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
+from rangeseg_ros.core.by_planes.patches import Patches
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.binning import pixel_area
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -136,7 +137,7 @@ def test_clutter_is_no_surface():
     clutter = (ROWS >= 40) & (ROWS < 80)
     random = np.random.default_rng(5)
     inverse = plane(WALL) + clutter * random.normal(0, 20 * QUANTUM, CAMERA.shape)
-    labels, _ = grown(inverse)
+    labels, _ = grown(inverse, least=100)
     assert not labels[22:38].any()
     assert (labels[:18] > 0).mean() > 0.9 and (labels[42:] > 0).mean() > 0.9
 

@@ -8,9 +8,10 @@ import pytest
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.patches import Patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
-from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.moves import Labelling

@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
+from rangeseg_ros.core.by_planes.patches import Patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
-from rangeseg_ros.core.by_planes.surfaces import Patches, join_surfaces, unite_regions
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces, unite_regions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.regions import drop_regions

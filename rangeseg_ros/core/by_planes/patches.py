@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
+from rangeseg_ros.core.by_planes.region_graph import renumbered
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
+from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
 # Chi-squared of the three degrees of freedom of a plane.
@@ -28,6 +31,32 @@ _PER_VARIANCE = 256
 _LEVELS = 16 * _PER_VARIANCE
 # Above all numbers of patches.
 _NONE = np.uint32(0xFFFFFFFF)
+
+
+class Patches(NamedTuple):
+    """Connected blocks on one plane, over which the distortion is nearly constant.
+
+    Attributes
+    ----------
+    labels : (rows, columns) int32
+        Patch of each block: 0 for none, otherwise 1...P.
+    moments : (P + 1, 13) float64
+        Of the patches; zeros for 0.
+    """
+
+    labels: NDArray[np.int32]
+    moments: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, nodes: Nodes, sensor: SensorModel) -> Patches:
+        """Patches of blocks (rows, columns)."""
+        shape = nodes.residual.shape
+        # No patch reaches over the middle, but neither does any reach across a large surface.
+        # Not even in a small image is one smaller than four blocks.
+        largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
+        halves = map_halves(_patches, shape[0], nodes, largest, sensor.agreement)
+        labels, moments = _put_together(*halves[0], *halves[1])
+        return cls(labels.reshape(shape), moments)
 
 
 @njit(cache=True, nogil=True)
@@ -290,3 +319,27 @@ def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
             b = parent[b]
         root[a] = b
     return root
+
+
+@njit(cache=True, nogil=True)
+def _patches(
+    first: int, after: int, nodes: Nodes, largest: float, agreement: float
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Patches in some rows of blocks, 1...P, and their moments."""
+    begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
+    roots = grow_patches(first, after, nodes, largest, agreement) - begin
+    return renumbered(roots, nodes.moments.reshape(-1, SIZE)[begin:end], 1.0)
+
+
+@njit(cache=True, nogil=True)
+def _put_together(
+    upper: NDArray[np.int32],
+    first: NDArray[np.float64],
+    lower: NDArray[np.int32],
+    second: NDArray[np.float64],
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Labels and moments of two halves as those of the whole."""
+    labels = np.concatenate((upper, lower))
+    for a in range(len(upper), len(labels)):
+        labels[a] += (labels[a] > 0) * (len(first) - 1)
+    return labels, np.concatenate((first, second[1:]))

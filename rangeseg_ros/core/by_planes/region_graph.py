@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE
+
 
 class Contacts(NamedTuple):
     """Pairs of parts that touch, as chains of half-edges.
@@ -138,3 +140,27 @@ def least_contact(
             best, least = h, value
         h = contacts.link[h]
     return best, least
+
+
+@njit(cache=True, nogil=True)
+def renumbered(
+    root: NDArray[np.intp], moments: NDArray[np.float64], least: float
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
+    count = np.zeros(len(root))
+    for a in range(len(root)):
+        count[root[a]] += moments[a, COUNT]
+    number = np.zeros(len(root), np.int32)
+    clusters = 0
+    for a in range(len(root)):
+        if count[a] >= least:
+            clusters += 1
+            number[a] = clusters
+    labels = np.zeros(len(root), np.int32)
+    total = np.zeros((clusters + 1, SIZE))
+    for a in range(len(root)):
+        labels[a] = number[root[a]]
+        if labels[a] > 0:
+            for entry in range(SIZE):
+                total[labels[a], entry] += moments[a, entry]
+    return labels, total

@@ -21,15 +21,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
-from rangeseg_ros.core.by_planes.patches import find_roots, grow_patches
+from rangeseg_ros.core.by_planes.patches import Patches, find_roots
 from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
-from rangeseg_ros.core.by_planes.region_graph import Contacts, absorb, find_contacts, least_contact
+from rangeseg_ros.core.by_planes.region_graph import (
+    Contacts,
+    absorb,
+    find_contacts,
+    least_contact,
+    renumbered,
+)
 from rangeseg_ros.core.regions import by_falling_size, relabel
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import View
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, common_residual, fit_all
-from rangeseg_ros.core.sensing.sensor import SensorModel, distortion_share
+from rangeseg_ros.core.sensing.sensor import distortion_share
 from rangeseg_ros.core.significance import chi2_quantile
 
 # By how much the squares that two parts leave of a common plane may exceed those that a smooth
@@ -37,9 +42,6 @@ from rangeseg_ros.core.significance import chi2_quantile
 _WITHIN = chi2_quantile(2)
 # What noise makes of the three parameters of a plane.
 _NOISE = chi2_quantile(3)
-# Blocks of the smallest patch, two by two: fewer hardly determine the direction of a plane, and
-# where a face is rough they are splinters of it.
-_BLOCKS_OF_PATCH = 4
 # What a plane more costs at least: evidence that is no chance for its three parameters.
 _PLANE = chi2_quantile(3) / 2
 
@@ -79,33 +81,6 @@ class Expected(NamedTuple):
             float(smoothness * sensor.patch * unit),
             PLANE_BEND**2 * view.area,
         )
-
-
-class Patches(NamedTuple):
-    """Connected blocks on one plane, over which the distortion is nearly constant.
-
-    Attributes
-    ----------
-    labels : (rows, columns) int32
-        Patch of each block: 0 for none, otherwise 1...P.
-    moments : (P + 1, 13) float64
-        Of the patches; zeros for 0.
-    """
-
-    labels: NDArray[np.int32]
-    moments: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, nodes: Nodes, sensor: SensorModel) -> Patches:
-        """Patches of blocks (rows, columns)."""
-        shape = nodes.residual.shape
-        # No patch reaches over the middle, but neither does any reach across a large surface.
-        # Not even in a small image is one smaller than four blocks.
-        largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
-        smallest = float(_BLOCKS_OF_PATCH * NODE**2)
-        halves = map_halves(_patches, shape[0], nodes, largest, smallest, sensor.agreement)
-        labels, moments = _put_together(*halves[0], *halves[1])
-        return cls(labels.reshape(shape), moments)
 
 
 def join_surfaces(
@@ -181,7 +156,7 @@ def _surfaces(
     """What `join_surfaces` returns."""
     labels, moments = patches.labels.copy(), patches.moments
     roots = _roots(labels, right, below, moments, expected)
-    surface, moments = _renumber(roots, moments, least)
+    surface, moments = renumbered(roots, moments, least)
     _rename(labels, surface)
     return labels, moments
 
@@ -205,54 +180,6 @@ def _rename(labels: NDArray[np.int32], table: NDArray[np.int32]) -> None:
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             labels[i, j] = table[labels[i, j]]
-
-
-@njit(cache=True, nogil=True)
-def _patches(
-    first: int, after: int, nodes: Nodes, largest: float, least: float, agreement: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Patches of at least so many pixels in some rows of blocks, 1...P, and their moments."""
-    begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
-    roots = grow_patches(first, after, nodes, largest, agreement) - begin
-    return _renumber(roots, nodes.moments.reshape(-1, SIZE)[begin:end], least)
-
-
-@njit(cache=True, nogil=True)
-def _put_together(
-    upper: NDArray[np.int32],
-    first: NDArray[np.float64],
-    lower: NDArray[np.int32],
-    second: NDArray[np.float64],
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Labels and moments of two halves as those of the whole."""
-    labels = np.concatenate((upper, lower))
-    for a in range(len(upper), len(labels)):
-        labels[a] += (labels[a] > 0) * (len(first) - 1)
-    return labels, np.concatenate((first, second[1:]))
-
-
-@njit(cache=True, nogil=True)
-def _renumber(
-    root: NDArray[np.intp], moments: NDArray[np.float64], least: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
-    count = np.zeros(len(root))
-    for a in range(len(root)):
-        count[root[a]] += moments[a, COUNT]
-    number = np.zeros(len(root), np.int32)
-    clusters = 0
-    for a in range(len(root)):
-        if count[a] >= least:
-            clusters += 1
-            number[a] = clusters
-    labels = np.zeros(len(root), np.int32)
-    total = np.zeros((clusters + 1, SIZE))
-    for a in range(len(root)):
-        labels[a] = number[root[a]]
-        if labels[a] > 0:
-            for entry in range(SIZE):
-                total[labels[a], entry] += moments[a, entry]
-    return labels, total
 
 
 @njit(cache=True, nogil=True)
