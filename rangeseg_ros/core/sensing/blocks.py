@@ -29,19 +29,12 @@ degrees of freedom; it finds faces 10 pixels wide."""
 
 
 class Blocks(NamedTuple):
-    """The blocks of an image and the planes through each.
+    """The blocks (rows, columns) of an image and the planes through each, in 1/m^2.
 
-    Attributes
-    ----------
-    moments : (rows, columns, 13) float64
-        With unit weights, of the measured pixels.
-    squared : (rows, columns) float64
-        Mean square of the inverse range, 1/m^2.
-    across, down : (rows, columns) float64
-        Squares of the change of the inverse range from pixel to pixel on the plane, along the row
-        and down the column, 1/m^2, less what noise adds to them.
-    residual : (rows, columns) float64
-        Sum of the squared residuals, 1/m^2.
+    `moments` (..., 13) of the measured pixels have unit weights. `squared` is the mean square of
+    the inverse range; `across` and `down` are the squares of its change from pixel to pixel on the
+    plane, along the row and down the column, less what noise adds to them; `residual` is the sum
+    of the squared residuals.
     """
 
     moments: NDArray[np.float64]

@@ -47,15 +47,10 @@ class DistortionMap:
     reference: float = 0.0
 
     def corrected(self, image: RangeImage) -> RangeImage:
-        """`image` without the distortion.
+        """`image` without the distortion; `DistortionError` for another size or camera.
 
         An inverse range along unit rays, as of clouds, is the inverse depth times depth/range,
         and so is its error.
-
-        Raises
-        ------
-        DistortionError
-            The image has another size, or another camera.
         """
         self._check(image)
         along = image.along

@@ -12,23 +12,17 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-_SIGNIFICANT = 5.0
-"""Standard errors by which a line of a spectrum differs from chance in any image."""
+SIGNIFICANT = 5.0
+"""Standard errors that a statistic of an image must differ by, not to be chance in any image."""
+# Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
-"""Rows or columns, and those whose spectrum is looked at, that stand for an image."""
-_LARGEST = 16
-"""Enlargement that is looked for."""
+_LARGEST = 16  # enlargement that is looked for
 
 
 class Cells(NamedTuple):
-    """Squares of pixels that hold one measurement each.
+    """Squares of `factor` x `factor` pixels that hold one measurement each.
 
-    Attributes
-    ----------
-    factor : int
-        Pixels along a side.
-    rows, columns : int
-        How many of the first cell are cropped.
+    `rows` and `columns` are how many of the first one are cropped.
     """
 
     factor: int
@@ -122,7 +116,7 @@ def interpolation(image: RangeImage) -> Cells | None:
         found[2] = _spectrum(some, 3)[2]
         amplitude = np.minimum(amplitude, found)
         # Of a period all divisors show.
-        periods = np.flatnonzero(amplitude > _SIGNIFICANT)
+        periods = np.flatnonzero(amplitude > SIGNIFICANT)
         if not len(periods):
             return None
     return Cells(int(periods[-1]), 0, 0)

@@ -80,17 +80,10 @@ def add_pixel(
     weight: float,
     ratio: float,
 ) -> None:
-    """Add a pixel to a moment vector (13,), but for its count.
+    """Add a pixel, or as many as it stands for, to a moment vector (13,), but for the count.
 
-    Parameters
-    ----------
-    ray : (3,) float32
-    inverse : float
-        Inverse range, 1/m.
-    weight : float
-        1 / random variance of that, times the pixels that it stands for.
-    ratio : float
-        Of the systematic to the random variance, times these.
+    `weight` is 1 / random variance of its inverse range, `ratio` the systematic over the random
+    variance, each times these pixels.
     """
     x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
     for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
@@ -137,19 +130,7 @@ def sums_of(moments: NDArray[np.float64], k: int) -> tuple[float, ...]:
 
 @njit(cache=True, error_model='numpy')
 def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-    """Least-squares plane of a moment vector.
-
-    Parameters
-    ----------
-    moments : (13,) float64
-    theta : (3,) float64
-        Receives the plane; zeros where the pixels do not determine one.
-
-    Returns
-    -------
-    float
-        Weighted sum of the squared residuals.
-    """
+    """Write the plane of moments (13,), or zeros, to theta (3,); sum of the squared residuals."""
     theta[0], theta[1], theta[2], left = plane_of(sums_of(moments.reshape(1, -1), 0))
     return left
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -29,24 +30,12 @@ _SAMPLES = 64
 
 
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
-    """The pinhole camera that points lie on the rays of.
+    """The pinhole camera that points (H, W, 3), metres, lie on the rays of where valid (H, W).
 
     In its optical frame x / z is linear in the column then, and y / z in the row. Lenses and
-    scanners bend the lines by far more than what is let pass.
-
-    Parameters
-    ----------
-    points : (H, W, 3) float
-        In a frame of any axes, metres. The camera is at its origin where points tell no other
-        place, as those of a single plane.
-    valid : (H, W) bool
-        Which of them were measured.
-
-    Returns
-    -------
-    Camera or None
-        None where points lie on no such rays, or fill less than half of the rows or columns:
-        rays of the others would be guessed.
+    scanners bend the lines by far more than what is let pass. The camera is at the origin where
+    points tell no other place, as those of a single plane. None where points lie on no such rays,
+    or fill less than half of the rows or columns: rays of the others would be guessed.
     """
     height, width = valid.shape
     # Odd steps, as holes come in every second row or column.
@@ -62,8 +51,8 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
         columns, rows = _fitted_line(u, x / z, width), _fitted_line(v, y / z, height)
         if columns is None or rows is None:
             continue
-        lens = columns[0], rows[0], columns[1], rows[1]
-        camera = _camera(width, height, lens, turn, place)
+        focal, centre = zip(columns, rows, strict=True)
+        camera = _camera(width, height, *focal, *centre, turn, place)
         if camera is not None and _on_rays(points, valid, camera):
             return camera
     return None
@@ -80,20 +69,13 @@ def depth_of(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floatin
 
 
 def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(3, 3) which axes of a cloud's frame are right, down and forward in it, as columns.
+    """(3, 3) which axes of a cloud's frame are nearest to right, down and forward, as columns.
 
-    Those nearest to them: which way a scanner looks is nothing exact.
-
-    Parameters
-    ----------
-    rays : (H, W, 3) float32
-        Unit vectors.
-    valid : (H, W) bool
-        Where they are known.
+    Of unit rays (H, W, 3) that are known where valid (H, W).
     """
     width = valid.shape[1]
-    # Of a scanner that turns all the way, the other half looks back.
     across = max(width // _SAMPLES, 1)
+    # Of a scanner that turns all the way, the other half looks back.
     front = slice(width // 4, width - width // 4, across)
     forward = _nearest_axis(rays[:, front][valid[:, front]].sum(axis=0, dtype=np.float64))
     both = (valid[1:] & valid[:-1])[:, ::across]
@@ -202,16 +184,11 @@ def _fitted_line(
 
 
 @lru_cache(maxsize=4)
-def _camera(
-    width: int,
-    height: int,
-    lens: tuple[float, float, float, float],
-    turn: tuple[float, ...],
-    place: tuple[float, ...],
-) -> Camera | None:
+def _camera(*intrinsics: Any) -> Camera | None:
     """One for all frames, as its rays are worked out once."""
+    *lens, turn, place = intrinsics
     try:
-        return Camera(width, height, *lens, turn=turn, place=place)
+        return Camera(*lens, turn=turn, place=place)
     except CameraError:
         return None
 

@@ -167,45 +167,25 @@ class RangeImage:
             known &= ~hidden.any(axis=2)
         camera = camera_of(array, known)
         if camera is not None:
-            image = cls.from_depth(np.where(known, depth_of(array, camera), 0), camera)
-        else:
-            cloud = np.where(known[..., None], array, 0).astype(np.float64)
-            with np.errstate(over='ignore'):
-                inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
-            rays = (cloud * inverse[..., None]).astype(np.float32)
-            # Like those of cameras, or every kernel that reads them is compiled twice.
-            rays.flags.writeable = False
-            image = cls(rays, inverse)
-            image._doubt_unit('points')
+            return cls.from_depth(np.where(known, depth_of(array, camera), 0), camera)
+        cloud = np.where(known[..., None], array, 0).astype(np.float64)
+        with np.errstate(over='ignore'):
+            inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
+        rays = (cloud * inverse[..., None]).astype(np.float32)
+        # Like those of cameras, or every kernel that reads them is compiled twice.
+        rays.flags.writeable = False
+        image = cls(rays, inverse)
+        image._doubt_unit('points')
         return image
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
-        """Copy with Gaussian noise on the ranges (thesis 6.7.1).
-
-        Parameters
-        ----------
-        sigma : float
-            Standard deviation, metres.
-        seed : int
-            Of the noise.
-        """
+        """Copy with Gaussian noise of this standard deviation, metres, on the ranges (6.7.1)."""
         noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
         with np.errstate(divide='ignore'):
             return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
 
     def without(self, body: NDArray[np.bool_]) -> RangeImage:
-        """Copy without the measurements of the robot's own body.
-
-        Parameters
-        ----------
-        body : (H, W) bool
-            True where the image shows it.
-
-        Raises
-        ------
-        RangeImageError
-            The image has another size.
-        """
+        """Copy without the pixels that show the robot's own body: (H, W), of the image's size."""
         if body.shape != self.shape:
             raise RangeImageError(
                 f'the mask is {body.shape[1]}x{body.shape[0]}, '

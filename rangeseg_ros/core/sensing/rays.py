@@ -20,20 +20,10 @@ _SMOOTH = 0.5
 
 
 def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
-    """Rays of all pixels between measured ones; None where the grid of rays is not smooth.
+    """Rays (H, W, 3) of a cloud; None where their grid is not smooth.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W), of a cloud.
-
-    Returns
-    -------
-    rays : (H, W, 3) float32
-        Those of the image where it has measured, unit vectors elsewhere.
-    between : (H, W) bool
-        Pixels with measured ones on either side, in their row or column: beyond these, a
-        polynomial goes anywhere.
+    And the pixels (H, W) with measured ones on either side, in their row or column: beyond these,
+    a polynomial goes anywhere. Within, rays are those measured, and unit vectors elsewhere.
     """
     valid = image.valid
     steps = [max(size // _GRID, 1) for size in image.shape]
