@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.ground.roles import Ramp, Tilt, ramps_of, tilt_of
@@ -209,7 +208,7 @@ class Segmentation:
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
             table[plane.label] = plane.normal
-        return look_up(table, self.labels)
+        return table.take(self.labels, axis=0, mode='clip')
 
     @cached_property
     def edges(self) -> NDArray[np.bool_]:

@@ -9,24 +9,15 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import Outline, triangles
-from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
+from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, triangles
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
-from rangeseg_ros.core.fitting.uncertainty import (
-    level_of,
-    plane_jacobians,
-    sandwiches,
-)
+from rangeseg_ros.core.fitting.uncertainty import level_of, plane_jacobians, sandwiches
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import (
-    SensorModel,
-    random_variance,
-    systematic_variance,
-)
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 # A border is taken seriously up to this many times the range of the farthest part of its plane.
 _FAR = 2.0
@@ -118,14 +109,12 @@ class Plane:
         triangles : (T, 3) int
             Rows of `vertices`, counter-clockwise seen from the sensor.
         """
-        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.intp)]
-        first = 0
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.intp)
         for rings in self.outline.parts:
             if len(rings[0]) > 2:
-                vertices += rings
-                faces.append(first + triangles(rings, self.normal))
-                first += sum(map(len, rings))
-        return np.concatenate(vertices), np.concatenate(faces)
+                faces = np.append(faces, len(vertices) + triangles(rings, self.normal), axis=0)
+                vertices = np.concatenate([vertices, *rings])
+        return vertices, faces
 
     def to_dict(self) -> dict[str, Any]:
         """The plane as numbers, texts and lists of them, as JSON takes it."""
@@ -163,7 +152,7 @@ class Plane:
     def hull(self) -> NDArray[np.float64]:
         """(N, 3) outline on the plane, metres, counter-clockwise seen from the sensor.
 
-        Follows the region's largest part within `outlines.TOLERANCE` pixels; concave as it is.
+        Follows the region's largest part within `shapes.TOLERANCE` pixels; concave as it is.
         """
         return self.outline.hull
 
@@ -185,23 +174,9 @@ def describe_regions(
     fits: Fits,
     probability: NDArray[np.float64] | None = None,
 ) -> list[Plane]:
-    """Uncertainty, place and shape of every region's plane.
+    """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
-    image : RangeImage
-        (H, W).
-    fits : Fits
-        Of these labels.
-    probability : (M + 1,) float64, optional
-        Of the regions to be planes; 1 where it is not given.
-
-    Returns
-    -------
-    list of Plane
-        In the order of the labels.
+    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
@@ -228,12 +203,13 @@ def describe_regions(
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    columns = surfaces.result(), distance, fits.pixels, rms, confidence, probability
-    group, offset, *figures = (column[found].tolist() for column in columns)
+    numbers = surfaces.result(), distance, fits.pixels, rms, confidence, probability
+    group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]
-    shapes = Shapes(outlines, image.place, image.axes[:, 0].copy())
-    forms = outlines, [RegionShape(shapes, n) for n in range(len(known))]
-    return list(map(Plane, known, known, group, *equations, centroid[found], *figures, *forms))
+    place, right = image.place, image.axes[:, 0].copy()
+    shapes = [RegionShape(outline, place, right) for outline in outlines]
+    columns = known, known, group, *equations, centroid[found], *figures, outlines, shapes
+    return list(map(Plane, *columns))
 
 
 @njit(cache=True, nogil=True)

@@ -108,7 +108,7 @@ class SensorModel(NamedTuple):
 
 
 def length_of_distortion(stated: float, shape: tuple[int, int]) -> float:
-    """Width of the distortion in images (H, W), pixels: as stated; for 0, 3 degrees of a Kinect."""
+    """Width of the distortion in images (H, W), pixels: as stated; 0 is 3 degrees of a Kinect."""
     return stated or 35 * float(np.sqrt(shape[0] * shape[1] / VGA))
 
 

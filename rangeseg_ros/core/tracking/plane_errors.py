@@ -34,22 +34,13 @@ def candidates(
     first: tuple[NDArray[np.float64], NDArray[np.float64]],
     second: tuple[NDArray[np.float64], NDArray[np.float64]],
     reach: NDArray[np.float64],
-    turn: float = SURE_TURN,
 ) -> NDArray[np.bool_]:
     """(N, M) which planes are near enough in angle and offset to be asked of the gate.
 
-    Parameters
-    ----------
-    first : ((N, 3), (N,)) float64
-        Normals and distances.
-    second : ((M, 3), (M, 3)) float64
-        Normals and points on the planes, metres.
-    reach : (M,) float64
-        Distances of these points from the camera, metres.
-    turn : float
-        Largest angle, radians.
+    Of the first, normals (N, 3) and distances (N,); of the second, normals and points (M, 3) on
+    the planes, which are so far (M,) from the camera, metres.
     """
-    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(turn)
+    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(SURE_TURN)
     return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
 
 
@@ -60,15 +51,8 @@ def with_floor(
 ) -> NDArray[np.float64]:
     """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
 
-    Parameters
-    ----------
-    spread : (K, 3, 3) float64
-        Where both planes are looked at, so that c is independent of a and b.
-    reach : (K,) float64
-        Distances from the camera, metres.
-    width : (K,) float64
-        Half of that of the narrower plane, metres. Planes of a map are not as narrow as one frame
-        shows them.
+    Where both are looked at, so that c is independent of a and b, so far from the camera. `width`
+    is half of that of the narrower plane; those of a map are not as narrow as one frame shows.
     """
     result = spread.copy()
     offset = (OFFSET * reach) ** 2
