@@ -203,27 +203,14 @@ def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
     return pixels
 
 
-# The eight neighbours in a circle, as bits, and the offsets of each: (row, column).
-_RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
+# Bits of the eight neighbours, and which patterns of them fall apart without the centre.
+_RING = np.array([[1, 2, 4], [8, 0, 16], [32, 64, 128]])
+_PATTERNS = [(_RING & pattern > 0).view(np.uint8) for pattern in range(256)]
+_JOINS = np.array([cv2.connectedComponents(ring)[0] > 2 for ring in _PATTERNS])
 
 
 def bridge_edges(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
-    kernel = np.zeros((3, 3), np.float32)
-    for bit, position in enumerate(_RING):
-        kernel[position] = 1 << bit
-    pattern = cv2.filter2D(
-        edges.astype(np.uint8), cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT
-    )
+    kernel, pixels = _RING.astype(np.float32), edges.view(np.uint8)
+    pattern = cv2.filter2D(pixels, cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT)
     return edges | _JOINS[pattern]
-
-
-def _joins(pattern: int) -> bool:
-    """Whether the neighbours set in a pattern of eight bits fall apart without the centre."""
-    ring = np.zeros((3, 3), np.uint8)
-    for bit, position in enumerate(_RING):
-        ring[position] = pattern >> bit & 1
-    return cv2.connectedComponents(ring, connectivity=8)[0] > 2
-
-
-_JOINS = np.array([_joins(pattern) for pattern in range(256)])

@@ -197,12 +197,12 @@ class Tracker:
             own = seen.id[members].tolist()
             claim = min(before.get(i, i) for i in own)
             # Of surfaces that come apart, the one with the plane that gave the id keeps it.
-            claims.append((claim not in own, -sum(planes[n].count for n in members), members))
+            pixels = sum(planes[n].count for n in members)
+            claims.append((claim not in own, -pixels, members, (claim, min(own))))
         taken: set[int] = set()
         surfaces = [0] * len(planes)
-        for _, _, members in sorted(claims):
-            own = seen.id[members].tolist()
-            free = [i for i in (min(before.get(i, i) for i in own), min(own)) if i not in taken]
+        for _, _, members, wanted in sorted(claims):
+            free = [i for i in wanted if i not in taken]
             surface = free[0] if free else self._next
             self._next += surface == self._next
             taken.add(surface)
