@@ -56,9 +56,7 @@ class Config:
         'edges of regions: deviation from local planes, depth gradient as in the thesis, or none',
         choices=('plane', 'sobel', 'none'),
     )
-    edge_step: float = option(
-        0.0, 'smallest jump of the inverse range, 1/m; 0 follows the noise', 0.0, 10.0
-    )
+    edge_step: float = option(0.0, 'smallest jump, 1/m; 0 follows the noise', 0.0, 10.0)
     weighting: str = option(
         'uniform',
         'neighbourhood weights: all alike (uniform) or more for closer points (distance)',
@@ -98,32 +96,18 @@ class Config:
         'regions of few pixels for their perimeter: leave, mark as no plane (identify), or merge',
         choices=('leave', 'identify', 'merge'),
     )
-    min_pixels: int = option(
-        0, 'smallest plane, pixels; 0 follows the size of the image: 300 of VGA', 0, 100000000
-    )
+    min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)
     # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
     # its disparity, of which the quantisation is new in every pixel.
-    noise: float = option(
-        0.0013, 'random error of the inverse range, 1/m; an image may show more', 0.0, 10.0
-    )
-    range_noise: float = option(
-        0.0, 'random error of the range, metres, for sensors like lasers', 0.0, 10.0
-    )
-    pixel_noise: float = option(
-        0.6, 'random error of the direction of a pixel, pixels', 0.0, 100.0
-    )
-    white_noise: float = option(
-        0.33, 'share of the random variance that is new in every pixel', 0.0, 1.0
-    )
+    noise: float = option(0.0013, 'random error of the inverse range, 1/m', 0.0, 10.0)
+    range_noise: float = option(0.0, 'random error of the range, metres', 0.0, 10.0)
+    pixel_noise: float = option(0.6, "random error of a pixel's direction, pixels", 0.0, 100.0)
+    white_noise: float = option(0.33, 'share of the random variance new in every pixel', 0.0, 1.0)
     noise_correlation: float = option(
         2.0, 'width of the Gaussian the noise looks smoothed with, pixels; 0 = white', 0.0, 100.0
     )
-    distortion: float = option(
-        0.00145, 'smooth systematic error of the inverse range, 1/m', 0.0, 10.0
-    )
-    range_distortion: float = option(
-        0.0, 'smooth systematic error of the range, metres', 0.0, 10.0
-    )
+    distortion: float = option(0.00145, 'systematic error of the inverse range, 1/m', 0.0, 10.0)
+    range_distortion: float = option(0.0, 'systematic error of the range, metres', 0.0, 10.0)
     distortion_length: float = option(
         0.0, 'width of the distortion, pixels, as of the noise; 0 = 35 in VGA', 0.0, 10000.0
     )
@@ -142,9 +126,7 @@ class Config:
     mask: str = option(
         '', "PNG, not 0 where images show the robot's own body: neither segmented nor terrain"
     )
-    track_time: float = option(
-        3.0, 'seconds that a plane may be out of sight or unnoticed and keep its id', 0.0, 100000.0
-    )
+    track_time: float = option(3.0, 'seconds out of sight that ids are kept', 0.0, 100000.0)
     up_x: float = option(0.0, 'up in the frame of the image, x', -1000.0, 1000.0)
     up_y: float = option(
         -1.0, 'up in the frame of the image, y; 0, -1, 0: of a level camera', -1000.0, 1000.0
@@ -156,9 +138,7 @@ class Config:
     role_height: float = option(
         0.1, 'planes so near to the floor or ceiling belong to it, metres', 0.0, 10.0
     )
-    role_area: float = option(
-        0.3, 'smallest area that can be floor, ceiling or wall, square metres', 0.0, 1000.0
-    )
+    role_area: float = option(0.3, 'smallest floor, ceiling or wall, square metres', 0.0, 1000.0)
     # How the camera moves where planes and tf leave it open: by default like a quick hand.
     camera_turn: float = option(
         60.0, 'standard deviation of the turning of the camera, degrees per second', 0.1, 3600.0
@@ -183,15 +163,11 @@ class Config:
     pose_turn_noise: float = option(
         0.3, 'standard deviation of the pose of the camera, degrees, about each axis', 0.0, 45.0
     )
-    map_resolution: float = option(
-        0.03, 'smallest detail of outlines in the map of planes, metres', 0.001, 10.0
-    )
+    map_resolution: float = option(0.03, 'smallest detail of outlines of the map, m', 0.001, 10.0)
     map_area: float = option(
         0.05, 'smallest plane of the map, square metres; 0 for clutter as well', 0.0, 1000.0
     )
-    map_planes: int = option(
-        1000, 'planes of the map at most: those out of sight the longest are forgotten', 1, 100000
-    )
+    map_planes: int = option(1000, 'planes of the map at most, those seen last', 1, 100000)
     odometry: bool = option(
         False, "the camera's own motion from planes: ~/odometry and, without fixed_frame, the map"
     )
@@ -202,37 +178,23 @@ class Config:
     sensor_height: float = option(
         0.0, 'height of the sensor above the ground, along up, metres; 0 = unknown', 0.0, 100.0
     )
-    ground_slope: float = option(
-        12.0, 'steepest ground, against the ground under the robot, degrees', 0.0, 45.0
-    )
+    ground_slope: float = option(12.0, 'steepest slope of the ground, degrees', 0.0, 45.0)
     sensor_height_sd: float = option(
         0.015, 'standard deviation of sensor_height, metres', 0.001, 10.0
     )
-    up_sd: float = option(
-        1.5, 'standard deviation of the direction up, however it is told, degrees', 0.01, 45.0
-    )
-    obstacle_height: float = option(
-        0.05, 'what stands so high above the ground is an obstacle, metres', 0.005, 10.0
-    )
-    drop_height: float = option(
-        0.05, 'what lies so deep below the ground is a drop, metres', 0.005, 10.0
-    )
-    ground_gap: float = option(
-        0.15, 'widest gap in the ground that the robot crosses, metres', 0.0, 10.0
-    )
+    up_sd: float = option(1.5, 'standard deviation of up, degrees', 0.01, 45.0)
+    obstacle_height: float = option(0.05, 'least height of an obstacle, metres', 0.005, 10.0)
+    drop_height: float = option(0.05, 'least depth of a drop, metres', 0.005, 10.0)
+    ground_gap: float = option(0.15, 'widest gap that the robot crosses, metres', 0.0, 10.0)
     robot_radius: float = option(
         0.25, 'radius of the robot, metres: ground so far apart is connected', 0.01, 10.0
     )
-    grid_resolution: float = option(
-        0.05, 'side of a cell of ~/grid, the ground around the robot, metres', 0.01, 1.0
-    )
+    grid_resolution: float = option(0.05, 'side of a cell of ~/grid, metres', 0.01, 1.0)
     grid_size: float = option(8.0, 'side of ~/grid, metres', 0.1, 50.0)
     grid_memory: float = option(
         30.0, 'seconds that ~/grid remembers, with fixed_frame or odometry', 0.0, 86400.0
     )
-    grid_clearance: float = option(
-        2.0, 'what hangs higher above the ground is no obstacle of ~/grid, metres', 0.0, 100.0
-    )
+    grid_clearance: float = option(2.0, 'headroom of ~/grid, metres', 0.0, 100.0)
     cloud_resolution: float = option(
         0.0, 'side of the cells of ~/ground and ~/obstacles, metres; 0 = all pixels', 0.0, 1.0
     )

@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 def quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions (..., 4) x, y, z, w, with w >= 0, of rotations (..., 3, 3).
 
-    Notes
-    -----
     A rotation has all products of two components of its quaternion q: they make up 4 q q^T, of
     which the row with the largest diagonal is q itself but for its length (Shepperd, Quaternion
     from rotation matrix, Journal of Guidance and Control 1978).

@@ -99,14 +99,9 @@ class Plane:
         )
 
     def mesh(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Triangles of the outline without its holes.
+        """Vertices (N, 3), metres, and triangles (T, 3) of them, of the outline without its holes.
 
-        Returns
-        -------
-        vertices : (N, 3) float64
-            Metres.
-        triangles : (T, 3) int
-            Rows of `vertices`, counter-clockwise seen from the sensor.
+        Triangles are rows of vertices, counter-clockwise seen from the sensor.
         """
         vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.intp)
         for rings in self.outline.parts:

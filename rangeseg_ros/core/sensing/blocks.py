@@ -141,8 +141,7 @@ def _change(
 ) -> float:
     """Change of the inverse range from pixel to pixel on the plane of a block.
 
-    Between the two rays of a row (`way` 0, 1) or column (1, 0) that are farthest apart; 0 where
-    none has two.
+    Between the two rays of a row (`way` 0, 1) or column (1, 0) that are farthest apart, else 0.
     """
     (top, left), (di, dj) = corner, way
     farthest, change = 0, 0.0

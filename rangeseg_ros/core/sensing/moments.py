@@ -38,11 +38,7 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
 
 @njit(cache=True, inline='always')
 def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[Any, Any, Any]:
-    """Ray of a pixel.
-
-    Of a pinhole camera x is the same in all rows and y in all columns: two rows' worth of numbers
-    stay in cache then, and the rest of an image of rays is not read.
-    """
+    """Ray of a pixel; of a pinhole camera from the first row and column, which stay in cache."""
     row, column = (0, 0) if pinhole else (i, j)
     return rays[row, j, 0], rays[i, column, 1], rays[row, j, 2]
 
@@ -51,10 +47,9 @@ def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[An
 def plus_pixel(
     sums: tuple[float, ...], x: float, y: float, z: float, inverse: float, weight: float
 ) -> tuple[float, ...]:
-    """The first ten sums of a moment vector with one pixel more: of its ray (x, y, z).
+    """The first ten sums of a moment vector, `NO_PIXEL` at first, with one more ray (x, y, z).
 
-    A tuple, which the compiler keeps in registers: sums in an array would go through memory for
-    every pixel. Begins with `NO_PIXEL`.
+    A tuple, which the compiler keeps in registers, and not in memory as an array.
     """
     a, b, c, d, e, f, p, q, r, square = sums
     wx, wy, wz = weight * x, weight * y, weight * z
@@ -146,10 +141,9 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 @njit(cache=True, error_model='numpy')
 def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
-    """Weighted sum of the squared residuals of one plane for two of N moment vectors (N, 13).
+    """What `fit` returns for the sum of two of N moment vectors (N, 13).
 
-    What `fit` returns for their sum, without memory traffic, views and their reference counts:
-    growing spends its time here.
+    Without views and their reference counts: growing spends its time here.
     """
     sums = (
         moments[k, 0] + moments[m, 0],

@@ -58,14 +58,11 @@ class RangeImage:
 
     def __repr__(self) -> str:
         kind = 'organised cloud' if self.camera is None else 'depth image'
-        measured = self.inverse[self.valid]
-        if not len(measured):
-            return f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, nothing measured>'
-        return (
-            f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, '
-            f'{measured.size / self.inverse.size:.0%} measured, '
-            f'{1 / measured.max():.3g} to {1 / measured.min():.3g} m>'
-        )
+        measured, said = self.inverse[self.valid], 'nothing measured'
+        if len(measured):
+            said = f'{measured.size / self.inverse.size:.0%} measured, '
+            said += f'{1 / measured.max():.3g} to {1 / measured.min():.3g} m'
+        return f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, {said}>'
 
     @classmethod
     def from_depth(
@@ -106,10 +103,10 @@ class RangeImage:
             raise RangeImageError(
                 f'depth image must be uint16, int16, int32 or float, not {array.dtype}'
             )
+        height, width = array.shape
         if array.shape != camera.shape:
             raise RangeImageError(
-                f'depth image is {array.shape[1]}x{array.shape[0]}, '
-                f'its camera {camera.width}x{camera.height}'
+                f'depth image is {width}x{height}, its camera {camera.width}x{camera.height}'
             )
         if scale is None:
             scale = 0.001 if integers else 1.0
@@ -186,18 +183,15 @@ class RangeImage:
 
     def without(self, body: NDArray[np.bool_]) -> RangeImage:
         """Copy without the pixels that show the robot's own body: (H, W), of the image's size."""
+        (height, width), (rows, columns) = body.shape, self.shape
         if body.shape != self.shape:
-            raise RangeImageError(
-                f'the mask is {body.shape[1]}x{body.shape[0]}, '
-                f'the image {self.shape[1]}x{self.shape[0]}'
-            )
+            raise RangeImageError(f'the mask is {width}x{height}, the image {columns}x{rows}')
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
     @property
     def beyond_reach(self) -> bool:
         """Whether more than half of what was measured is beyond any depth camera's reach."""
-        far = self.valid & (self.inverse < 1 / FAR)
-        return bool(2 * np.count_nonzero(far) > np.count_nonzero(self.valid))
+        return bool(2 * np.count_nonzero(self.inverse[self.valid] < 1 / FAR) > self.valid.sum())
 
     def _doubt_unit(self, measured: str) -> None:
         if self.beyond_reach:
