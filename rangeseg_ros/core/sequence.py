@@ -130,10 +130,10 @@ class SequenceSegmenter:
         if config.odometry:
             towards = unit((config.up_x, config.up_y, config.up_z)) if up is None else up
             seen = views(result.labels, planes, config.distortion_length)
-            motion = self._odometry.add(planes, seen, stamp, towards, image.axes)
-            self.motion = motion.of_origin(image.place)
+            found = self._odometry.add(planes, seen, stamp, towards, image.axes)
+            self.motion = found.of_origin(image.place)
             if not config.fixed_frame:
-                if not motion.held and len(self.map):
+                if not found.held and len(self.map):
                     self.map.clear('no plane held the camera')
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None

@@ -52,7 +52,7 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
         if columns is None or rows is None:
             continue
         focal, centre = zip(columns, rows, strict=True)
-        camera = _camera(width, height, *focal, *centre, turn, place)
+        camera = _camera(width, height, *focal, *centre, turn=turn, place=place)
         if camera is not None and _on_rays(points, valid, camera):
             return camera
     return None
@@ -184,11 +184,10 @@ def _fitted_line(
 
 
 @lru_cache(maxsize=4)
-def _camera(*intrinsics: Any) -> Camera | None:
+def _camera(*lens: Any, **frame: Any) -> Camera | None:
     """One for all frames, as its rays are worked out once."""
-    *lens, turn, place = intrinsics
     try:
-        return Camera(*lens, turn=turn, place=place)
+        return Camera(*lens, **frame)
     except CameraError:
         return None
 

@@ -9,8 +9,7 @@ camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +45,7 @@ Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
 
 
-@dataclass(frozen=True, eq=False)
-class Tracks:
+class Tracks(NamedTuple):
     """N planes in the frame of the camera."""
 
     id: NDArray[np.int64]
@@ -79,12 +77,12 @@ class Tracks:
             (coarse == own[:, None]).astype(np.float32),
         )
 
-    @cached_property
+    @property
     def size(self) -> NDArray[np.float32]:
         """(N,) number of samples of each plane."""
         return self.mask.sum(axis=1)
 
-    @cached_property
+    @property
     def range(self) -> NDArray[np.float64]:
         """(N,) distances of the centroids from the camera, metres."""
         return np.asarray(np.linalg.norm(self.centroid, axis=1))
@@ -92,8 +90,7 @@ class Tracks:
     def moved(self, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> Tracks:
         """The planes in a frame in which x is at rotation x + shift."""
         jacobian = moved_plane(rotation, shift)
-        return replace(
-            self,
+        return self._replace(
             plane=self.plane @ jacobian.T,
             covariance=congruent(jacobian, self.covariance),
             centroid=self.centroid @ rotation.T + shift,
@@ -101,12 +98,11 @@ class Tracks:
 
     def where(self, chosen: NDArray[np.bool_]) -> Tracks:
         """Some of the planes."""
-        return Tracks(*(getattr(self, f.name)[chosen] for f in fields(self)))
+        return Tracks._make(part[chosen] for part in self)
 
     def joined(self, others: Tracks) -> Tracks:
         """These planes followed by others."""
-        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
-        return Tracks(*map(np.concatenate, pairs))
+        return Tracks._make(map(np.concatenate, zip(self, others, strict=True)))
 
 
 class Tracker:
