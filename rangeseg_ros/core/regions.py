@@ -49,25 +49,16 @@ def plane_regions(
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
 
 
+@njit(cache=True, nogil=True)
 def connected_components(
     labels: NDArray[np.integer], grid: Grid, valid: NDArray[np.bool_]
 ) -> NDArray[np.int32]:
     """4-connected components of like labels that cross no disconnected edge.
 
-    Their numbers (H, W), 1...M, 0 where not valid.
+    Their numbers (H, W), 1...M, 0 where not valid: by two passes, with a table of equivalent
+    numbers between them (thesis 3.1.1).
     """
-    return _find_components(labels, *grid, valid)
-
-
-@njit(cache=True, nogil=True)
-def _find_components(
-    labels: NDArray[np.integer],
-    right: NDArray[np.float32],
-    below: NDArray[np.float32],
-    valid: NDArray[np.bool_],
-) -> NDArray[np.int32]:
-    """Two passes, with a table of equivalent numbers between them (thesis 3.1.1)."""
-    height, width = labels.shape
+    (height, width), (right, below) = labels.shape, grid
     found = np.zeros((height, width), np.int32)
     # Of each number an equivalent, lower one, or itself.
     parent = np.empty(labels.size + 1, np.int32)
@@ -92,18 +83,11 @@ def _find_components(
             if found[i, j] == 0:
                 count += 1
                 parent[count] = found[i, j] = count
-    number = np.zeros(count + 1, np.int32)
-    last = 0
+    number, last = np.zeros(count + 1, np.int32), 0
     for k in range(1, count + 1):
-        if parent[k] == k:
-            last += 1
-            number[k] = last
-        else:
-            number[k] = number[parent[k]]
-    for i in range(height):
-        for j in range(width):
-            found[i, j] = number[found[i, j]]
-    return found
+        last += parent[k] == k
+        number[k] = last if parent[k] == k else number[parent[k]]
+    return number[found.ravel()].reshape(labels.shape)
 
 
 @njit(cache=True, nogil=True)

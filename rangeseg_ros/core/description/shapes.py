@@ -16,11 +16,9 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.camera import Camera
 
+# Distance of the polygon from the outline at most, pixels: what segmentation leaves open.
 TOLERANCE = 1.5
-"""Distance of the polygon from the outline at most, pixels: what segmentation leaves open."""
-
-# The pixels that a corner belongs to.
-_CORNERS = np.ones((2, 2), np.uint8)
+_CORNERS = np.ones((2, 2), np.uint8)  # the pixels that a corner belongs to
 
 
 @dataclass(eq=False)

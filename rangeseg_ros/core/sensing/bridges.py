@@ -13,14 +13,10 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
+# Pixels from one side of a hole to the other, at most: gaps of three, as random holes in a third
+# of the pixels make them, and less than the shadow of any step that is not small itself.
 SPAN = 4
-"""Pixels from one side of a hole to the other, at most.
-
-Gaps of three, as random holes in a third of the pixels make them, and less than the shadow of any
-step that is not small itself.
-"""
-# Rows and columns from one pixel to the next.
-_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from one pixel to the next
 
 
 def bridge_holes(

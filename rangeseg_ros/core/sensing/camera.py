@@ -18,10 +18,8 @@ from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
 _STEEPEST = 1000.0
-# By which the square of a unit quaternion may be off: decimals of files.
-_UNIT = 1e-6
-OPTICAL = (0.0, 0.0, 0.0, 1.0)
-"""The turn of a camera in its own optical frame: none."""
+_UNIT = 1e-6  # by which the square of a unit quaternion may be off: decimals of files
+OPTICAL = (0.0, 0.0, 0.0, 1.0)  # the turn of a camera in its own optical frame: none
 
 
 class CameraWarning(UserWarning):

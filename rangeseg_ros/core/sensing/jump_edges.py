@@ -17,10 +17,8 @@ from rangeseg_ros.core.significance import OUTLIER
 
 # Rows and columns of the windows of both methods, and of the median before the Sobel operators.
 _WINDOW = 3
-# The farthest window that a boundary looks at.
-_FRAME = 2 * _WINDOW - 1
-# Response of the Sobel operator of 3 x 3 to a step of one: 1 + 2 + 1.
-_SOBEL_GAIN = 4
+_FRAME = 2 * _WINDOW - 1  # the farthest window that a boundary looks at
+_SOBEL_GAIN = 4  # response of the operator of 3 x 3 to a step of one: 1 + 2 + 1
 
 
 def jump_edges(image: RangeImage, method: str, *steps: ArrayLike) -> GridEdges | None:
@@ -187,7 +185,6 @@ def sobel(image: RangeImage) -> GridEdges:
     down = (strength >= framed[:-2, 1:-1]) & (strength > framed[2:, 1:-1])
     ridge = np.where(np.abs(gx) >= np.abs(gy), across, down) & (strength > threshold**2)
     pixels = bridge_edges(ridge | ~valid) & valid
-    # A step between two columns or rows responds with the sum of the kernel's one side.
     step = threshold / _SOBEL_GAIN
     horizontal = (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
     vertical = (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]

@@ -18,18 +18,16 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 SIZE = 13  # of the vector of sums
+# Entries: w y^2, number of pixels, sums of the two variance ratios.
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
-"""Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
-NO_PIXEL = (0.0,) * (CHI2 + 1)
-"""The sums of no pixel, see `plus_pixel`."""
+NO_PIXEL = (0.0,) * (CHI2 + 1)  # see `plus_pixel`
 
 
 @register_jitable
 def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]:
     """Cofactors of the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]], and its determinant.
 
-    Of numbers in kernels, and of arrays. The cofactors are in the order of the arguments; over
-    the determinant they are the inverse.
+    Of numbers in kernels, and of arrays; over the determinant they are the inverse, in that order.
     """
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b

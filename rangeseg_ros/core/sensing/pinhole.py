@@ -15,18 +15,15 @@ from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, CameraError
 # To which intrinsics are rounded, pixels: frames of a sensor share a camera. A power of two, as
 # numbers of few decimals are never halfway between two of these.
 _STEP = 2.0**-10
-# The same of quaternions: 0.001 pixels in the middle of an image of 1000.
-_TURN = 2.0**-20
+_TURN = 2.0**-20  # the same of quaternions: 0.001 pixels in the middle of an image of 1000
 # The same of places, metres: 0.001 pixels of a focal length of 1000, a metre away.
 _PLACE = 2.0**-20
 _ORIGIN = (0.0, 0.0, 0.0)
-# Largest error of the camera, pixels: less than any sensor's.
-_CLOSE = 0.01
+_CLOSE = 0.01  # largest error of the camera, pixels: less than any sensor's
 # Largest standard deviation of a camera's place over its distance from what it sees: half a degree
 # of the rays. Rounding leaves 1e-5 of what has any depth, and 1 of a plane or of parallel rays.
 _PLACED = 0.01
-# Rows and columns of the sample that the camera is estimated from, about.
-_SAMPLES = 64
+_SAMPLES = 64  # rows and columns of the sample that the camera is estimated from, about
 
 
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:

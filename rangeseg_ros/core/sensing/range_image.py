@@ -21,10 +21,8 @@ class UnitWarning(UserWarning):
     """Ranges that look as if they were in another unit."""
 
 
-FAR = 65.0
-"""The farthest that 16 bits of millimetres tell, metres."""
-NOT_MEASURED = 65535
-"""What drivers and data sets write for it beside 0: the largest value of 16 bits."""
+FAR = 65.0  # the farthest that 16 bits of millimetres tell, metres
+NOT_MEASURED = 65535  # what drivers and data sets write for it beside 0
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,12 +11,9 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-# Degree of the polynomial: unit vectors over 120 degrees, to a hundredth of a pixel.
-_DEGREE = 6
-# Rows and columns of the grid of pixels that it is fitted to, at most.
-_GRID = 80
-# Largest error, in pixels, of a grid that is smooth.
-_SMOOTH = 0.5
+_DEGREE = 6  # of the polynomial: unit vectors over 120 degrees, to a hundredth of a pixel
+_GRID = 80  # rows and columns of the grid of pixels that it is fitted to, at most
+_SMOOTH = 0.5  # largest error, in pixels, of a grid that is smooth
 
 
 def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
@@ -26,11 +23,9 @@ def completed_rays(image: RangeImage) -> tuple[NDArray[np.float32], NDArray[np.b
     a polynomial goes anywhere. Within, rays are those measured, and unit vectors elsewhere.
     """
     valid = image.valid
-    steps = [max(size // _GRID, 1) for size in image.shape]
-    rows, columns = (
-        places * step
-        for places, step in zip(np.nonzero(valid[:: steps[0], :: steps[1]]), steps, strict=True)
-    )
+    down, across = (max(size // _GRID, 1) for size in image.shape)
+    rows, columns = np.nonzero(valid[::down, ::across])
+    rows, columns = rows * down, columns * across
     neighbours = valid[:, 1:] & valid[:, :-1]
     if len(rows) < 10 * (_DEGREE + 1) ** 2 or not neighbours.any():
         return None

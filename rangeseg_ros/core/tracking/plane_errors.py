@@ -12,22 +12,17 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.significance import chi2_quantile
 
+# Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one.
 GATE = chi2_quantile(3)
-"""Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one."""
+# What planes of one surface differ by from frame to frame beyond their covariances, as their
+# pixels are not the same: an offset, as share of the range (of 2 m, half of what the distortion of
+# a Kinect is there), and an angle, at least and for an offset over half of the plane's width.
 OFFSET, ANGLE = 0.007, np.radians(1.0)
-"""What planes of one surface differ by from frame to frame beyond their covariances.
-
-Their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
-distortion of a Kinect is there), and an angle, at least and for an
-offset over half of the plane's width.
-"""
+# Half the width that a plane counts with at least, metres, so that what it tilts by is finite.
 NARROWEST = 0.01
-"""Half the width that a plane counts with at least, metres, so that what it tilts by is finite."""
+# Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
+# Beyond is no error of the sensor but another plane, however uncertain both are.
 SURE_TURN, FARTHEST = np.radians(15.0), 0.1
-"""Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
-
-Beyond is no error of the sensor but another plane, however uncertain both are.
-"""
 
 
 def candidates(

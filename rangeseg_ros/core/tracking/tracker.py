@@ -102,7 +102,7 @@ class Tracks(NamedTuple):
 
     def joined(self, others: Tracks) -> Tracks:
         """These planes followed by others."""
-        return Tracks._make(map(np.concatenate, zip(self, others, strict=True)))
+        return Tracks._make(np.concatenate(pair) for pair in zip(self, others, strict=True))
 
 
 class Tracker:
@@ -153,7 +153,12 @@ class Tracker:
         seen = Tracks.of(planes, labels)
         known = self._tracks or Tracks.of([], labels)
         shared = known.mask @ seen.mask.T
-        known = self._with_camera(known, seen, shared, elapsed, motion)
+        # Planes that were in sight and have half of their pixels in common.
+        sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
+        sure &= (known.unseen == 0)[:, None] & _near(known, seen)
+        speed = np.repeat([np.radians(self.config.camera_turn), self.config.camera_speed], 3)
+        prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
+        known = known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, motion))
         seen.id[:] = _assign(known, seen, shared)
         new = seen.id == 0
         seen.id[new] = self._next + np.arange(new.sum())
@@ -164,23 +169,6 @@ class Tracker:
         self._tracks = seen.joined(known.where(lost & (known.unseen <= self.config.track_time)))
         names = zip(planes, seen.id.tolist(), seen.surface.tolist(), strict=True)
         return [plane.named(id=i, surface=surface) for plane, i, surface in names]
-
-    def _with_camera(
-        self,
-        known: Tracks,
-        seen: Tracks,
-        shared: NDArray[np.float32],
-        elapsed: float,
-        told: Motion | None,
-    ) -> Tracks:
-        """Known planes in the frame of the camera as it is now."""
-        config = self.config
-        # Planes that were in sight and have half of their pixels in common.
-        sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
-        sure &= (known.unseen == 0)[:, None] & _near(known, seen)
-        speed = np.repeat([np.radians(config.camera_turn), config.camera_speed], 3)
-        prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
-        return known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, told))
 
     def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
         """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
