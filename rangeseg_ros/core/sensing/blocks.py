@@ -56,7 +56,11 @@ class Blocks(NamedTuple):
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
-        _sum_blocks(self.moments, rays, size, blocks)
+        parts = np.pad(self.moments, ((0, rows % 2), (0, columns % 2), (0, 0)))
+        upper, lower = parts[::2], parts[1::2]
+        blocks.moments[:] = upper[:, ::2] + upper[:, 1::2] + lower[:, ::2] + lower[:, 1::2]
+        blocks.moments[..., COUNT + 1 :] = 0
+        _fit_planes(0, len(blocks.moments), rays, size, blocks)
         return blocks
 
     @classmethod
@@ -91,20 +95,6 @@ def _sum_pixels(
                 moments[bi, bj, k] = value
             moments[bi, bj, COUNT], moments[bi, bj, RATIO], moments[bi, bj, SLOPE] = count, 0, 0
     _fit_planes(first, after, rays, size, blocks)
-
-
-@njit(cache=True, nogil=True)
-def _sum_blocks(
-    parts: NDArray[np.float64], rays: NDArray[np.float32], size: int, blocks: Blocks
-) -> None:
-    """Fill in blocks of 2 x 2 that have these moments."""
-    moments = blocks.moments
-    moments[:] = 0
-    for i in range(parts.shape[0]):
-        for j in range(parts.shape[1]):
-            for k in range(COUNT + 1):
-                moments[i // 2, j // 2, k] += parts[i, j, k]
-    _fit_planes(0, len(moments), rays, size, blocks)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
