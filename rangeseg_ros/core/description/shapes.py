@@ -208,11 +208,9 @@ def _rectangle(
     first /= np.sqrt((first * first).sum())
     second = np.cross(normal, first)
     # Around the first corner, so that the products keep their digits.
-    x, y = np.zeros(count), np.zeros(count)
-    for k in range(count):
-        for a in range(3):
-            x[k] += first[a] * (points[k, a] - points[0, a])
-            y[k] += second[a] * (points[k, a] - points[0, a])
+    away = points - points[0]
+    x = first[0] * away[:, 0] + first[1] * away[:, 1] + first[2] * away[:, 2]
+    y = second[0] * away[:, 0] + second[1] * away[:, 1] + second[2] * away[:, 2]
     # Green's theorem: twice the areas, six times the first, 12 and 24 times the second moments.
     area = inside = mx = my = xx = xy = yy = 0.0
     start = 0
