@@ -29,10 +29,7 @@ _SIZE = 8
 
 
 def minimise(
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    grid: Grid,
-    smoothness: float,
+    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
 ) -> NDArray[np.int32]:
     """Labelling (H, W) of low energy (eq. 5.3 and 5.5, lambda = `smoothness`).
 

@@ -39,10 +39,7 @@ class Labelling(NamedTuple):
 
 
 def segment(
-    image: RangeImage,
-    grid: Grid,
-    config: Config,
-    lap: Callable[[str], None],
+    image: RangeImage, grid: Grid, config: Config, lap: Callable[[str], None]
 ) -> Labelling:
     """Give every pixel a direction; `lap` is told the name of every stage that ends."""
     normals = observed_normals(image, grid, config)

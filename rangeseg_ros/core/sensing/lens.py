@@ -24,11 +24,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import NDArray
 
 # Numbers of coefficients that OpenCV takes; the last two of 14 are the tilt of the sensor.
-_COUNTS = {
-    'plumb_bob': (4, 5),
-    'rational_polynomial': (4, 5, 8, 12, 14),
-    'equidistant': (4,),
-}
+_COUNTS = {'plumb_bob': (4, 5), 'rational_polynomial': (4, 5, 8, 12, 14), 'equidistant': (4,)}
 MODELS = tuple(_COUNTS)
 
 # The way from the centre to a pixel is followed in so many steps, each solved by Newton's method;

@@ -90,10 +90,7 @@ def _nearest_axis(
 
 
 def _candidate_frames(
-    points: NDArray[np.float64],
-    u: NDArray[np.intp],
-    v: NDArray[np.intp],
-    shape: tuple[int, int],
+    points: NDArray[np.float64], u: NDArray[np.intp], v: NDArray[np.intp], shape: tuple[int, int]
 ) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
     """Turns and places of cameras that points (N, 3) of pixels may be from.
 
