@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.sensing.camera import OPTICAL, Camera
-from rangeseg_ros.core.sensing.pinhole import axes_of_frame, camera_of, depth_of
+from rangeseg_ros.core.sensing.clouds import axes_of_frame, camera_of, depth_of
 
 
 class RangeImageError(ValueError):

@@ -9,7 +9,7 @@ camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +102,8 @@ class Tracks(NamedTuple):
 
     def joined(self, others: Tracks) -> Tracks:
         """These planes followed by others."""
-        return Tracks._make(np.concatenate(pair) for pair in zip(self, others, strict=True))
+        pairs: Any = zip(self, others, strict=True)
+        return Tracks._make(np.concatenate(pair) for pair in pairs)
 
 
 class Tracker:

@@ -1,4 +1,4 @@
-"""The camera of an organised cloud, where its points show one, and where it is in their frame."""
+"""What the points of an organised cloud tell of its sensor: its camera, its axes, and its rays."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ _CLOSE = 0.01  # largest error of the camera, pixels: less than any sensor's
 # of the rays. Rounding leaves 1e-5 of what has any depth, and 1 of a plane or of parallel rays.
 _PLACED = 0.01
 _SAMPLES = 64  # rows and columns of the sample that the camera is estimated from, about
+_DEGREE = 6  # of the polynomial: unit vectors over 120 degrees, to a hundredth of a pixel
+_GRID = 80  # rows and columns of the grid of pixels that it is fitted to, at most
+_SMOOTH = 0.5  # largest error, in pixels, of a grid that is smooth
 
 
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
@@ -79,6 +82,48 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
     steps = np.diff(rays[:, ::across], axis=0)[both].sum(axis=0, dtype=np.float64)
     down = _nearest_axis(steps, forward)
     return np.stack([np.cross(down, forward), down, forward], axis=1)
+
+
+def completed_rays(
+    rays: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+    """Rays (H, W, 3) of a cloud, with unit vectors between others where they are not valid (H, W).
+
+    They change so smoothly over the grid that a polynomial through the others tells them; None
+    where they do not. And the pixels with measured ones on either side, in their row or column:
+    beyond these, a polynomial goes anywhere.
+    """
+    down, across = (max(size // _GRID, 1) for size in valid.shape)
+    v, u = np.nonzero(valid[::down, ::across])
+    v, u = v * down, u * across
+    neighbours = valid[:, 1:] & valid[:, :-1]
+    if len(v) < 10 * (_DEGREE + 1) ** 2 or not neighbours.any():
+        return None
+    known = rays[v, u].astype(np.float64)
+    basis = _basis(v, u, valid.shape)
+    coefficients = np.linalg.lstsq(basis, known, rcond=None)[0]
+    error = np.linalg.norm(basis @ coefficients - known, axis=1)
+    pixel = np.median(np.linalg.norm(np.diff(rays, axis=1)[neighbours], axis=1))
+    if np.quantile(error, 0.95) > _SMOOTH * pixel:
+        return None
+    between = np.zeros_like(valid)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(valid, axis)
+        between |= before & np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis), axis)
+    v, u = np.nonzero(between & ~valid)
+    completed = rays.copy()
+    found = _basis(v, u, valid.shape) @ coefficients
+    completed[v, u] = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return completed, between
+
+
+def _basis(
+    rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
+) -> NDArray[np.floating]:
+    """(N, M) Chebyshev polynomials of both coordinates."""
+    v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
+    basis: NDArray[np.floating] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis
 
 
 def _nearest_axis(
