@@ -190,8 +190,8 @@ MECHANISMS = (
               {'tracking.tracker._camera_motion': _returning((np.eye(3), np.zeros(3)))}, 'tracks'),
     Mechanism('gate of chi-squared', 'tracking/plane_errors.py:mahalanobis,with_floor',
               {'tracking.tracker.GATE': 1e9}, 'tracks'),
-    Mechanism('gate of angles', 'tracking/tracks.py:near_planes',
-              {'tracking.tracker.near_planes': lambda _: lambda known, seen:
+    Mechanism('gate of angles', 'tracking/tracker.py:_near',
+              {'tracking.tracker._near': lambda _: lambda known, seen:
                np.ones((len(known.id), len(seen.id)), bool)}, 'tracks'),
     Mechanism('planes found again without overlap', 'tracking/tracker.py:_assign',
               {'tracking.tracker._UNSEEN_OVERLAP': 0.0}, 'tracks'),

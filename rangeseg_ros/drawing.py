@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
 
 _SQUARE = np.ones((3, 3), np.uint8)
@@ -68,7 +67,8 @@ def overlay(
         numbers[plane.label] = plane.id
     palette = colours(numbers)
     base = cv2.cvtColor(grey(inverse), cv2.COLOR_GRAY2RGB)
-    picture: NDArray = cv2.addWeighted(base, 0.45, look_up(palette, labels), 0.55, 0)
+    shown = palette.take(labels, axis=0, mode='clip')
+    picture: NDArray = cv2.addWeighted(base, 0.45, shown, 0.55, 0)
     cv2.copyTo(base, (labels == 0).view(np.uint8), picture)
     cv2.copyTo(np.zeros_like(base), (borders(labels) & (labels > 0)).view(np.uint8), picture)
     half = labels[::2, ::2].copy()

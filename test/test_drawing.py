@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.drawing import colours, grey, overlay
 
 
@@ -62,13 +61,3 @@ def test_any_size_and_no_measurement(shape, value):
     labels = np.ones(shape, np.uint16)
     plane = SimpleNamespace(label=1, id=1)
     assert overlay(inverse, labels, [plane]).shape == (*shape, 3)
-
-
-@pytest.mark.parametrize('kind', [np.uint8, np.float32])
-def test_what_labels_stand_for_is_looked_up(kind):
-    draw = np.random.default_rng(6)
-    table = (255 * draw.random((300, 3))).astype(kind)
-    labels = draw.integers(0, 300, (67, 45)).astype(np.uint16)
-    found = look_up(table, labels)
-    assert found.dtype == kind
-    np.testing.assert_array_equal(found, table[labels])

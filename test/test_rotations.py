@@ -3,12 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.rotations import (
-    cross_products,
-    quaternions,
-    rotation_by,
-    rotation_matrix,
-)
+from rangeseg_ros.core.rotations import quaternions, rotation_by, rotation_matrix
 
 TURNS = np.concatenate(
     [
@@ -40,9 +35,3 @@ def test_matrices_of_quaternions_and_of_turns():
         truth = Rotation.from_rotvec(turn)
         assert np.abs(rotation_matrix(truth.as_quat()) - truth.as_matrix()).max() < 1e-15
         assert np.abs(rotation_by(turn) - truth.as_matrix()).max() < 1e-15
-
-
-def test_cross_products():
-    one, other = TURNS[:-1], TURNS[1:]
-    assert np.array_equal(cross_products(one, other), np.cross(one, other))
-    assert cross_products(one[:0], other[:0]).shape == (0, 3)

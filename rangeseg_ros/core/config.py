@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -29,13 +29,12 @@ class Config:
 
     method: str = option(
         'planes',
-        'labels are planes, refined (planes), or discretised normals as in the thesis (normals)',
+        'labels are planes, or discretised normals as in the thesis',
         choices=('planes', 'normals'),
     )
     normals: str = option(
         'cross_product',
-        'observed normals by cross product of tangents, or by the plane through a window of least '
-        'squares in inverse range (plane_fit) or of orthogonal least squares (orthogonal_fit)',
+        'observed normals: cross product of tangents, planes fitted in inverse range, or in space',
         choices=('cross_product', 'plane_fit', 'orthogonal_fit'),
     )
     normal_baseline: int = option(
@@ -46,29 +45,18 @@ class Config:
     )
     directions: str = option(
         'platonic',
-        'method normals: distribution of the label directions: subdivided icosahedron, regular '
-        'angles, spiral, or hypercube rejection (random)',
+        'method normals: subdivided icosahedron, regular angles, spiral, or random directions',
         choices=('platonic', 'regular', 'spiral', 'random'),
     )
     direction_count: int = option(
-        305,
-        'method normals: number of directions; platonic has 4, 17, 73, 305, 1249, regular the '
-        'odd squares (25, 225, 1225), spiral and random any',
-        1,
-        5000,
+        305, 'number of directions: platonic 4, 17, 73, 305, 1249; regular odd squares', 1, 5000
     )
     jump_edges: str = option(
         'plane',
-        'edges that separate regions: deviation from the local plane (plane), thresholded depth '
-        'gradient as in the thesis (sobel), or none',
+        'edges of regions: deviation from local planes, depth gradient as in the thesis, or none',
         choices=('plane', 'sobel', 'none'),
     )
-    edge_step: float = option(
-        0.0,
-        'smallest jump of the inverse range, 1/m; 0 follows the noise (Kinect: 0.0065)',
-        0.0,
-        10.0,
-    )
+    edge_step: float = option(0.0, 'smallest jump, 1/m; 0 follows the noise', 0.0, 10.0)
     weighting: str = option(
         'uniform',
         'neighbourhood weights: all alike (uniform) or more for closer points (distance)',
@@ -95,62 +83,37 @@ class Config:
         0, 'method normals with exact: rounds of moves at most; 0 = until none helps', 0, 1000
     )
     exact: bool = option(
-        False,
-        'method normals: minimise the energy without shortcuts, every label over all of the image '
-        'until nothing changes (minutes)',
+        False, 'method normals: every label over all of the image until none changes (minutes)'
     )
     work_budget: float = option(
         1.0,
-        'method planes: share of the full work that a frame may take; below 1 every second row '
-        'and column is looked at, below 0.55 every fourth',
+        'method planes: share of the full work; less looks at fewer rows and columns',
         0.0,
         1.0,
     )
     noise_regions: str = option(
         'identify',
-        'regions of less than two pixels per pixel of their perimeter: leave them, mark them as '
-        'no plane (identify), or merge them with their neighbours',
+        'regions of few pixels for their perimeter: leave, mark as no plane (identify), or merge',
         choices=('leave', 'identify', 'merge'),
     )
-    min_pixels: int = option(
-        0, 'smallest plane, pixels; 0 follows the size of the image: 300 of VGA', 0, 100000000
-    )
+    min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)
     # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
     # its disparity, of which the quantisation is new in every pixel.
-    noise: float = option(
-        0.0013,
-        'random error of the inverse range, 1/m, more where the image shows more',
-        0.0,
-        10.0,
-    )
-    range_noise: float = option(
-        0.0, 'random error of the range, metres, for sensors like lasers', 0.0, 10.0
-    )
-    pixel_noise: float = option(
-        0.6,
-        'random error of the direction of a pixel, pixels: noise at grazing angles',
-        0.0,
-        100.0,
-    )
-    white_noise: float = option(
-        0.33, 'share of the random variance that is new in every pixel', 0.0, 1.0
-    )
+    noise: float = option(0.0013, 'random error of the inverse range, 1/m', 0.0, 10.0)
+    range_noise: float = option(0.0, 'random error of the range, metres', 0.0, 10.0)
+    pixel_noise: float = option(0.6, "random error of a pixel's direction, pixels", 0.0, 100.0)
+    white_noise: float = option(0.33, 'share of the random variance new in every pixel', 0.0, 1.0)
     noise_correlation: float = option(
         2.0, 'width of the Gaussian the noise looks smoothed with, pixels; 0 = white', 0.0, 100.0
     )
-    distortion: float = option(
-        0.00145, 'smooth systematic error of the inverse range, 1/m', 0.0, 10.0
-    )
-    range_distortion: float = option(
-        0.0, 'smooth systematic error of the range, metres', 0.0, 10.0
-    )
+    distortion: float = option(0.00145, 'systematic error of the inverse range, 1/m', 0.0, 10.0)
+    range_distortion: float = option(0.0, 'systematic error of the range, metres', 0.0, 10.0)
     distortion_length: float = option(
         0.0, 'width of the distortion, pixels, as of the noise; 0 = 35 in VGA', 0.0, 10000.0
     )
     sensor_model: str = option(
         'measured',
-        'errors of the sensor: measured in every image, where noise and distortion given here '
-        'hold as far as it says too little (measured), or as given (fixed)',
+        'errors of the sensor: measured in every image as far as it tells, or as given (fixed)',
         choices=('measured', 'fixed'),
     )
     dithering: float = option(
@@ -158,39 +121,24 @@ class Config:
     )
     # What is known of one sensor: its fixed distortion, and what always stands in its way.
     distortion_map: str = option(
-        '',
-        'file of the fixed distortion of the sensor, as rangeseg calibrate writes it; subtracted '
-        'from the inverse depth before anything else, so that distortion is what remains',
+        '', "file of rangeseg calibrate: the sensor's fixed distortion, which is subtracted"
     )
     mask: str = option(
-        '',
-        "PNG of the size of the images, not 0 where they show the robot's own body: that is "
-        'neither segmented nor terrain',
+        '', "PNG, not 0 where images show the robot's own body: neither segmented nor terrain"
     )
-    track_time: float = option(
-        3.0, 'seconds that a plane may be out of sight or unnoticed and keep its id', 0.0, 100000.0
-    )
+    track_time: float = option(3.0, 'seconds out of sight that ids are kept', 0.0, 100000.0)
     up_x: float = option(0.0, 'up in the frame of the image, x', -1000.0, 1000.0)
     up_y: float = option(
-        -1.0,
-        'up in the frame of the image, y; the default, 0, -1, 0, is that of a level camera, '
-        'which is z of clouds in frames that do not look along z',
-        -1000.0,
-        1000.0,
+        -1.0, 'up in the frame of the image, y; 0, -1, 0: of a level camera', -1000.0, 1000.0
     )
     up_z: float = option(0.0, 'up in the frame of the image, z', -1000.0, 1000.0)
     role_tolerance: float = option(
-        10.0,
-        'largest angle of planes with roles to the horizontal or vertical, degrees',
-        0.0,
-        45.0,
+        10.0, 'largest angle of planes with roles to level or upright, degrees', 0.0, 45.0
     )
     role_height: float = option(
         0.1, 'planes so near to the floor or ceiling belong to it, metres', 0.0, 10.0
     )
-    role_area: float = option(
-        0.3, 'smallest area that can be floor, ceiling or wall, square metres', 0.0, 1000.0
-    )
+    role_area: float = option(0.3, 'smallest floor, ceiling or wall, square metres', 0.0, 1000.0)
     # How the camera moves where planes and tf leave it open: by default like a quick hand.
     camera_turn: float = option(
         60.0, 'standard deviation of the turning of the camera, degrees per second', 0.1, 3600.0
@@ -200,14 +148,10 @@ class Config:
     )
     # The world: frames, the map of planes.
     fixed_frame: str = option(
-        '',
-        'frame in which planes stay put, like odom or map: the map of planes is in it, and ids '
-        'follow the motion that tf tells; without a name there is no map',
+        '', 'frame in which planes stay put, like map, for ids and a map of planes; empty for none'
     )
     gravity_frame: str = option(
-        '',
-        'frame whose z is up and whose z = 0 is the ground, like base_footprint: tf then tells up '
-        'and the height of the camera, before the accelerometer and up_x, up_y, up_z',
+        '', 'frame whose z is up from the ground, like base_footprint: tf tells up and the height'
     )
     target_frame: str = option(
         '', 'frame of ~/planes and ~/markers, like base_link; without a name, that of the images'
@@ -219,19 +163,13 @@ class Config:
     pose_turn_noise: float = option(
         0.3, 'standard deviation of the pose of the camera, degrees, about each axis', 0.0, 45.0
     )
-    map_resolution: float = option(
-        0.03, 'smallest detail of outlines in the map of planes, metres', 0.001, 10.0
-    )
+    map_resolution: float = option(0.03, 'smallest detail of outlines of the map, m', 0.001, 10.0)
     map_area: float = option(
         0.05, 'smallest plane of the map, square metres; 0 for clutter as well', 0.0, 1000.0
     )
-    map_planes: int = option(
-        1000, 'planes of the map at most: those out of sight the longest are forgotten', 1, 100000
-    )
+    map_planes: int = option(1000, 'planes of the map at most, those seen last', 1, 100000)
     odometry: bool = option(
-        False,
-        "the camera's own motion from the planes in sight: ~/odometry, and, without fixed_frame, "
-        'the map of planes',
+        False, "the camera's own motion from planes: ~/odometry and, without fixed_frame, the map"
     )
     odometry_frame: str = option(
         'odom', "frame of ~/odometry: x forward and z up, at the camera's first place"
@@ -240,46 +178,25 @@ class Config:
     sensor_height: float = option(
         0.0, 'height of the sensor above the ground, along up, metres; 0 = unknown', 0.0, 100.0
     )
-    ground_slope: float = option(
-        12.0, 'steepest ground, against the ground under the robot, degrees', 0.0, 45.0
-    )
+    ground_slope: float = option(12.0, 'steepest slope of the ground, degrees', 0.0, 45.0)
     sensor_height_sd: float = option(
         0.015, 'standard deviation of sensor_height, metres', 0.001, 10.0
     )
-    up_sd: float = option(
-        1.5, 'standard deviation of the direction up, however it is told, degrees', 0.01, 45.0
-    )
-    obstacle_height: float = option(
-        0.05, 'what stands so high above the ground is an obstacle, metres', 0.005, 10.0
-    )
-    drop_height: float = option(
-        0.05, 'what lies so deep below the ground is a drop, metres', 0.005, 10.0
-    )
-    ground_gap: float = option(
-        0.15, 'widest gap in the ground that the robot crosses, metres', 0.0, 10.0
-    )
+    up_sd: float = option(1.5, 'standard deviation of up, degrees', 0.01, 45.0)
+    obstacle_height: float = option(0.05, 'least height of an obstacle, metres', 0.005, 10.0)
+    drop_height: float = option(0.05, 'least depth of a drop, metres', 0.005, 10.0)
+    ground_gap: float = option(0.15, 'widest gap that the robot crosses, metres', 0.0, 10.0)
     robot_radius: float = option(
-        0.25,
-        'radius of the robot, metres: ground that far apart may lead from one to the other',
-        0.01,
-        10.0,
+        0.25, 'radius of the robot, metres: ground so far apart is connected', 0.01, 10.0
     )
-    grid_resolution: float = option(
-        0.05, 'side of a cell of ~/grid, the ground around the robot, metres', 0.01, 1.0
-    )
+    grid_resolution: float = option(0.05, 'side of a cell of ~/grid, metres', 0.01, 1.0)
     grid_size: float = option(8.0, 'side of ~/grid, metres', 0.1, 50.0)
     grid_memory: float = option(
         30.0, 'seconds that ~/grid remembers, with fixed_frame or odometry', 0.0, 86400.0
     )
-    grid_clearance: float = option(
-        2.0, 'what hangs higher above the ground is no obstacle of ~/grid, metres', 0.0, 100.0
-    )
+    grid_clearance: float = option(2.0, 'headroom of ~/grid, metres', 0.0, 100.0)
     cloud_resolution: float = option(
-        0.0,
-        'side of the cells of which ~/ground and ~/obstacles have a point, metres, more where '
-        'there would be 20 000 points or more; ~/drops has all edges of drops; 0 = all pixels',
-        0.0,
-        1.0,
+        0.0, 'side of the cells of ~/ground and ~/obstacles, metres; 0 = all pixels', 0.0, 1.0
     )
     seed: int = option(0, 'of dithering and random directions', 0, 2147483647)
 
@@ -353,19 +270,14 @@ def check_directions(distribution: str, count: int) -> None:
         raise ConfigError(f'parameter direction_count: regular gives {squares} {given}')
 
 
-def _frames_in_seconds(frames: object) -> object:
-    """Seconds of a number of frames at 30 Hz."""
-    return frames / 30 if isinstance(frames, int | float) else frames
-
-
-# Former names of parameters, their names now, and what becomes of their values.
-RENAMED: dict[str, tuple[str, Callable[[Any], Any]]] = {
-    'track_memory': ('track_time', _frames_in_seconds),
-    'sensor_height_noise': ('sensor_height_sd', lambda value: value),
-    'up_noise': ('up_sd', lambda value: value),
+# Former names of parameters, and their names now.
+RENAMED = {
+    'track_memory': 'track_time',
+    'sensor_height_noise': 'sensor_height_sd',
+    'up_noise': 'up_sd',
 }
 # Former parameters that nothing reads any more, and why.
-DROPPED: dict[str, str] = {
+DROPPED = {
     'flatness': 'plane_probability decides what is a plane',
     'refits': 'planes are fitted to the final labels',
     'warm_start': 'no frame depends on those before',
@@ -380,17 +292,15 @@ def known_name(name: object) -> bool:
 def _renamed(mapping: Mapping[str, Any]) -> dict[str, Any]:
     """Names and values of parameters as they are called now."""
     result = {name: value for name, value in mapping.items() if name not in (*RENAMED, *DROPPED)}
-    for former, reason in DROPPED.items():
+    dropped = {former: reason for former, reason in DROPPED.items() if former in mapping}
+    said = [f'{former} is not read any more: {reason}' for former, reason in dropped.items()]
+    for former, name in RENAMED.items():
         if former in mapping:
-            warnings.warn(
-                f'parameter {former} is not read any more: {reason}', FutureWarning, stacklevel=3
-            )
-    for former, (name, convert) in RENAMED.items():
-        if former in mapping:
-            result.setdefault(name, convert(mapping[former]))
-            warnings.warn(
-                f'parameter {former} is called {name} now: {name}: {result[name]!r}',
-                FutureWarning,
-                stacklevel=3,
-            )
+            value = mapping[former]
+            if former == 'track_memory' and isinstance(value, int | float):
+                value /= 30  # frames at 30 Hz
+            result.setdefault(name, value)
+            said.append(f'{former} is called {name} now: {name}: {result[name]!r}')
+    for text in said:
+        warnings.warn(f'parameter {text}', FutureWarning, stacklevel=3)
     return result

@@ -31,8 +31,7 @@ def option(
 def checked(option_field: Any, value: Any) -> Any:
     """Return `value` in the type of the field's default, or raise ConfigError."""
     name, kind = option_field.name, type(option_field.default)
-    low, high = option_field.metadata['low'], option_field.metadata['high']
-    choices = option_field.metadata['choices']
+    low, high, choices = (option_field.metadata[key] for key in ('low', 'high', 'choices'))
     shown = reprlib.repr(value)
     # Numbers of numpy are numbers; True is none.
     kinds: dict[type, Any] = {int: numbers.Integral, float: numbers.Real, bool: (bool, np.bool_)}

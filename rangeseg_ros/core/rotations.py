@@ -1,4 +1,4 @@
-"""Rotation matrices, unit quaternions x, y, z, w, and cross products.
+"""Rotation matrices and unit quaternions x, y, z, w.
 
 The few forms that the core needs: to import SciPy's takes longer than to segment a frame.
 """
@@ -12,8 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 def quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     """Unit quaternions (..., 4) x, y, z, w, with w >= 0, of rotations (..., 3, 3).
 
-    Notes
-    -----
     A rotation has all products of two components of its quaternion q: they make up 4 q q^T, of
     which the row with the largest diagonal is q itself but for its length (Shepperd, Quaternion
     from rotation matrix, Journal of Guidance and Control 1978).
@@ -63,10 +61,3 @@ def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:
     """Matrix (3, 3) of cross products: cross_matrix(a) @ b = a x b."""
     x, y, z = np.asarray(vector, np.float64)
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-def cross_products(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Cross products (N, 3) of vectors (N, 3); of few of them much faster than NumPy's."""
-    x, y, z = a.T
-    u, v, w = b.T
-    return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)

@@ -6,13 +6,12 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.lookup import look_up
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.ground.roles import Ramp, Tilt, ramps_of, tilt_of
@@ -41,8 +40,7 @@ class Labelling(Protocol):
         """Normals (H, W, 3) that the labels stand for; None where the planes have them."""
 
 
-@dataclass(frozen=True, eq=False)
-class WorkedOut:
+class WorkedOut(NamedTuple):
     """A `Labelling` without the image it is of: what remains of it in a pickle."""
 
     value: float
@@ -125,17 +123,7 @@ class Segmentation:
         return str(_notebook().to_html(self))
 
     def plot(self, axes: Any = None) -> Any:
-        """Show the planes over the depth with matplotlib.
-
-        Parameters
-        ----------
-        axes : matplotlib.axes.Axes, optional
-            The current ones when not given.
-
-        Returns
-        -------
-        matplotlib.axes.Axes
-        """
+        """Show the planes over the depth in matplotlib's axes, the current ones when not given."""
         return _notebook().plot(self, axes)
 
     def to_dict(self) -> dict[str, Any]:
@@ -158,8 +146,7 @@ class Segmentation:
 
     def to_open3d(self) -> list[Any]:
         """Coloured open3d.geometry.TriangleMesh of each plane."""
-        meshes: list[Any] = _notebook().to_open3d(self)
-        return meshes
+        return list(_notebook().to_open3d(self))
 
     @cached_property
     def verdict(self) -> Verdict:
@@ -224,7 +211,7 @@ class Segmentation:
         table = np.full((int(self.labels.max(initial=0)) + 1, 3), np.nan, np.float32)
         for plane in self.planes:
             table[plane.label] = plane.normal
-        return look_up(table, self.labels)
+        return table.take(self.labels, axis=0, mode='clip')
 
     @cached_property
     def edges(self) -> NDArray[np.bool_]:
@@ -285,8 +272,12 @@ class Segmentation:
         return self.labelling.energy()
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = WorkedOut(self.energy, self.labelling.normals())
-        survey, stairs = self.ground, self.stairs
-        found = {'survey': survey, 'stairs': stairs, 'tilt': self.tilt}
-        judged = {'verdict': self.verdict, 'image': None}
-        return {**self.__dict__, 'labelling': kept, **found, **judged}
+        kept = {name: getattr(self, name) for name in ('verdict', 'stairs', 'tilt')}
+        labelling = WorkedOut(self.energy, self.labelling.normals())
+        return {
+            **self.__dict__,
+            **kept,
+            'labelling': labelling,
+            'survey': self.ground,
+            'image': None,
+        }

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
@@ -60,18 +60,16 @@ class SequenceSegmenter:
 
     @config.setter
     def config(self, config: Config) -> None:
+        before, moved = self.config, config.map_frame != self.config.map_frame
         self._segmenter = Segmenter(config)
-        self._tracker.config = config
-        before = self.map.config
-        if config.map_frame != before.map_frame:
+        if moved:
             self.map.clear('its frame has changed')
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config), None
-        self._odometry.config = config
-        self.map.config = config
-        if grid_options(config) != grid_options(before) or config.map_frame != before.map_frame:
+        if moved or grid_options(config) != grid_options(before):
             self._ground = GroundMemory(grid_options(config))
+        self._tracker.config = self._odometry.config = self.map.config = config
 
     def segment(
         self,
@@ -112,6 +110,7 @@ class SequenceSegmenter:
 
         As `segment` does, for segmenters that work on several frames at once.
         """
+        config = self.config
         if stamp < self._stamp:
             self._tracker.reset()
             self.map.clear('time has gone back')
@@ -127,51 +126,36 @@ class SequenceSegmenter:
         self._stamp, self._pose = stamp, pose
         planes = self._tracker.track(result.labels, planes, stamp, motion)
         up = result.up if up is None else unit(up)
-        planes = with_roles(planes, self.config, up)
-        if self.config.odometry:
-            self._follow(result.labels, planes, stamp, up, image)
-            if not self.config.fixed_frame and self.motion:
+        planes = with_roles(planes, config, up)
+        if config.odometry:
+            towards = unit((config.up_x, config.up_y, config.up_z)) if up is None else up
+            seen = views(result.labels, planes, config.distortion_length)
+            found = self._odometry.add(planes, seen, stamp, towards, image.axes)
+            self.motion = found.of_origin(image.place)
+            if not config.fixed_frame:
+                if not found.held and len(self.map):
+                    self.map.clear('no plane held the camera')
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:
             self.map.add(result.labels, planes, image, pose, stamp)
         survey = result.survey
-        if up is not None and isinstance(survey, Survey):
-            survey = replace(survey, up=up)
-        if isinstance(survey, Survey):
-            height = 0.0 if height is None else float(height + survey.up @ image.place)
-            if height > 0 and not survey.sensor_height:
-                survey = replace(survey, sensor_height=height)
+        if isinstance(survey, Survey) and up is not None:
+            above = 0.0 if height is None else max(float(height + up @ image.place), 0.0)
             survey = replace(
                 survey,
+                up=up,
+                sensor_height=survey.sensor_height or above,
                 memory=self._ground,
                 stamp=stamp,
                 pose=pose,
-                fixed_frame=self.config.map_frame,
+                fixed_frame=config.map_frame,
             )
-        if image.place.any():
-            planes = [
-                plane.named(id=seen.id, surface=seen.surface, role=seen.role)
-                for plane, seen in zip(result.planes, planes, strict=True)
-            ]
+        planes = [
+            plane.named(id=seen.id, surface=seen.surface, role=seen.role)
+            for plane, seen in zip(result.planes, planes, strict=True)
+        ]
         return replace(result, planes=planes, survey=survey)
-
-    def _follow(
-        self,
-        labels: NDArray[np.uint16],
-        planes: list[Plane],
-        stamp: int,
-        up: NDArray[np.float64] | None,
-        image: RangeImage,
-    ) -> None:
-        """Find where the camera is now."""
-        config = self.config
-        towards = (config.up_x, config.up_y, config.up_z) if up is None else up
-        seen = views(labels, planes, config.distortion_length)
-        motion = self._odometry.add(planes, seen, stamp, unit(towards), image.axes)
-        self.motion = motion.of_origin(image.place)
-        if not self.motion.held and len(self.map) and not config.fixed_frame:
-            self.map.clear('no plane held the camera')
 
 
 def with_roles(

@@ -1,8 +1,8 @@
 """Data cost of method normals: the angle between a normal and a direction (thesis eq. 5.5).
 
 A site is a square of `size` x `size` pixels, numbered in raster order, and costs the sum of the
-angles of its pixels, in degrees. A pixel without normal costs nothing, so that its neighbours
-decide (thesis 6.7).
+angles of its pixels, in degrees. A pixel without normal (NaN) costs nothing, so that its
+neighbours decide (thesis 6.7).
 """
 
 from __future__ import annotations
@@ -11,36 +11,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
 
-
+@njit(cache=True, nogil=True)
 def data_costs(
     labels: NDArray[np.int32],
     size: int,
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Cost of every site's own label.
-
-    Parameters
-    ----------
-    labels : (h, w) int32
-        Index into `directions`.
-    size : int
-        Pixels along a side of a site.
-    normals : (H, W, 3) float32
-        Unit vectors, NaN where none is defined.
-    directions : (K, 3) float32
-        Unit vectors.
-
-    Returns
-    -------
-    (h, w) float32
-        Degrees.
-    """
-    data = np.empty(labels.shape, np.float32)
-    run_rows(_find_costs, len(labels), labels, size, normals, directions, data)
-    return data
+    """Cost (h, w) of every site's own label, of normals (H, W, 3) and directions (K, 3)."""
+    costs = np.empty(labels.shape, np.float32)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            costs[i, j] = _cost(directions[labels[i, j]], i, j, size, normals)
+    return costs
 
 
 @njit(cache=True, nogil=True)
@@ -58,22 +42,6 @@ def label_costs(
         row, column = sites[s] // width, sites[s] % width
         costs[s] = _cost(directions[label], row, column, size, normals)
     return costs
-
-
-@njit(cache=True, nogil=True)
-def _find_costs(
-    first: int,
-    after: int,
-    labels: NDArray[np.int32],
-    size: int,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    data: NDArray[np.float32],
-) -> None:
-    """Costs of the labels of some rows."""
-    for i in range(first, after):
-        for j in range(labels.shape[1]):
-            data[i, j] = _cost(directions[labels[i, j]], i, j, size, normals)
 
 
 @njit(cache=True, inline='always')

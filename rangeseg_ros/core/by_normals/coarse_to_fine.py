@@ -21,7 +21,7 @@ from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.expansion import expand
 from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts, group_sites
 from rangeseg_ros.core.regions import connected_components
-from rangeseg_ros.core.runtime.threads import run_halves, run_rows
+from rangeseg_ros.core.runtime.threads import run_halves
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Pixels along a side of a square, 4800 squares in VGA, and sites from a border to expand it to.
@@ -29,27 +29,11 @@ _SIZE = 8
 
 
 def minimise(
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    grid: Grid,
-    smoothness: float,
+    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
 ) -> NDArray[np.int32]:
-    """Labelling of low energy, eq. 5.3 with the angle to the normals as data cost (eq. 5.5).
+    """Labelling (H, W) of low energy (eq. 5.3 and 5.5, lambda = `smoothness`).
 
-    Parameters
-    ----------
-    normals : (H, W, 3) float32
-        NaN where undefined.
-    directions : (K, 3) float32
-    grid : Grid
-        (H, W).
-    smoothness : float
-        Lambda.
-
-    Returns
-    -------
-    (H, W) int32
-        Index into `directions`.
+    Labels are indices of directions (K, 3); normals (H, W, 3) are NaN where undefined.
     """
     height, width = normals.shape[:2]
     links, inside = link_costs(grid, smoothness).reshape(2, height, width), _largest_parts(grid)
@@ -64,12 +48,20 @@ def minimise(
     return labels
 
 
+@njit(cache=True, nogil=True)
 def nearest_directions(
     normals: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> NDArray[np.int32]:
     """Direction (K, 3) nearest to each normal (h, w, 3), of any length: (h, w) index, else 0."""
     labels = np.zeros(normals.shape[:2], np.int32)
-    run_rows(_choose_nearest, len(labels), normals, directions, labels)
+    for i in range(len(labels)):
+        for j in range(labels.shape[1]):
+            x, y, z = normals[i, j]
+            most = np.float32(-np.inf)
+            for k in range(len(directions)):
+                along = x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]
+                if along > most:
+                    labels[i, j], most = k, along
     return labels
 
 
@@ -102,18 +94,17 @@ def _largest_parts(grid: Grid) -> NDArray[np.bool_]:
     squares = _enlarged(np.arange(rows * columns).reshape(rows, columns), _SIZE, shape)
     parts = connected_components(squares, grid, np.ones(shape, np.bool_))
     area = np.bincount(parts.ravel())[parts]
-    inside: NDArray[np.bool_] = area == _enlarged(
-        _per_square(np.maximum, area, _SIZE), _SIZE, shape
-    )
+    largest = _enlarged(_per_square(np.maximum, area, _SIZE), _SIZE, shape)
+    inside: NDArray[np.bool_] = area == largest
     return inside
 
 
 def _between_squares(links: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Links (2, h, w) of the squares, sums of those (2, H, W) between pixels `inside` (H, W)."""
     right, below = np.zeros_like(links)
-    last = slice(_SIZE - 1, -1, _SIZE), slice(_SIZE, None, _SIZE)
-    right[:, last[0]] = links[0, :, last[0]] * (inside[:, last[0]] & inside[:, last[1]])
-    below[last[0]] = links[1, last[0]] * (inside[last[0]] & inside[last[1]])
+    last, next_ = slice(_SIZE - 1, -1, _SIZE), slice(_SIZE, None, _SIZE)
+    right[:, last] = links[0, :, last] * (inside[:, last] & inside[:, next_])
+    below[last] = links[1, last] * (inside[last] & inside[next_])
     return np.stack([_per_square(np.add, right, _SIZE), _per_square(np.add, below, _SIZE)])
 
 
@@ -145,25 +136,6 @@ def _expand(
     data = data_costs(labels, size, normals, directions)
     labelling = GridLabelling.of(labels.ravel(), data.ravel(), links.reshape(2, -1), width)
     run_halves(_expand_rows, height, labelling, seeds.ravel(), size, normals, directions)
-
-
-@njit(cache=True, nogil=True)
-def _choose_nearest(
-    first: int,
-    after: int,
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    labels: NDArray[np.int32],
-) -> None:
-    """Directions nearest to the normals of some rows."""
-    for i in range(first, after):
-        for j in range(normals.shape[1]):
-            x, y, z = normals[i, j]
-            most = np.float32(-np.inf)
-            for k in range(len(directions)):
-                along = x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]
-                if along > most:
-                    labels[i, j], most = k, along
 
 
 @njit(cache=True, nogil=True)

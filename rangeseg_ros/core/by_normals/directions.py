@@ -20,28 +20,10 @@ _EQUATOR = 1e-9  # rounding
 
 @lru_cache(maxsize=8)
 def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Discretise the hemisphere of normals that face the sensor.
+    """Unit vectors (count, 3) over the hemisphere, not to be written to.
 
-    Parameters
-    ----------
-    distribution : {'platonic', 'regular', 'spiral', 'random'}
-        Subdivided icosahedron (section 5.2.2), regular angles (5.2.1), generalised spiral, or
-        hypercube rejection (5.2.1).
-    count : int
-        Number of directions: 4, 17, 73, 305 or 1249 (table A.3) for `platonic`, an odd square
-        (table A.1) for `regular`, any positive number for the others.
-    seed : int
-        Of the random numbers of `random`.
-
-    Returns
-    -------
-    (count, 3) float64
-        Unit vectors with z < 0; the same array for the same arguments, not to be written to.
-
-    Raises
-    ------
-    ConfigError
-        Unknown distribution, or a count that it cannot give.
+    Distributions and counts are those of `Config`: platonic has 4, 17, 73, 305 or 1249 (thesis,
+    table A.3), regular an odd square (A.1), spiral and random any. `ConfigError` for others.
     """
     check_directions(distribution, count)
     if distribution == 'platonic':
@@ -59,8 +41,7 @@ def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float
 def platonic(subdivisions: int) -> NDArray[np.float64]:
     """Vertices of an icosahedron after Loop subdivision (thesis 5.2.2, appendix A.2).
 
-    The solid is cut by a plane through an edge and the edge opposite to it; the vertices
-    strictly on one side are returned.
+    Those strictly on one side of a plane through an edge and the edge opposite to it.
     """
     golden = (1 + 5**0.5) / 2
     # The edges between the vertices (+-1, +-golden, 0) lie in the plane z = 0.

@@ -20,26 +20,13 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 
 
 class Labelling(NamedTuple):
-    """Discretised normals as labels of the pixels of an image.
+    """Discretised normals as labels of the pixels of an image."""
 
-    Attributes
-    ----------
-    labels : (H, W) int32
-        Numbers of directions.
-    directions : (K, 3) float32
-        Unit vectors towards the sensor.
-    observed : (H, W, 3) float32
-        Observed normals, NaN where undefined.
-    grid : Grid
-    smoothness : float
-        Lambda.
-    """
-
-    labels: NDArray[np.int32]
-    directions: NDArray[np.float32]
-    observed: NDArray[np.float32]
+    labels: NDArray[np.int32]  # (H, W), indices of directions
+    directions: NDArray[np.float32]  # (K, 3), unit vectors towards the sensor
+    observed: NDArray[np.float32]  # (H, W, 3), NaN where undefined
     grid: Grid
-    smoothness: float
+    smoothness: float  # lambda
 
     def normals(self) -> NDArray[np.float32]:
         """The reconstructed normals (H, W, 3)."""
@@ -52,24 +39,9 @@ class Labelling(NamedTuple):
 
 
 def segment(
-    image: RangeImage,
-    grid: Grid,
-    config: Config,
-    lap: Callable[[str], None],
+    image: RangeImage, grid: Grid, config: Config, lap: Callable[[str], None]
 ) -> Labelling:
-    """Give every pixel a direction.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    grid : Grid
-        Of the image.
-    config : Config
-        All that is said to be of method normals is read.
-    lap : callable
-        Told the name of every stage that ends.
-    """
+    """Give every pixel a direction; `lap` is told the name of every stage that ends."""
     normals = observed_normals(image, grid, config)
     lap('normals')
     unturned = directions(config.directions, config.direction_count, config.seed)
@@ -91,10 +63,9 @@ def minimise_exactly(
     moves: str = 'expansion',
     cycles: int = 0,
 ) -> NDArray[np.int32]:
-    """Labelling that no move of a label improves, from the nearest direction at every pixel.
+    """What `coarse_to_fine.minimise` finds, from the nearest direction at every pixel on.
 
-    Parameters and result as in `coarse_to_fine.minimise`; `moves` and `cycles` as in
-    `moves.Labelling.minimise` (thesis 4.8).
+    No move of a label improves it; `moves` and `cycles` as in `moves.Labelling.minimise` (4.8).
     """
 
     def cost(label: int, pixels: NDArray[np.integer]) -> NDArray[np.float32]:

@@ -1,16 +1,12 @@
-"""Observed surface normals (thesis 5.7): unit vectors towards the sensor."""
+"""Observed surface normals (H, W, 3), thesis 5.7: unit vectors towards the sensor, or NaN."""
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -23,20 +19,8 @@ _SYMMETRIC = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
 def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[np.float32]:
     """Normals by the method that `config` names.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    grid : Grid
-        (H, W).
-    config : Config
-        `normals`, `normal_baseline`, `normal_radius` and `jump_edges` are read.
-
-    Returns
-    -------
-    (H, W, 3) float32
-        Unit vectors, NaN where undefined. With jump edges by plane deviation, which lie between
-        pixels, that is also where a tangent crosses one.
+    With jump edges by plane deviation, which lie between pixels, there are none where a tangent
+    crosses one.
     """
     if config.normals == 'plane_fit':
         return plane_fit(image, config.normal_radius)
@@ -53,76 +37,27 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[n
 def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
     """Cross product of the tangents between the neighbours of a pixel (thesis 5.7.1).
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    baseline : int
-        Distance from the pixel to its left, right, upper and lower neighbour, pixels; 1 in the
-        thesis. The noise of the direction falls in proportion.
-
-    Returns
-    -------
-    (H, W, 3) float32
-        NaN where the pixel or one of its neighbours was not measured or lies outside the image.
+    Between those so many pixels to the left and right, above and below, which must be measured; 1
+    in the thesis. The noise of the direction falls in proportion.
     """
-    normals = np.empty(image.rays.shape, np.float32)
-    run_rows(_cross_product, len(normals), image.inverse, image.rays, baseline, normals)
-    return normals
-
-
-@njit(cache=True, nogil=True)
-def _cross_product(
-    first: int,
-    after: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    reach: int,
-    normals: NDArray[np.float32],
-) -> None:
-    """Normals of some rows."""
-    height, width = inverse.shape
-    normals[first:after] = np.float32(np.nan)
-    u, v = np.empty(3), np.empty(3)
-    for i in range(max(first, reach), min(after, height - reach)):
-        for j in range(reach, width - reach):
-            left, right = inverse[i, j - reach], inverse[i, j + reach]
-            upper, lower = inverse[i - reach, j], inverse[i + reach, j]
-            if min(left, right, upper, lower, inverse[i, j]) <= 0:
-                continue
-            for c in range(3):
-                u[c] = rays[i, j + reach, c] / right - rays[i, j - reach, c] / left
-                v[c] = rays[i + reach, j, c] / lower - rays[i - reach, j, c] / upper
-            x = u[2] * v[1] - u[1] * v[2]
-            y = u[0] * v[2] - u[2] * v[0]
-            z = u[1] * v[0] - u[0] * v[1]
-            facing = x * rays[i, j, 0] + y * rays[i, j, 1] + z * rays[i, j, 2]
-            length = math.sqrt(x * x + y * y + z * z)
-            if length > 0 and facing != 0:
-                scale = -math.copysign(1 / length, facing)
-                normals[i, j, 0] = x * scale
-                normals[i, j, 1] = y * scale
-                normals[i, j, 2] = z * scale
+    reach, (height, width) = baseline, image.shape
+    u, v = np.zeros((2, height, width, 3))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        points = np.where(image.valid[..., None], image.rays / image.inverse[..., None], np.nan)
+    u[:, reach : width - reach] = points[:, 2 * reach :] - points[:, : -2 * reach]
+    v[reach : height - reach] = points[2 * reach :] - points[: -2 * reach]
+    x = u[..., 2] * v[..., 1] - u[..., 1] * v[..., 2]
+    y = u[..., 0] * v[..., 2] - u[..., 2] * v[..., 0]
+    z = u[..., 1] * v[..., 0] - u[..., 0] * v[..., 1]
+    return _towards_sensor(np.stack([x, y, z], axis=-1), image)
 
 
 def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
-    """Plane through a window of least squares in inverse range (thesis 5.7.2).
+    """Plane of least squares in inverse range through 2 radius + 1 rows and columns (5.7.2).
 
     That is where the noise of structured light and stereo is constant; `orthogonal_fit` is of
     distances in space. The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse,
     so that the sums of the normal equations are box filters over the image.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    radius : int
-        The window has 2 radius + 1 rows and columns.
-
-    Returns
-    -------
-    (H, W, 3) float32
-        NaN where the window holds a pixel that was not measured or lies outside the image.
     """
     rays = np.where(image.valid[..., None], image.rays, 0).astype(np.float64)
     products = _means(rays[..., _ROWS] * rays[..., _COLUMNS], radius)
@@ -133,10 +68,9 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
 
 
 def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
-    """Plane through a window of least orthogonal distances to its points (thesis 5.7.2).
+    """Plane of least orthogonal distances to the points of such a window (thesis 5.7.2).
 
-    The eigenvector of the smallest eigenvalue of the points' covariance. Parameters and result as
-    for `plane_fit`.
+    The eigenvector of the smallest eigenvalue of the points' covariance.
     """
     valid = image.valid
     # About their mean, so that the products of coordinates keep their digits.
@@ -157,7 +91,7 @@ def _means(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:
 
 
 def _towards_sensor(
-    normals: NDArray[np.float64], image: RangeImage, radius: int
+    normals: NDArray[np.float64], image: RangeImage, radius: int = 0
 ) -> NDArray[np.float32]:
     """Unit vectors against the rays; NaN for vectors without a direction and for windows that
     reach out of the image or hold a pixel that was not measured."""

@@ -6,27 +6,17 @@ from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import Outline, triangles
-from rangeseg_ros.core.description.shapes import RegionShape, Shape, Shapes
+from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, triangles
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
-from rangeseg_ros.core.fitting.uncertainty import (
-    level_of,
-    plane_jacobians,
-    sandwiches,
-)
+from rangeseg_ros.core.fitting.region_sums import POINT, RAY, SCATTER, WEIGHT
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import (
-    SensorModel,
-    random_variance,
-    systematic_variance,
-)
+from rangeseg_ros.core.sensing.sensor import random_variance, systematic_variance
 
 # A border is taken seriously up to this many times the range of the farthest part of its plane.
 _FAR = 2.0
@@ -109,23 +99,16 @@ class Plane:
         )
 
     def mesh(self) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
-        """Triangles of the outline without its holes.
+        """Vertices (N, 3), metres, and triangles (T, 3) of them, of the outline without its holes.
 
-        Returns
-        -------
-        vertices : (N, 3) float64
-            Metres.
-        triangles : (T, 3) int
-            Rows of `vertices`, counter-clockwise seen from the sensor.
+        Triangles are rows of vertices, counter-clockwise seen from the sensor.
         """
-        vertices, faces = [np.zeros((0, 3))], [np.zeros((0, 3), np.intp)]
-        first = 0
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.intp)
         for rings in self.outline.parts:
             if len(rings[0]) > 2:
-                vertices += rings
-                faces.append(first + triangles(rings, self.normal))
-                first += sum(map(len, rings))
-        return np.concatenate(vertices), np.concatenate(faces)
+                faces = np.append(faces, len(vertices) + triangles(rings, self.normal), axis=0)
+                vertices = np.concatenate([vertices, *rings])
+        return vertices, faces
 
     def to_dict(self) -> dict[str, Any]:
         """The plane as numbers, texts and lists of them, as JSON takes it."""
@@ -163,7 +146,7 @@ class Plane:
     def hull(self) -> NDArray[np.float64]:
         """(N, 3) outline on the plane, metres, counter-clockwise seen from the sensor.
 
-        Follows the region's largest part within `outlines.TOLERANCE` pixels; concave as it is.
+        Follows the region's largest part within `shapes.TOLERANCE` pixels; concave as it is.
         """
         return self.outline.hull
 
@@ -185,23 +168,9 @@ def describe_regions(
     fits: Fits,
     probability: NDArray[np.float64] | None = None,
 ) -> list[Plane]:
-    """Uncertainty, place and shape of every region's plane.
+    """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        1...M, 0 for no plane; labels whose pixels determine no plane are left out.
-    image : RangeImage
-        (H, W).
-    fits : Fits
-        Of these labels.
-    probability : (M + 1,) float64, optional
-        Of the regions to be planes; 1 where it is not given.
-
-    Returns
-    -------
-    list of Plane
-        In the order of the labels.
+    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
@@ -209,10 +178,7 @@ def describe_regions(
         return []
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
-    cells, start = fits.sums.cells, fits.sums.start
-    normal, distance, centroid, rms, confidence, farthest = _described(
-        cells, start, fits.total, theta, fits.outlier_share(), fits.sensor
-    )
+    normal, distance, centroid, rms, confidence, farthest = _described(fits)
     covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     if image.place.any():
         # From the sensor to the frame of the points.
@@ -228,74 +194,44 @@ def describe_regions(
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    columns = surfaces.result(), distance, fits.pixels, rms, confidence, probability
-    group, offset, *figures = (column[found].tolist() for column in columns)
+    numbers = surfaces.result(), distance, fits.pixels, rms, confidence, probability
+    group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]
-    shapes = Shapes(outlines, image.place, image.axes[:, 0].copy())
-    forms = outlines, [RegionShape(shapes, n) for n in range(len(known))]
-    return list(map(Plane, known, known, group, *equations, centroid[found], *figures, *forms))
+    place, right = image.place, image.axes[:, 0].copy()
+    shapes = [RegionShape(outline, place, right) for outline in outlines]
+    columns = known, known, group, *equations, centroid[found], *figures, outlines, shapes
+    return list(map(Plane, *columns))
 
 
-@njit(cache=True, nogil=True)
-def _described(
-    cells: NDArray[np.float64],
-    start: NDArray[np.intp],
-    total: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    outlier_share: NDArray[np.float64],
-    sensor: SensorModel,
-) -> tuple[NDArray[np.float64], ...]:
+def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
     """What regions 0...M have as planes, see `Plane`.
 
     Normal, distance, centroid, rms, confidence, and the inverse range at which the plane ends for
     its outline: 0 where there is no plane.
     """
-    regions = len(theta)
-    normal, distance, farthest = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
-    centroid, rms, confidence = np.zeros((regions, 3)), np.zeros(regions), np.zeros(regions)
-    for k in range(regions):
-        x, y, z = theta[k]
-        slope = np.sqrt(x * x + y * y + z * z)
-        if slope == 0:
-            continue
-        distance[k] = 1 / slope
-        for a in range(3):
-            normal[k, a] = -theta[k, a] * distance[k]
-        n, inliers = normal[k], max(total[k, COUNT], 1.0)
-        offset = square = 0.0
-        for a in range(3):
-            centroid[k, a] = total[k, POINT + a] / inliers
-            offset += n[a] * centroid[k, a]
-        entry = SCATTER
-        for a in range(3):
-            for b in range(a, 3):
-                square += (1 if a == b else 2) * n[a] * n[b] * total[k, entry] / inliers
-                entry += 1
-        square += distance[k] * (2 * offset + distance[k])
-        rms[k] = np.sqrt(max(square, 0.0))
-        centroid[k] -= (offset + distance[k]) * n
-        expected, least = _expected_square(cells[start[k] : start[k + 1]], theta[k], sensor)
-        expected *= distance[k] ** 2
-        farthest[k] = least / _FAR
-        confidence[k] = (1 - outlier_share[k]) * min(1.0, expected / max(square, 1e-18))
-    return normal, distance, centroid, rms, confidence, farthest
-
-
-@njit(cache=True)
-def _expected_square(
-    cells: NDArray[np.float64], theta: NDArray[np.float64], sensor: SensorModel
-) -> tuple[float, float]:
-    """Mean square distance from a plane, over distance^2, that the sensor's errors make.
-
-    And the inverse range of the plane in its farthest cell.
-    """
-    total, pixels, least = 0.0, 0.0, np.inf
-    for cell in cells:
-        level, count = level_of(cell, theta), cell[COUNT]
-        # n . p + d changes by d / y times the error of y, whose variance is a + b y^4.
-        squared = level * level if level > 0 else 1.0
-        variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
-        total += count * variance / squared
-        pixels += count
-        least = min(least, level)
-    return total / max(pixels, 1.0), least if pixels > 0 else 0.0
+    theta, total, cells = fits.theta, fits.total, fits.sums.cells
+    slope = np.sqrt((theta * theta).sum(axis=1))
+    distance = np.divide(1, slope, out=np.zeros_like(slope), where=slope > 0)
+    normal = -theta * distance[:, None]
+    inliers = np.maximum(total[:, COUNT], 1)[:, None]
+    centroid = total[:, POINT : POINT + 3] / inliers
+    offset = (normal * centroid).sum(axis=1)
+    # The scatter matrix between the normals: its upper triangle, with the rest of it.
+    rows, columns = np.triu_indices(3)
+    twice = np.where(rows == columns, 1, 2) * normal[:, rows] * normal[:, columns]
+    square = (twice * total[:, SCATTER : SCATTER + 6] / inliers).sum(axis=1)
+    square += distance * (2 * offset + distance)
+    centroid -= (offset + distance)[:, None] * normal
+    # What the errors of the sensor make of it: n . p + d changes by d / y times the error of y.
+    region = np.repeat(np.arange(len(theta)), np.diff(fits.sums.start))
+    level = (theta[region] * cells[:, RAY : RAY + 3]).sum(axis=1) / cells[:, WEIGHT]
+    squared = np.where(level > 0, level * level, 1.0)
+    variance = random_variance(fits.sensor, squared) + systematic_variance(fits.sensor, squared)
+    pixels = np.bincount(region, cells[:, COUNT], len(theta))
+    expected = np.bincount(region, cells[:, COUNT] * variance / squared, len(theta))
+    expected = expected / np.maximum(pixels, 1) * distance**2
+    farthest = np.where(pixels > 0, np.inf, 0.0)
+    np.minimum.at(farthest, region, level / _FAR)
+    explained = np.minimum(1, expected / np.maximum(square, 1e-18))
+    confidence = (1 - fits.outlier_share()) * explained
+    return normal, distance, centroid, np.sqrt(np.maximum(square, 0)), confidence, farthest

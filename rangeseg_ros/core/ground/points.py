@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.ground.classes import DROP, GROUND
 from rangeseg_ros.core.ground.terrain import Terrain
+from rangeseg_ros.core.sensing.clouds import completed_rays
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.rays import completed_rays
 
 MOST_POINTS = 20_000
 """Points of a thinned cloud: as many as layers of costmaps take in the time of a frame."""
@@ -72,7 +72,7 @@ def unseen(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
     opened = cv2.morphologyEx(missing.view(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     rays = image.rays
     if len(seen) and image.camera is None:
-        completed = completed_rays(image)
+        completed = completed_rays(image.rays, image.valid)
         if completed is None:
             seen = seen[:0]
         else:

@@ -39,16 +39,7 @@ def choose_cache() -> None:
     The first that can be written to, and not by other users: `NUMBA_CACHE_DIR`, the package
     (whoever can write there can change the sources), the user's cache folder, a temporary one for
     this process. Kernels that were compiled into a package which is read-only are copied there.
-
-    Warns
-    -----
-    CacheWarning
-        `NUMBA_CACHE_DIR` is not such a folder, or what is compiled is lost with the process.
-
-    Raises
-    ------
-    OSError
-        No folder can be written to.
+    `CacheWarning` where it is not the named one or goes with the process; OSError without any.
     """
     _choose_processor()
     given = os.environ.pop('NUMBA_CACHE_DIR', None)
@@ -58,7 +49,10 @@ def choose_cache() -> None:
     if folder is None and writable(PACKAGE / 'core' / '__pycache__'):
         drop_outdated(PACKAGE)
     elif folder is None:
-        folder = _user_folder() or _temporary_folder()
+        home = os.environ.get('HOME')
+        user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
+        folder = _own_folder(Path(user, 'rangeseg_ros')) if user else None
+        folder = folder or _temporary_folder()
         _copy_compiled(folder)
     if folder:
         # Of processes started from here, too.
@@ -128,13 +122,6 @@ def _private(folder: Path) -> bool:
     return True
 
 
-def _user_folder() -> Path | None:
-    """Folder in the user's cache."""
-    home = os.environ.get('HOME')
-    user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
-    return _own_folder(Path(user, 'rangeseg_ros')) if user else None
-
-
 def _temporary_folder() -> Path:
     """Folder that goes with the process."""
     try:
@@ -153,13 +140,7 @@ def _temporary_folder() -> Path:
 
 
 def drop_outdated(package: Path) -> None:
-    """Remove kernels compiled beside sources that have changed, or that import such sources.
-
-    Parameters
-    ----------
-    package : Path
-        With the compiled kernels, and a note of what they were compiled from.
-    """
+    """Remove kernels compiled beside sources that have changed, or that import such sources."""
     note, now = package / _SOURCES, _digests(package)
     try:
         before = json.loads(note.read_text())
@@ -169,8 +150,8 @@ def drop_outdated(package: Path) -> None:
         return
     changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
     for name in _dependents(package, changed):
-        folder, stem = os.path.split(package.parent / name.replace('.', '/'))
-        for compiled in Path(folder, '__pycache__').glob(f'{stem}.*.nb[ic]'):
+        source = package.parent / name.replace('.', '/')
+        for compiled in (source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'):
             compiled.unlink(missing_ok=True)
     part = note.with_name(f'{note.name}.{os.getpid()}')
     part.write_text(json.dumps(now))
@@ -179,24 +160,21 @@ def drop_outdated(package: Path) -> None:
 
 def _digests(package: Path) -> dict[str, str]:
     """Digests of the sources of the core by module: times of change may be those of an archive."""
-    return {
-        '.'.join(path.relative_to(package.parent).with_suffix('').parts): hashlib.sha256(
-            path.read_bytes()
-        ).hexdigest()
-        for path in sorted((package / 'core').rglob('*.py'))
-    }
+    digests = {}
+    for path in sorted((package / 'core').rglob('*.py')):
+        name = '.'.join(path.relative_to(package.parent).with_suffix('').parts)
+        digests[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    return digests
 
 
 def _dependents(package: Path, changed: set[str]) -> set[str]:
     """The changed modules and all that import one of them, or one that does."""
-    imports = {}
+    imports: dict[str, set[str]] = {}
     for name in _digests(package):
         text = (package.parent / name.replace('.', '/')).with_suffix('.py').read_text()
-        found = _IMPORT.findall(text)
-        modules = {
-            f'{module}.{item}' for module, items in found for item in re.findall(r'\w+', items)
-        }
-        imports[name] = modules | {module for module, _ in found}
+        imports[name] = set()
+        for module, items in _IMPORT.findall(text):
+            imports[name] |= {module, *(f'{module}.{item}' for item in re.findall(r'\w+', items))}
     while more := {name for name, found in imports.items() if found & changed} - changed:
         changed = changed | more
     return changed

@@ -90,16 +90,14 @@ def _threads() -> int:
     return min(cv2.getNumThreads() // max(_sharing, 1), _MAX_THREADS)
 
 
-def run_rows(
-    kernel: Callable[..., None], rows: int, *arguments: Any, strips: int = _STRIPS
-) -> None:
+def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     """Run kernel(first, after, *arguments) on strips of the rows at the same time.
 
     What one strip writes no other may touch: then the result is the same for any number of
-    threads, and of strips for each.
+    threads.
     """
     threads = _threads()
-    count = max(min(strips * threads, rows // _ROWS), 1) if threads > 1 else 1
+    count = max(min(_STRIPS * threads, rows // _ROWS), 1) if threads > 1 else 1
     bounds = [rows * part // count for part in range(count + 1)]
     others = [Task(kernel, *strip, *arguments) for strip in pairwise(bounds[1:])]
     kernel(0, bounds[1], *arguments)

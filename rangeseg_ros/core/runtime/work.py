@@ -18,13 +18,7 @@ def step_within(budget: float) -> int:
 
 
 class Stopwatch:
-    """Times the stages of a run.
-
-    Attributes
-    ----------
-    laps : dict
-        Milliseconds per stage.
-    """
+    """Times the stages of a run; `laps` are milliseconds per stage."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}

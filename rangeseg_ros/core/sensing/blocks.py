@@ -29,19 +29,12 @@ degrees of freedom; it finds faces 10 pixels wide."""
 
 
 class Blocks(NamedTuple):
-    """The blocks of an image and the planes through each.
+    """The blocks (rows, columns) of an image and the planes through each, in 1/m^2.
 
-    Attributes
-    ----------
-    moments : (rows, columns, 13) float64
-        With unit weights, of the measured pixels.
-    squared : (rows, columns) float64
-        Mean square of the inverse range, 1/m^2.
-    across, down : (rows, columns) float64
-        Squares of the change of the inverse range from pixel to pixel on the plane, along the row
-        and down the column, 1/m^2, less what noise adds to them.
-    residual : (rows, columns) float64
-        Sum of the squared residuals, 1/m^2.
+    `moments` (..., 13) of the measured pixels have unit weights. `squared` is the mean square of
+    the inverse range; `across` and `down` are the squares of its change from pixel to pixel on the
+    plane, along the row and down the column, less what noise adds to them; `residual` is the sum
+    of the squared residuals.
     """
 
     moments: NDArray[np.float64]
@@ -63,7 +56,11 @@ class Blocks(NamedTuple):
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
-        _sum_blocks(self.moments, rays, size, blocks)
+        parts = np.pad(self.moments, ((0, rows % 2), (0, columns % 2), (0, 0)))
+        upper, lower = parts[::2], parts[1::2]
+        blocks.moments[:] = upper[:, ::2] + upper[:, 1::2] + lower[:, ::2] + lower[:, 1::2]
+        blocks.moments[..., COUNT + 1 :] = 0
+        _fit_planes(0, len(blocks.moments), rays, size, blocks)
         return blocks
 
     @classmethod
@@ -100,20 +97,6 @@ def _sum_pixels(
     _fit_planes(first, after, rays, size, blocks)
 
 
-@njit(cache=True, nogil=True)
-def _sum_blocks(
-    parts: NDArray[np.float64], rays: NDArray[np.float32], size: int, blocks: Blocks
-) -> None:
-    """Fill in blocks of 2 x 2 that have these moments."""
-    moments = blocks.moments
-    moments[:] = 0
-    for i in range(parts.shape[0]):
-        for j in range(parts.shape[1]):
-            for k in range(COUNT + 1):
-                moments[i // 2, j // 2, k] += parts[i, j, k]
-    _fit_planes(0, len(moments), rays, size, blocks)
-
-
 @njit(cache=True, nogil=True, error_model='numpy')
 def _fit_planes(
     first: int, after: int, rays: NDArray[np.float32], size: int, blocks: Blocks
@@ -148,8 +131,7 @@ def _change(
 ) -> float:
     """Change of the inverse range from pixel to pixel on the plane of a block.
 
-    Between the two rays of a row (`way` 0, 1) or column (1, 0) that are farthest apart; 0 where
-    none has two.
+    Between the two rays of a row (`way` 0, 1) or column (1, 0) that are farthest apart, else 0.
     """
     (top, left), (di, dj) = corner, way
     farthest, change = 0, 0.0

@@ -13,14 +13,10 @@ from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
+# Pixels from one side of a hole to the other, at most: gaps of three, as random holes in a third
+# of the pixels make them, and less than the shadow of any step that is not small itself.
 SPAN = 4
-"""Pixels from one side of a hole to the other, at most.
-
-Gaps of three, as random holes in a third of the pixels make them, and less than the shadow of any
-step that is not small itself.
-"""
-# Rows and columns from one pixel to the next.
-_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from one pixel to the next
 
 
 def bridge_holes(
@@ -32,15 +28,8 @@ def bridge_holes(
     readout: they part no surface. A missing pixel lies between two measured ones in its row,
     column or diagonals. All such pairs must continue each other: their inverse ranges differ by
     no more than a jump and the slope of the surface over their distance, which the two sides of a
-    shadow do not. The closest pair is interpolated.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    steps, slopes : (ceil(H / 4), ceil(W / 4)) float32
-        Smallest jump, and the change of the inverse range from pixel to pixel on surfaces, of
-        every block, 1/m.
+    shadow do not. The closest pair is interpolated. `steps` and `slopes` are the smallest jump,
+    and the change of the inverse range from pixel to pixel on surfaces, of every block, 1/m.
     """
     known = image.valid.view(np.uint8)
     holes = cv2.dilate(known, np.ones((2 * SPAN - 1, 2 * SPAN - 1), np.uint8)) > known

@@ -18,10 +18,8 @@ from rangeseg_ros.core.sensing.lens import checked_lens, undistort
 # Slope of a ray, 0.06 degrees from across the optical axis: no lens has such pixels, and the
 # squares of their moments leave the range of the solvers.
 _STEEPEST = 1000.0
-# By which the square of a unit quaternion may be off: decimals of files.
-_UNIT = 1e-6
-OPTICAL = (0.0, 0.0, 0.0, 1.0)
-"""The turn of a camera in its own optical frame: none."""
+_UNIT = 1e-6  # by which the square of a unit quaternion may be off: decimals of files
+OPTICAL = (0.0, 0.0, 0.0, 1.0)  # the turn of a camera in its own optical frame: none
 
 
 class CameraWarning(UserWarning):
@@ -75,30 +73,25 @@ class Camera:
     place: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        checked: dict[str, Any] = {
-            name: positive_integer(name, getattr(self, name)) for name in ('width', 'height')
-        }
-        checked |= {
-            name: _finite(name, getattr(self, name)) for name in ('fx', 'fy', 'cx', 'cy', 'skew')
-        }
+        given = vars(self)
+        values: dict[str, Any] = {}
+        values |= {name: positive_integer(name, given[name]) for name in ('width', 'height')}
+        values |= {name: _finite(name, given[name]) for name in ('fx', 'fy', 'cx', 'cy', 'skew')}
+        for name in ('turn', 'place'):
+            values[name] = tuple(_finite(name, part) for part in given[name])
         try:
             lens = checked_lens(self.distortion_model, self.d)
         except (TypeError, ValueError, AttributeError, OverflowError) as error:
             raise CameraError(str(error)) from None
-        checked['distortion_model'], checked['d'] = lens
-        checked['turn'] = tuple(_finite('turn', part) for part in self.turn)
-        if len(self.turn) != 4 or abs(sum(q * q for q in checked['turn']) - 1) > _UNIT:
+        values['distortion_model'], values['d'] = lens
+        vars(self).update(values)
+        if len(self.turn) != 4 or abs(sum(q * q for q in self.turn) - 1) > _UNIT:
             raise CameraError(f'turn must be a unit quaternion x, y, z, w, not {self.turn!r}')
-        checked['place'] = tuple(_finite('place', part) for part in self.place)
         if len(self.place) != 3:
             raise CameraError(f'place must be x, y, z, not {self.place!r}')
-        for name, value in checked.items():
-            object.__setattr__(self, name, value)
         for name in ('fx', 'fy'):
-            if getattr(self, name) <= 0:
-                raise CameraError(
-                    f'focal length {name} must be positive, not {getattr(self, name)}'
-                )
+            if values[name] <= 0:
+                raise CameraError(f'focal length {name} must be positive, not {values[name]}')
         self._check_rays()
 
     @classmethod
@@ -123,7 +116,9 @@ class Camera:
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
     def _check_rays(self) -> None:
-        shown = _shown(self)
+        # Of a grid over the image.
+        across, down = (np.linspace(0, size - 1, 33) for size in (self.width, self.height))
+        shown = np.isfinite(self.rays_at(*np.meshgrid(across, down))[..., 0])
         if not self.distortion_model and not shown.all():
             raise CameraError(
                 f'focal lengths {self.fx:g}, {self.fy:g} and principal point {self.cx:g}, '
@@ -175,18 +170,7 @@ class Camera:
         return rays
 
     def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """Directions scaled to depth 1, (..., 3), of places in the image.
-
-        Parameters
-        ----------
-        u, v : (...) float
-            Columns and rows, pixels.
-
-        Returns
-        -------
-        (..., 3) float64
-            NaN where there is no ray.
-        """
+        """Directions (..., 3) scaled to depth 1 of columns u and rows v (...); NaN without one."""
         with np.errstate(over='ignore', invalid='ignore'):
             y = (np.asarray(v, float) - self.cy) / self.fy
             x = (np.asarray(u, float) - self.cx - self.skew * y) / self.fx
@@ -219,9 +203,3 @@ def _finite(name: str, value: Any) -> float:
     if not np.isfinite(number):
         raise CameraError(f'{name} must be finite, not {value!r}')
     return number
-
-
-def _shown(camera: Camera) -> NDArray[np.bool_]:
-    """Which places of a grid over the image have a ray."""
-    u, v = np.meshgrid(np.linspace(0, camera.width - 1, 33), np.linspace(0, camera.height - 1, 33))
-    return np.isfinite(camera.rays_at(u, v)[..., 0])

@@ -20,68 +20,44 @@ class DistortionError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class DistortionMap:
-    """Error of the inverse depth of every pixel, along the optical axis.
+    """Error of the inverse depth y of every pixel (H, W): offset + slope (y - reference), 1/m.
 
-    The error at an inverse depth y is offset + slope (y - reference).
-
-    Attributes
-    ----------
-    offset : (H, W) float32
-        1/m; 0 where it is not known. Without its free part: its least-squares plane
-        a u + b v + c over the pixels that were seen is zero.
-    deviation : (H, W) float32 or None
-        Standard deviation of the error at the distances it was learned from, 1/m; 0 where it is
-        not known.
-    slope : (H, W) float32 or None
-        Change of the error with y; None where it does not depend on it.
-    camera : Camera or None
-        Whose images it is for; None where that is not known.
-    reference : float
-        Inverse depth at which the error is the offset, 1/m.
+    The offset is 0 where it is not known, and without its free part: its least-squares plane
+    a u + b v + c over the pixels that were seen is zero.
     """
 
     offset: NDArray[np.float32]
+    # Standard deviation at the distances it was learned from, 0 where it is not known.
     deviation: NDArray[np.float32] | None = None
-    slope: NDArray[np.float32] | None = None
-    camera: Camera | None = None
+    slope: NDArray[np.float32] | None = None  # None where the error does not depend on y
+    camera: Camera | None = None  # whose images it is for, where that is known
     reference: float = 0.0
 
     def corrected(self, image: RangeImage) -> RangeImage:
-        """`image` without the distortion.
+        """`image` without the distortion; `DistortionError` for another size or camera.
 
         An inverse range along unit rays, as of clouds, is the inverse depth times depth/range,
         and so is its error.
-
-        Raises
-        ------
-        DistortionError
-            The image has another size, or another camera.
         """
         self._check(image)
-        along = image.along
-        error = self.offset
+        along, error = image.along, self.offset
         if self.slope is not None:
             with np.errstate(divide='ignore', invalid='ignore'):
                 inverse_depth = image.inverse / along
             error = error + self.slope * (inverse_depth - np.float32(self.reference))
-        error = error * along
-        inverse = np.where(image.inverse > 0, image.inverse - error, np.float32(0))
+        inverse = image.inverse - error * along
         # What remains beyond infinity was not measured.
-        inverse = np.where(inverse > 0, inverse, np.float32(0))
+        inverse = np.where(image.valid & (inverse > 0), inverse, np.float32(0))
         return replace(image, inverse=inverse, corrected=True)
 
     def _check(self, image: RangeImage) -> None:
-        height, width = self.offset.shape
-        if image.shape != self.offset.shape:
+        (height, width), (rows, columns) = self.offset.shape, image.shape
+        if (height, width) != (rows, columns):
             raise DistortionError(
-                f'the distortion map is {width}x{height}, '
-                f'the image {image.shape[1]}x{image.shape[0]}'
+                f'the distortion map is {width}x{height}, the image {columns}x{rows}'
             )
-        own, other = self.camera, image.camera
-        if own is None or other is None:
-            return
-        for name in ('fx', 'fy', 'cx', 'cy'):
-            expected, found = getattr(own, name), getattr(other, name)
+        for name in ('fx', 'fy', 'cx', 'cy') if self.camera and image.camera else ():
+            expected, found = getattr(self.camera, name), getattr(image.camera, name)
             if abs(expected - found) > _SAME_CAMERA * width:
                 raise DistortionError(
                     f'the distortion map is of another camera: {name} {expected:g}, not {found:g}'

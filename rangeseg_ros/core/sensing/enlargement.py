@@ -12,23 +12,17 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-_SIGNIFICANT = 5.0
-"""Standard errors by which a line of a spectrum differs from chance in any image."""
+SIGNIFICANT = 5.0
+"""Standard errors that a statistic of an image must differ by, not to be chance in any image."""
+# Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
-"""Rows or columns, and those whose spectrum is looked at, that stand for an image."""
-_LARGEST = 16
-"""Enlargement that is looked for."""
+_LARGEST = 16  # enlargement that is looked for
 
 
 class Cells(NamedTuple):
-    """Squares of pixels that hold one measurement each.
+    """Squares of `factor` x `factor` pixels that hold one measurement each.
 
-    Attributes
-    ----------
-    factor : int
-        Pixels along a side.
-    rows, columns : int
-        How many of the first cell are cropped.
+    `rows` and `columns` are how many of the first one are cropped.
     """
 
     factor: int
@@ -38,10 +32,11 @@ class Cells(NamedTuple):
     def reduced(self, image: RangeImage) -> RangeImage:
         """The image with a pixel for each cell, the cropped ones included."""
         k, (height, width) = self.factor, image.shape
-        v = np.clip(np.arange(k // 2 - self.rows, height + k // 2, k), 0, height - 1)
-        u = np.clip(np.arange(k // 2 - self.columns, width + k // 2, k), 0, width - 1)
-        v, u = v[: -(-(height + self.rows) // k)], u[: -(-(width + self.columns) // k)]
-        picked = np.ix_(v, u)
+        middles = (
+            np.clip(k // 2 - cropped + k * np.arange(-(-(size + cropped) // k)), 0, size - 1)
+            for size, cropped in ((height, self.rows), (width, self.columns))
+        )
+        picked = np.ix_(*middles)
         camera = self.camera(image.camera) if image.camera else None
         rays = image.rays[picked] if camera is None else camera.rays
         # Like those of cameras, or every kernel that reads them is compiled twice.
@@ -88,26 +83,19 @@ def replication(image: RangeImage) -> Cells | None:
     multiples of the factor apart, and so are the rows. At least half of the borders must show it:
     a few edges of an exact scene may lie at multiples by chance.
     """
-    inverse = image.inverse
-    columns = _period(inverse[:: max(len(inverse) // _LINES, 1)])
-    if columns is None:
-        return None
-    rows = _period(inverse[:, :: max(inverse.shape[1] // _LINES, 1)].T)
-    if rows is None or rows[0] != columns[0]:
-        return None
-    return Cells(columns[0], rows[1], columns[1])
+    (factor, columns), (other, rows) = _period(image.inverse), _period(image.inverse.T)
+    return Cells(factor, rows, columns) if 0 < factor == other else None
 
 
-def _period(lines: NDArray[np.float32]) -> tuple[int, int] | None:
-    """Distance of the columns at which values change, and what the first one lacks."""
+def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
+    """Distance of the columns at which values change, and what the first one lacks; 0 for none."""
+    lines = lines[:: max(len(lines) // _LINES, 1)]
     before, after = lines[:, :-1], lines[:, 1:]
     changes = np.flatnonzero(((before != after) & (before > 0) & (after > 0)).any(axis=0)) + 1
-    if len(changes) < 2:
-        return None
     period = int(np.gcd.reduce(np.diff(changes)))
     few = 2 * len(changes) * period < lines.shape[1]
     if few or not 2 <= period <= _LARGEST:
-        return None
+        return 0, 0
     return period, int(-changes[0] % period)
 
 
@@ -126,7 +114,7 @@ def interpolation(image: RangeImage) -> Cells | None:
         found[2] = _spectrum(some, 3)[2]
         amplitude = np.minimum(amplitude, found)
         # Of a period all divisors show.
-        periods = np.flatnonzero(amplitude > _SIGNIFICANT)
+        periods = np.flatnonzero(amplitude > SIGNIFICANT)
         if not len(periods):
             return None
     return Cells(int(periods[-1]), 0, 0)

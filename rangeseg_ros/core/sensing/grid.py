@@ -19,14 +19,9 @@ GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 class Grid(NamedTuple):
-    """Weights of the edges between neighbouring pixels, 0 where disconnected.
+    """Weights of the edges from each pixel to its right (H, W-1) and lower (H-1, W) neighbour.
 
-    Attributes
-    ----------
-    right : (H, W-1) float32
-        Of the edges from each pixel to its right neighbour.
-    below : (H-1, W) float32
-        Of those to the one below.
+    0 where disconnected.
     """
 
     right: NDArray[np.float32]
@@ -34,26 +29,10 @@ class Grid(NamedTuple):
 
 
 class View(NamedTuple):
-    """A range image, or its bins, with blocks, neighbourhood and errors.
+    """A range image, as it was measured and with holes bridged (`whole`, which `grid` is of).
 
-    Attributes
-    ----------
-    image : RangeImage
-        (H, W), as it was measured.
-    whole : RangeImage
-        (H, W), holes bridged.
-    blocks : Blocks
-        Of 4 x 4 pixels of `image`.
-    grid : Grid
-        Of `whole`.
-    sensor : SensorModel
-        Errors of the image.
-    least : int
-        Pixels of the smallest plane.
-    area : float
-        Of a pixel, see `pixel_area`.
-    identified : bool
-        False where the errors were to be measured and the image says too little.
+    Or its bins. With its blocks of 4 x 4 pixels, its errors, the pixels of the smallest plane
+    (`least`), the `area` of a pixel (see `pixel_area`), and whether the errors are known: not where they were to be measured and the image says too little.
     """
 
     image: RangeImage
@@ -69,19 +48,9 @@ class View(NamedTuple):
 def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform') -> Grid:
     """Weights of the edges between neighbouring pixels.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W); pixels without measurement are disconnected (thesis 6.7).
-    jumps : (horizontal, vertical) of bool, optional
-        Edges that cross a jump and are disconnected (thesis 5.5.2).
-    weighting : {'uniform', 'distance'}
-        1 for each edge, or more the closer the points lie in space (thesis 5.5.4):
-        2 m / (m + d) with the distance d of the points and its median m over the image.
-
-    Returns
-    -------
-    Grid
+    Pixels without measurement are disconnected (thesis 6.7), and edges that cross a jump (5.5.2).
+    The others have 1 ('uniform'), or more the closer the points lie in space ('distance', 5.5.4):
+    2 m / (m + d) with the distance d of the points and its median m over the image.
     """
     valid = image.valid
     across, down = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]

@@ -17,31 +17,21 @@ from rangeseg_ros.core.significance import OUTLIER
 
 # Rows and columns of the windows of both methods, and of the median before the Sobel operators.
 _WINDOW = 3
-# The farthest window that a boundary looks at.
-_FRAME = 2 * _WINDOW - 1
-# Response of the Sobel operator of 3 x 3 to a step of one: 1 + 2 + 1.
-_SOBEL_GAIN = 4
+_FRAME = 2 * _WINDOW - 1  # the farthest window that a boundary looks at
+_SOBEL_GAIN = 4  # response of the operator of 3 x 3 to a step of one: 1 + 2 + 1
 
 
-def jump_edges(
-    image: RangeImage,
-    method: str,
-    step: ArrayLike,
-    slope: ArrayLike = 0.0,
-    between: ArrayLike = 0.0,
-) -> GridEdges | None:
+def jump_edges(image: RangeImage, method: str, *steps: ArrayLike) -> GridEdges | None:
     """Jump edges by method `plane`, `sobel` or `none`; the first takes the smallest steps."""
     if method == 'plane':
-        return plane_deviation(image, step, slope, between)
-    if method == 'sobel':
-        return sobel(image)
-    return None
+        return plane_deviation(image, *steps)
+    return sobel(image) if method == 'sobel' else None
 
 
 def plane_deviation(
     image: RangeImage, step: ArrayLike, slope: ArrayLike = 0.0, between: ArrayLike = 0.0
 ) -> GridEdges:
-    """Jumps between the planes on either side of a pixel boundary (thesis 2.3, eq. 2.7).
+    """Jumps to the right of pixels (H, W-1) and below (H-1, W) from plane to plane (thesis 2.3).
 
     In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
     adjoining 3 x 3 windows is compared to the steps on either side of it: on a plane all three
@@ -53,23 +43,12 @@ def plane_deviation(
     Where three surfaces meet, two may lie on the same side of the mean: every clear step between
     two pixels is a jump, too, unless the next one continues it, as on a steep face. At corners,
     where the windows hold little of one surface, contours would have gaps: beside candidates, the
-    pixels by themselves are compared as the windows are.
+    pixels by themselves are compared as the windows are. No jump is beside a pixel that was not
+    measured.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    step : float or (rows, columns) float
-        Deviation that makes a jump, 1/m, of all or of every block of 4 x 4 pixels.
-    slope : float or (rows, columns) float
-        Change of the inverse range from pixel to pixel on surfaces, 1/m.
-    between : float or (rows, columns) float
-        As `step`, between two pixels instead of windows; not less than `step`.
-
-    Returns
-    -------
-    horizontal, vertical : (H, W-1), (H-1, W) bool
-        Never true beside a pixel that was not measured.
+    Of all of the image, or of every block of 4 x 4 pixels, in 1/m: the deviation of windows that
+    makes a `step`, that `between` two pixels, if larger, and the `slope` of surfaces, that is the
+    change of the inverse range from pixel to pixel.
     """
     height, width = image.shape
     step, slope, between = (np.asarray(a, np.float32) for a in (step, slope, between))
@@ -182,7 +161,7 @@ def _exceeds(a: float, b: float, c: float, d: float, limit: float) -> tuple[Any,
 
 
 def sobel(image: RangeImage) -> GridEdges:
-    """Edges around thresholded ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
+    """Edges (H, W-1), (H-1, W) around ridges of the depth gradient (thesis 2.2, 2.4, 5.5.2).
 
     Median filter, Sobel operators, the threshold of eq. 2.6, ridge thinning, morphological
     bridging; the pixels of the ridges are disconnected from all of their neighbours. A window that
@@ -190,15 +169,6 @@ def sobel(image: RangeImage) -> GridEdges:
     of depth (section 6.7). But contours must close at a shadow, or what lies before and behind it
     stays connected around its end: bridging counts shadows as edges, and two neighbours are also
     disconnected when the step between them by itself exceeds the threshold, whatever lies around.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-
-    Returns
-    -------
-    horizontal, vertical : (H, W-1), (H-1, W) bool
     """
     valid = image.valid
     with np.errstate(divide='ignore'):
@@ -215,7 +185,6 @@ def sobel(image: RangeImage) -> GridEdges:
     down = (strength >= framed[:-2, 1:-1]) & (strength > framed[2:, 1:-1])
     ridge = np.where(np.abs(gx) >= np.abs(gy), across, down) & (strength > threshold**2)
     pixels = bridge_edges(ridge | ~valid) & valid
-    # A step between two columns or rows responds with the sum of the kernel's one side.
     step = threshold / _SOBEL_GAIN
     horizontal = (np.abs(np.diff(depth, axis=1)) > step) & valid[:, 1:] & valid[:, :-1]
     vertical = (np.abs(np.diff(depth, axis=0)) > step) & valid[1:] & valid[:-1]
@@ -226,34 +195,19 @@ def sobel(image: RangeImage) -> GridEdges:
 
 def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
     """Pixels (H, W) that a jump separates from one of their four neighbours or more."""
-    right, below = (np.pad(edges[0], ((0, 0), (0, 1))), np.pad(edges[1], ((0, 1), (0, 0))))
-    pixels: NDArray[np.bool_] = right | below
-    pixels[:, 1:] |= edges[0]
-    pixels[1:] |= edges[1]
+    right, below = np.pad(edges[0], ((0, 0), (1, 1))), np.pad(edges[1], ((1, 1), (0, 0)))
+    pixels: NDArray[np.bool_] = right[:, 1:] | right[:, :-1] | below[1:] | below[:-1]
     return pixels
 
 
-# The eight neighbours in a circle, as bits, and the offsets of each: (row, column).
-_RING = ((0, 0), (0, 1), (0, 2), (1, 2), (2, 2), (2, 1), (2, 0), (1, 0))
+# Bits of the eight neighbours, and which patterns of them fall apart without the centre.
+_RING = np.array([[1, 2, 4], [8, 0, 16], [32, 64, 128]])
+_PATTERNS = [(_RING & pattern > 0).view(np.uint8) for pattern in range(256)]
+_JOINS = np.array([cv2.connectedComponents(ring)[0] > 2 for ring in _PATTERNS])
 
 
 def bridge_edges(edges: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Add every pixel that joins neighbours which do not touch each other (thesis 2.4)."""
-    kernel = np.zeros((3, 3), np.float32)
-    for bit, position in enumerate(_RING):
-        kernel[position] = 1 << bit
-    pattern = cv2.filter2D(
-        edges.astype(np.uint8), cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT
-    )
+    kernel, pixels = _RING.astype(np.float32), edges.view(np.uint8)
+    pattern = cv2.filter2D(pixels, cv2.CV_16S, kernel, borderType=cv2.BORDER_CONSTANT)
     return edges | _JOINS[pattern]
-
-
-def _joins(pattern: int) -> bool:
-    """Whether the neighbours set in a pattern of eight bits fall apart without the centre."""
-    ring = np.zeros((3, 3), np.uint8)
-    for bit, position in enumerate(_RING):
-        ring[position] = pattern >> bit & 1
-    return cv2.connectedComponents(ring, connectivity=8)[0] > 2
-
-
-_JOINS = np.array([_joins(pattern) for pattern in range(256)])

@@ -18,18 +18,16 @@ from numba.extending import register_jitable
 from numpy.typing import NDArray
 
 SIZE = 13  # of the vector of sums
+# Entries: w y^2, number of pixels, sums of the two variance ratios.
 CHI2, COUNT, RATIO, SLOPE = 9, 10, 11, 12
-"""Entries of a moment vector: w y^2, number of pixels, sums of the two variance ratios."""
-NO_PIXEL = (0.0,) * (CHI2 + 1)
-"""The sums of no pixel, see `plus_pixel`."""
+NO_PIXEL = (0.0,) * (CHI2 + 1)  # see `plus_pixel`
 
 
 @register_jitable
 def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]:
     """Cofactors of the symmetric matrix [[a, b, c], [b, d, e], [c, e, f]], and its determinant.
 
-    Of numbers in kernels, and of arrays. The cofactors are in the order of the arguments; over
-    the determinant they are the inverse.
+    Of numbers in kernels, and of arrays; over the determinant they are the inverse, in that order.
     """
     aa, bb, cc = d * f - e * e, c * e - b * f, b * e - c * d
     dd, ee, ff = a * f - c * c, b * c - a * e, a * d - b * b
@@ -38,11 +36,7 @@ def cofactors(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any) -> tuple[Any, ...]
 
 @njit(cache=True, inline='always')
 def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[Any, Any, Any]:
-    """Ray of a pixel.
-
-    Of a pinhole camera x is the same in all rows and y in all columns: two rows' worth of numbers
-    stay in cache then, and the rest of an image of rays is not read.
-    """
+    """Ray of a pixel; of a pinhole camera from the first row and column, which stay in cache."""
     row, column = (0, 0) if pinhole else (i, j)
     return rays[row, j, 0], rays[i, column, 1], rays[row, j, 2]
 
@@ -51,10 +45,9 @@ def ray_of(rays: NDArray[np.float32], pinhole: bool, i: int, j: int) -> tuple[An
 def plus_pixel(
     sums: tuple[float, ...], x: float, y: float, z: float, inverse: float, weight: float
 ) -> tuple[float, ...]:
-    """The first ten sums of a moment vector with one pixel more: of its ray (x, y, z).
+    """The first ten sums of a moment vector, `NO_PIXEL` at first, with one more ray (x, y, z).
 
-    A tuple, which the compiler keeps in registers: sums in an array would go through memory for
-    every pixel. Begins with `NO_PIXEL`.
+    A tuple, which the compiler keeps in registers, and not in memory as an array.
     """
     a, b, c, d, e, f, p, q, r, square = sums
     wx, wy, wz = weight * x, weight * y, weight * z
@@ -80,17 +73,10 @@ def add_pixel(
     weight: float,
     ratio: float,
 ) -> None:
-    """Add a pixel to a moment vector (13,), but for its count.
+    """Add a pixel, or as many as it stands for, to a moment vector (13,), but for the count.
 
-    Parameters
-    ----------
-    ray : (3,) float32
-    inverse : float
-        Inverse range, 1/m.
-    weight : float
-        1 / random variance of that, times the pixels that it stands for.
-    ratio : float
-        Of the systematic to the random variance, times these.
+    `weight` is 1 / random variance of its inverse range, `ratio` the systematic over the random
+    variance, each times these pixels.
     """
     x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
     for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
@@ -137,19 +123,7 @@ def sums_of(moments: NDArray[np.float64], k: int) -> tuple[float, ...]:
 
 @njit(cache=True, error_model='numpy')
 def fit(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-    """Least-squares plane of a moment vector.
-
-    Parameters
-    ----------
-    moments : (13,) float64
-    theta : (3,) float64
-        Receives the plane; zeros where the pixels do not determine one.
-
-    Returns
-    -------
-    float
-        Weighted sum of the squared residuals.
-    """
+    """Write the plane of moments (13,), or zeros, to theta (3,); sum of the squared residuals."""
     theta[0], theta[1], theta[2], left = plane_of(sums_of(moments.reshape(1, -1), 0))
     return left
 
@@ -165,10 +139,9 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 @njit(cache=True, error_model='numpy')
 def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
-    """Weighted sum of the squared residuals of one plane for two of N moment vectors (N, 13).
+    """What `fit` returns for the sum of two of N moment vectors (N, 13).
 
-    What `fit` returns for their sum, without memory traffic, views and their reference counts:
-    growing spends its time here.
+    Without views and their reference counts: growing spends its time here.
     """
     sums = (
         moments[k, 0] + moments[m, 0],

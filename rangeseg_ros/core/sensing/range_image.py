@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.sensing.camera import OPTICAL, Camera
-from rangeseg_ros.core.sensing.pinhole import axes_of_frame, camera_of, depth_of
+from rangeseg_ros.core.sensing.clouds import axes_of_frame, camera_of, depth_of
 
 
 class RangeImageError(ValueError):
@@ -21,10 +21,8 @@ class UnitWarning(UserWarning):
     """Ranges that look as if they were in another unit."""
 
 
-FAR = 65.0
-"""The farthest that 16 bits of millimetres tell, metres."""
-NOT_MEASURED = 65535
-"""What drivers and data sets write for it beside 0: the largest value of 16 bits."""
+FAR = 65.0  # the farthest that 16 bits of millimetres tell, metres
+NOT_MEASURED = 65535  # what drivers and data sets write for it beside 0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,14 +56,11 @@ class RangeImage:
 
     def __repr__(self) -> str:
         kind = 'organised cloud' if self.camera is None else 'depth image'
-        measured = self.inverse[self.valid]
-        if not len(measured):
-            return f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, nothing measured>'
-        return (
-            f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, '
-            f'{measured.size / self.inverse.size:.0%} measured, '
-            f'{1 / measured.max():.3g} to {1 / measured.min():.3g} m>'
-        )
+        measured, said = self.inverse[self.valid], 'nothing measured'
+        if len(measured):
+            said = f'{measured.size / self.inverse.size:.0%} measured, '
+            said += f'{1 / measured.max():.3g} to {1 / measured.min():.3g} m'
+        return f'<RangeImage {self.shape[1]}x{self.shape[0]}, {kind}, {said}>'
 
     @classmethod
     def from_depth(
@@ -106,10 +101,10 @@ class RangeImage:
             raise RangeImageError(
                 f'depth image must be uint16, int16, int32 or float, not {array.dtype}'
             )
+        height, width = array.shape
         if array.shape != camera.shape:
             raise RangeImageError(
-                f'depth image is {array.shape[1]}x{array.shape[0]}, '
-                f'its camera {camera.width}x{camera.height}'
+                f'depth image is {width}x{height}, its camera {camera.width}x{camera.height}'
             )
         if scale is None:
             scale = 0.001 if integers else 1.0
@@ -167,57 +162,34 @@ class RangeImage:
             known &= ~hidden.any(axis=2)
         camera = camera_of(array, known)
         if camera is not None:
-            image = cls.from_depth(np.where(known, depth_of(array, camera), 0), camera)
-        else:
-            cloud = np.where(known[..., None], array, 0).astype(np.float64)
-            with np.errstate(over='ignore'):
-                inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
-            rays = (cloud * inverse[..., None]).astype(np.float32)
-            # Like those of cameras, or every kernel that reads them is compiled twice.
-            rays.flags.writeable = False
-            image = cls(rays, inverse)
-            image._doubt_unit('points')
+            return cls.from_depth(np.where(known, depth_of(array, camera), 0), camera)
+        cloud = np.where(known[..., None], array, 0).astype(np.float64)
+        with np.errstate(over='ignore'):
+            inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
+        rays = (cloud * inverse[..., None]).astype(np.float32)
+        # Like those of cameras, or every kernel that reads them is compiled twice.
+        rays.flags.writeable = False
+        image = cls(rays, inverse)
+        image._doubt_unit('points')
         return image
 
     def dithered(self, sigma: float, seed: int) -> RangeImage:
-        """Copy with Gaussian noise on the ranges (thesis 6.7.1).
-
-        Parameters
-        ----------
-        sigma : float
-            Standard deviation, metres.
-        seed : int
-            Of the noise.
-        """
+        """Copy with Gaussian noise of this standard deviation, metres, on the ranges (6.7.1)."""
         noise = np.random.default_rng(seed).normal(0.0, sigma, self.shape)
         with np.errstate(divide='ignore'):
             return replace(self, inverse=_reciprocal(1 / self.inverse + noise, 1.0))
 
     def without(self, body: NDArray[np.bool_]) -> RangeImage:
-        """Copy without the measurements of the robot's own body.
-
-        Parameters
-        ----------
-        body : (H, W) bool
-            True where the image shows it.
-
-        Raises
-        ------
-        RangeImageError
-            The image has another size.
-        """
+        """Copy without the pixels that show the robot's own body: (H, W), of the image's size."""
+        (height, width), (rows, columns) = body.shape, self.shape
         if body.shape != self.shape:
-            raise RangeImageError(
-                f'the mask is {body.shape[1]}x{body.shape[0]}, '
-                f'the image {self.shape[1]}x{self.shape[0]}'
-            )
+            raise RangeImageError(f'the mask is {width}x{height}, the image {columns}x{rows}')
         return replace(self, inverse=np.where(body, np.float32(0), self.inverse), body=body)
 
     @property
     def beyond_reach(self) -> bool:
         """Whether more than half of what was measured is beyond any depth camera's reach."""
-        far = self.valid & (self.inverse < 1 / FAR)
-        return bool(2 * np.count_nonzero(far) > np.count_nonzero(self.valid))
+        return bool(2 * np.count_nonzero(self.inverse[self.valid] < 1 / FAR) > self.valid.sum())
 
     def _doubt_unit(self, measured: str) -> None:
         if self.beyond_reach:

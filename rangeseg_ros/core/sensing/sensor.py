@@ -17,46 +17,25 @@ _LINE = 2 * float(np.sqrt(np.pi))
 
 
 class SensorModel(NamedTuple):
-    """Error of the inverse range of a pixel, 1/m.
+    """Standard deviations of the error of a pixel, of the inverse range (1/m) and the range (m).
 
     A structured-light sensor's error is about constant in disparity, hence in inverse range; a
     laser's is constant in range. Each part is the root of the squares of both kinds.
-
-    Attributes
-    ----------
-    noise : float
-        Random error of the inverse range, standard deviation, 1/m.
-    range_noise : float
-        Random error of the range, metres.
-    white : float
-        Share of the random variance that is new in every pixel, like quantisation.
-    correlation : float
-        Width of the Gaussian kernel the rest looks smoothed with, pixels; 0 for white noise.
-    distortion : float
-        Smooth systematic error of the inverse range, standard deviation, 1/m.
-    range_distortion : float
-        Smooth systematic error of the range, metres.
-    distortion_length : float
-        Width of the Gaussian kernel the distortion is smoothed with at most, pixels: as stated.
-    column_noise, row_noise : float
-        Random error of a pixel's direction, along its row and down its column, pixels: what
-        surfaces seen at a grazing angle are noisier by.
-    quantum : float
-        Step that the inverse range is rounded to, 1/m; 0 for none.
-    range_quantum : float
-        Step that the range is rounded to, metres.
     """
 
-    noise: float
+    noise: float  # random
     range_noise: float
-    white: float
-    correlation: float
-    distortion: float
+    white: float  # share of the random variance that is new in every pixel, like quantisation
+    correlation: float  # width of the Gaussian the rest looks smoothed with, pixels; 0 for white
+    distortion: float  # systematic, smooth
     range_distortion: float
-    distortion_length: float
+    distortion_length: (
+        float  # width of the Gaussian it is smoothed with at most, pixels, as stated
+    )
+    # Random error of a pixel's direction, pixels: what surfaces at grazing angles are noisier by.
     column_noise: float = 0.0
     row_noise: float = 0.0
-    quantum: float = 0.0
+    quantum: float = 0.0  # step that the inverse range is rounded to, 0 for none
     range_quantum: float = 0.0
 
     @classmethod
@@ -114,23 +93,26 @@ class SensorModel(NamedTuple):
         )
 
     def __str__(self) -> str:
-        """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ...
-
-        Correlated over as many pixels as the correlation along a line sums to.
-        """
-        said = _listed(('noise', self.noise, '1/m'), ('range noise', self.range_noise, 'm'))
+        """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ..."""
+        errors = (
+            ('noise', self.noise, '1/m'),
+            ('range noise', self.range_noise, 'm'),
+            ('distortion', self.distortion, '1/m'),
+            ('range distortion', self.range_distortion, 'm'),
+            ('steps of', self.quantum, '1/m'),
+            ('steps of', self.range_quantum, 'm'),
+        )
+        said = [f'{name} {value:.2g} {unit}' for name, value, unit in errors if value > 0]
+        # Over as many pixels as the correlation along a line sums to.
         if self.white < 0.5 and _LINE * self.correlation > 1:
             said.insert(1, f'correlated over {_LINE * self.correlation:.0f} px')
-        smooth = ('distortion', self.distortion, '1/m')
-        said += _listed(smooth, ('range distortion', self.range_distortion, 'm'))
-        steps = ('steps of', self.quantum, '1/m'), ('steps of', self.range_quantum, 'm')
-        return ', '.join(said + _listed(*steps))
+        return ', '.join(said)
 
     @property
     def patch(self) -> float:
-        """Pixels that count as one measurement of the labelling, which compares neighbours.
+        """Variance of the mean of 2 x 2 pixels over that of white noise, 1 to 4.
 
-        The variance of the mean of 2 x 2 pixels over that of white noise: 1 to 4.
+        So many pixels count as one measurement of the labelling, which compares neighbours.
         """
         if self.correlation == 0:
             return 1.0
@@ -144,10 +126,7 @@ class SensorModel(NamedTuple):
 
     @property
     def distortion_pixels(self) -> float:
-        """Pixels of a square as wide as the distortion, of which a twelfth of its variance shows.
-
-        Smaller regions meet one value of it, larger ones all of it.
-        """
+        """Pixels of a square as wide as the distortion: smaller regions meet one value of it."""
         return self.distortion_length**2
 
     @property
@@ -158,34 +137,18 @@ class SensorModel(NamedTuple):
         return self.white + (1 - self.white) * correlated_residuals(self.correlation)[3]
 
 
-def _listed(*errors: tuple[str, float, str]) -> list[str]:
-    """Those that there are."""
-    return [f'{name} {value:.2g} {unit}' for name, value, unit in errors if value > 0]
-
-
 def length_of_distortion(stated: float, shape: tuple[int, int]) -> float:
-    """Width of the distortion in images (H, W), pixels: as stated, or for 0 as the image is large.
-
-    35 of VGA are 3 degrees of a Kinect.
-    """
+    """Width of the distortion in images (H, W), pixels: as stated; 0 is 3 degrees of a Kinect."""
     return stated or 35 * float(np.sqrt(shape[0] * shape[1] / VGA))
 
 
 @cache
 def correlated_residuals(width: float) -> tuple[float, float, float, float]:
-    """What planes through blocks leave of correlated noise of unit variance.
+    """What planes through blocks of 4, 8 and 16 pixels leave of correlated noise of unit variance.
 
-    Parameters
-    ----------
-    width : float
-        Of the Gaussian kernel it looks smoothed with, pixels: two pixels d apart correlate by
-        exp(-d^2 / (4 width^2)).
-
-    Returns
-    -------
-    tuple of 4 float
-        Mean square residual, for each degree of freedom, within blocks of 4, 8 and 16 pixels; and
-        what one plane through four blocks of 4 pixels leaves beyond the planes of the four.
+    Mean square for each degree of freedom; last, what one plane through four blocks of 4 pixels
+    leaves beyond the planes of the four. The noise looks smoothed with a Gaussian of this width:
+    two pixels d apart correlate by exp(-d^2 / (4 width^2)).
     """
     left = []
     for side in (4, 8, 16):
@@ -207,7 +170,7 @@ _SHARE, _EXPONENT = 0.15, 0.78
 
 @njit(cache=True, inline='always')
 def distortion_share(pixels: float, smooth: float) -> float:
-    """Mean square that a plane leaves of a region of so many pixels, in variances of distortion.
+    """Mean square that a plane leaves of so many pixels, in variances of the distortion.
 
     `smooth` are the `distortion_pixels` of the sensor.
     """

@@ -11,37 +11,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.enlargement import enlargement
+from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
 
-_SIGNIFICANT = 5.0
-"""Standard errors that a statistic of an image must differ by, not to be chance in any image."""
+# Logarithm of the odds at which one reading of an image is believed and not the other.
 _ODDS = float(np.log(1e4))
-"""Logarithm of the odds at which one reading of an image is believed and not the other."""
+# By which the bends of real planes differ, of that of a plane whose range is taken for depth.
 _SPREAD = 0.2
-"""By which the bends of real planes differ, of that of a plane whose range is taken for depth."""
-_FEWEST = 40
-"""Pixels that tell the bend of a plane."""
-_SAMPLE = 5000
-"""Pixels that stand for an image."""
+_FEWEST = 40  # pixels that tell the bend of a plane
+_SAMPLE = 5000  # pixels that stand for an image
+# Step of the inverse depth of a Kinect, 1/m: an eighth of a pixel at 580 px and 75 mm.
 _KINECT_STEP = 1 / (8 * 580 * 0.075)
-"""Step of the inverse depth of a Kinect, 1/m: an eighth of a pixel at 580 px and 75 mm."""
+# Quotients of the units that files have: 1/1000, 1/5000 and 1/10000 m, and metres.
 _WRONG_UNITS = (5.0, 0.2, 10.0, 0.1, 1000.0, 0.001)
-"""Quotients of the units that files have: 1/1000, 1/5000 and 1/10000 m, and metres."""
+# Reasons for which every metric result is wrong, not only less certain.
+_INVALID = {'range instead of z', 'scale improbable', 'millimetres in floats'}
 
 
 class Verdict(NamedTuple):
-    """What is doubtful about an image.
-
-    Attributes
-    ----------
-    reasons : tuple of str
-        Such as `enlarged x 4`, `filled 12 %`, `range instead of z`, `scale improbable`,
-        `millimetres in floats`, `curved scene`, `distortion not identifiable`; empty where
-        nothing is.
-    details : tuple of str
-        A sentence for each.
-    """
+    """What is doubtful about an image: reasons such as `filled 12 %`, and a sentence for each."""
 
     reasons: tuple[str, ...] = ()
     details: tuple[str, ...] = ()
@@ -54,13 +42,10 @@ class Verdict(NamedTuple):
     @property
     def invalid(self) -> bool:
         """Whether every metric result is wrong, not only less certain."""
-        return any(reason in _INVALID for reason in self.reasons)
+        return not _INVALID.isdisjoint(self.reasons)
 
     def __str__(self) -> str:
         return ' '.join(self.details) or 'trusted'
-
-
-_INVALID = ('range instead of z', 'scale improbable', 'millimetres in floats')
 
 
 def judge(
@@ -70,19 +55,10 @@ def judge(
     curved: NDArray[np.uint16] | None = None,
     identified: bool = True,
 ) -> Verdict:
-    """Look for what makes an image doubtful.
+    """Look for what makes an image doubtful in which planes, label -> theta (3,), were found.
 
-    Parameters
-    ----------
-    image : RangeImage
-    labels : (H, W) uint16
-        Of what was found in it.
-    planes : mapping of int to (3,) float64
-        Label -> theta, theta . ray = inverse.
-    curved : (H, W) uint16, optional
-        Not 0 on surfaces that are smooth and no planes.
-    identified : bool
-        False where the image was to tell the errors of the sensor and does not.
+    `curved` (H, W) is not 0 on surfaces that are smooth and no planes; `identified` is False where
+    the image was to tell the errors of the sensor and does not.
     """
     found: dict[str, str] = {}
     if cells := enlargement(image):
@@ -123,10 +99,9 @@ def judge(
 
 
 def filled_share(image: RangeImage) -> float:
-    """Share of the pixels that copy a neighbour up to an edge, more than do so from there on.
+    """Share of the pixels that copy a neighbour up to a jump, more than do so from there on.
 
-    Filters that fill holes continue a pixel to the far side of the hole: runs of equal values end
-    at jumps, and do not begin there. Steps of the sensor make as many of either.
+    Filters that fill holes continue a pixel to their far side; steps of the sensor do either.
     """
     if image.camera is None:
         return 0.0
@@ -141,7 +116,7 @@ def filled_share(image: RangeImage) -> float:
         ending, beginning = ending[ending > 3], beginning[beginning > 3]
         for one, other in ((ending, beginning), (beginning, ending)):
             excess = len(one) - len(other)
-            certain = excess > _SIGNIFICANT * (len(one) + len(other)) ** 0.5
+            certain = excess > SIGNIFICANT * (len(one) + len(other)) ** 0.5
             if certain and one.sum() > 2 * other.sum():
                 most = max(most, float(one.sum() - other.sum()) / measured)
     return most

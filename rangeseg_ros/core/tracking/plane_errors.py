@@ -12,44 +12,30 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.significance import chi2_quantile
 
+# Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one.
 GATE = chi2_quantile(3)
-"""Chi-squared, with the three degrees of freedom of a plane, up to which two planes may be one."""
+# What planes of one surface differ by from frame to frame beyond their covariances, as their
+# pixels are not the same: an offset, as share of the range (of 2 m, half of what the distortion of
+# a Kinect is there), and an angle, at least and for an offset over half of the plane's width.
 OFFSET, ANGLE = 0.007, np.radians(1.0)
-"""What planes of one surface differ by from frame to frame beyond their covariances.
-
-Their pixels are not the same: an offset, as share of the range (of 2 m, half of what the
-distortion of a Kinect is there), and an angle, at least and for an
-offset over half of the plane's width.
-"""
+# Half the width that a plane counts with at least, metres, so that what it tilts by is finite.
 NARROWEST = 0.01
-"""Half the width that a plane counts with at least, metres, so that what it tilts by is finite."""
+# Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
+# Beyond is no error of the sensor but another plane, however uncertain both are.
 SURE_TURN, FARTHEST = np.radians(15.0), 0.1
-"""Largest angle, and offset as share of the range, of what may be one plane from frame to frame.
-
-Beyond is no error of the sensor but another plane, however uncertain both are.
-"""
 
 
 def candidates(
     first: tuple[NDArray[np.float64], NDArray[np.float64]],
     second: tuple[NDArray[np.float64], NDArray[np.float64]],
     reach: NDArray[np.float64],
-    turn: float = SURE_TURN,
 ) -> NDArray[np.bool_]:
     """(N, M) which planes are near enough in angle and offset to be asked of the gate.
 
-    Parameters
-    ----------
-    first : ((N, 3), (N,)) float64
-        Normals and distances.
-    second : ((M, 3), (M, 3)) float64
-        Normals and points on the planes, metres.
-    reach : (M,) float64
-        Distances of these points from the camera, metres.
-    turn : float
-        Largest angle, radians.
+    Of the first, normals (N, 3) and distances (N,); of the second, normals and points (M, 3) on
+    the planes, which are so far (M,) from the camera, metres.
     """
-    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(turn)
+    near: NDArray[np.bool_] = first[0] @ second[0].T > np.cos(SURE_TURN)
     return near & (np.abs(first[0] @ second[1].T + first[1][:, None]) < FARTHEST * reach)
 
 
@@ -60,15 +46,8 @@ def with_floor(
 ) -> NDArray[np.float64]:
     """Covariances (K, 3, 3) of differences, with what planes of one surface differ by anyway.
 
-    Parameters
-    ----------
-    spread : (K, 3, 3) float64
-        Where both planes are looked at, so that c is independent of a and b.
-    reach : (K,) float64
-        Distances from the camera, metres.
-    width : (K,) float64
-        Half of that of the narrower plane, metres. Planes of a map are not as narrow as one frame
-        shows them.
+    Where both are looked at, so that c is independent of a and b, so far from the camera. `width`
+    is half of that of the narrower plane; those of a map are not as narrow as one frame shows.
     """
     result = spread.copy()
     offset = (OFFSET * reach) ** 2

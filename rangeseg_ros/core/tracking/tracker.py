@@ -9,6 +9,7 @@ camera and is found again where it should be.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +19,15 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.rotations import rotation_by
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
+    NARROWEST,
     by_motion,
+    candidates,
+    congruent,
     mahalanobis,
-)
-from rangeseg_ros.core.tracking.tracks import (
-    Tracks,
-    differences,
-    near_planes,
+    moved_plane,
+    tangents,
+    to_errors,
+    with_floor,
 )
 
 # Intersection over union that planes in reach of each other count with, beside what they have: a
@@ -35,8 +38,72 @@ _UNSEEN_OVERLAP = 0.1
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
 # The equations of the motion are linear in it.
 _MOTION_ROUNDS = 3
+# Rows or columns, whichever are fewer, at which overlap is looked at: a plane of the least size
+# has about eight samples in a 640 x 480 image.
+_SAMPLES = 60
 Motion = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Rotation (3, 3) and shift (3,) that take points of one frame to another."""
+
+
+class Tracks(NamedTuple):
+    """N planes in the frame of the camera."""
+
+    id: NDArray[np.int64]
+    surface: NDArray[np.int64]
+    plane: NDArray[np.float64]  # (N, 4), normals and distances
+    covariance: NDArray[np.float64]  # (N, 4, 4)
+    centroid: NDArray[np.float64]  # (N, 3)
+    width: NDArray[np.float64]  # half of that of the rectangle around each plane, metres
+    reach: NDArray[np.float64]  # half of its diagonal
+    unseen: NDArray[np.float64]  # seconds since they were last seen
+    mask: NDArray[np.float32]  # (N, S), in which samples of the label image that was
+
+    @classmethod
+    def of(cls, planes: Sequence[Plane], labels: NDArray[np.uint16]) -> Tracks:
+        """Planes seen now in a label image (H, W), without ids (0)."""
+        step = max(min(labels.shape) // _SAMPLES, 1)
+        coarse = labels[step // 2 :: step, step // 2 :: step].ravel()
+        own = np.array([p.label for p in planes], np.uint16)
+        extents = np.array([p.extents for p in planes], np.float64).reshape(-1, 2)
+        return cls(
+            np.zeros(len(planes), np.int64),
+            np.zeros(len(planes), np.int64),
+            np.array([[*p.normal, p.distance] for p in planes], np.float64).reshape(-1, 4),
+            np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4),
+            np.array([p.centroid for p in planes], np.float64).reshape(-1, 3),
+            np.maximum(extents.min(axis=1, initial=np.inf) / 2, NARROWEST),
+            np.asarray(np.linalg.norm(extents, axis=1)) / 2,
+            np.zeros(len(planes)),
+            (coarse == own[:, None]).astype(np.float32),
+        )
+
+    @property
+    def size(self) -> NDArray[np.float32]:
+        """(N,) number of samples of each plane."""
+        return self.mask.sum(axis=1)
+
+    @property
+    def range(self) -> NDArray[np.float64]:
+        """(N,) distances of the centroids from the camera, metres."""
+        return np.asarray(np.linalg.norm(self.centroid, axis=1))
+
+    def moved(self, rotation: NDArray[np.float64], shift: NDArray[np.float64]) -> Tracks:
+        """The planes in a frame in which x is at rotation x + shift."""
+        jacobian = moved_plane(rotation, shift)
+        return self._replace(
+            plane=self.plane @ jacobian.T,
+            covariance=congruent(jacobian, self.covariance),
+            centroid=self.centroid @ rotation.T + shift,
+        )
+
+    def where(self, chosen: NDArray[np.bool_]) -> Tracks:
+        """Some of the planes."""
+        return Tracks._make(part[chosen] for part in self)
+
+    def joined(self, others: Tracks) -> Tracks:
+        """These planes followed by others."""
+        pairs: Any = zip(self, others, strict=True)
+        return Tracks._make(np.concatenate(pair) for pair in pairs)
 
 
 class Tracker:
@@ -52,17 +119,8 @@ class Tracker:
     becomes the id of the surface, the lowest that any part has had, which persists when that
     part goes out of sight and others stay.
 
-    No id is ever given twice in the life of a tracker, and the same input gives the same ids.
-
-    Parameters
-    ----------
-    config : Config, optional
-        `track_time`, `camera_turn` and `camera_speed`.
-
-    Examples
-    --------
-    >>> tracker = Tracker()
-    >>> planes = tracker.track(result.labels, result.planes, stamp)
+    No id is ever given twice in the life of a tracker, and the same input gives the same ids. Of
+    the parameters, `track_time`, `camera_turn` and `camera_speed` count.
     """
 
     def __init__(self, config: Config | None = None) -> None:
@@ -83,25 +141,11 @@ class Tracker:
         stamp: int,
         motion: Motion | None = None,
     ) -> list[Plane]:
-        """The planes of the next frame with their ids.
+        """The planes of the next frame, of labels (H, W), with their `id` and `surface`.
 
-        Parameters
-        ----------
-        labels : (H, W) uint16
-            0 = no plane.
-        planes : sequence of Plane
-            As `Segmenter` returns them with `labels`.
-        stamp : int
-            Time of the frame, nanoseconds, not before that of the last one. A frame of another
-            size starts anew: nothing known is matched to it.
-        motion : (3, 3) and (3,) float64, optional
-            Rotation and shift that take points of the last frame to this one, where they are
-            known; the planes tell the rest.
-
-        Returns
-        -------
-        list of Plane
-            In the order given, `id` and `surface` set.
+        `stamp` is in nanoseconds, and not before that of the last frame. A frame of another size
+        starts anew: nothing known is matched to it. `motion` takes points of the last frame to
+        this one, where it is known; the planes tell the rest.
         """
         if labels.shape != self._shape:
             self.reset()
@@ -110,7 +154,12 @@ class Tracker:
         seen = Tracks.of(planes, labels)
         known = self._tracks or Tracks.of([], labels)
         shared = known.mask @ seen.mask.T
-        known = self._with_camera(known, seen, shared, elapsed, motion)
+        # Planes that were in sight and have half of their pixels in common.
+        sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
+        sure &= (known.unseen == 0)[:, None] & _near(known, seen)
+        speed = np.repeat([np.radians(self.config.camera_turn), self.config.camera_speed], 3)
+        prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
+        known = known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, motion))
         seen.id[:] = _assign(known, seen, shared)
         new = seen.id == 0
         seen.id[new] = self._next + np.arange(new.sum())
@@ -119,29 +168,8 @@ class Tracker:
         lost = ~np.isin(known.id, seen.id)
         known.unseen[:] += elapsed
         self._tracks = seen.joined(known.where(lost & (known.unseen <= self.config.track_time)))
-        return [
-            plane.named(id=i, surface=surface)
-            for plane, i, surface in zip(
-                planes, seen.id.tolist(), seen.surface.tolist(), strict=True
-            )
-        ]
-
-    def _with_camera(
-        self,
-        known: Tracks,
-        seen: Tracks,
-        shared: NDArray[np.float32],
-        elapsed: float,
-        told: Motion | None,
-    ) -> Tracks:
-        """Known planes in the frame of the camera as it is now."""
-        config = self.config
-        # Planes that were in sight and have half of their pixels in common.
-        sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
-        sure &= (known.unseen == 0)[:, None] & near_planes(known, seen)
-        speed = np.repeat([np.radians(config.camera_turn), config.camera_speed], 3)
-        prior = (min(max(elapsed, NOMINAL), PERSISTENCE) * speed) ** -2.0
-        return known.moved(*_camera_motion(known, seen, np.nonzero(sure), prior, told))
+        names = zip(planes, seen.id.tolist(), seen.surface.tolist(), strict=True)
+        return [plane.named(id=i, surface=surface) for plane, i, surface in names]
 
     def _surfaces(self, planes: Sequence[Plane], seen: Tracks, known: Tracks) -> list[int]:
         """Ids of the surfaces that the planes lie on: the lowest that any part of them has had."""
@@ -154,18 +182,43 @@ class Tracker:
             own = seen.id[members].tolist()
             claim = min(before.get(i, i) for i in own)
             # Of surfaces that come apart, the one with the plane that gave the id keeps it.
-            claims.append((claim not in own, -sum(planes[n].count for n in members), members))
+            pixels = sum(planes[n].count for n in members)
+            claims.append((claim not in own, -pixels, members, (claim, min(own))))
         taken: set[int] = set()
         surfaces = [0] * len(planes)
-        for _, _, members in sorted(claims):
-            own = seen.id[members].tolist()
-            free = [i for i in (min(before.get(i, i) for i in own), min(own)) if i not in taken]
+        for _, _, members, wanted in sorted(claims):
+            free = [i for i in wanted if i not in taken]
             surface = free[0] if free else self._next
             self._next += surface == self._next
             taken.add(surface)
             for n in members:
                 surfaces[n] = surface
         return surfaces
+
+
+def _near(known: Tracks, seen: Tracks) -> NDArray[np.bool_]:
+    """(T, N) see `candidates`."""
+    first, second = (known.plane[:, :3], known.plane[:, 3]), (seen.plane[:, :3], seen.centroid)
+    return candidates(first, second, seen.range)
+
+
+def _differences(
+    known: Tracks, seen: Tracks, t: NDArray[np.intp], s: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """What planes `s` (K,) seen differ by from known planes `t`, at the centroids of the former.
+
+    As errors (K, 3) of the known planes, with covariances (K, 3, 3), tangents (K, 2, 3) of the
+    known planes, and the points (K, 3) that were looked at.
+    """
+    normal, place = known.plane[t, :3], seen.centroid[s]
+    axes = tangents(normal)
+    offset = (normal * place).sum(axis=1) + known.plane[t, 3]
+    point = place - offset[:, None] * normal
+    local = to_errors(axes, point)
+    gap = (local @ seen.plane[s][..., None])[..., 0]
+    spread = congruent(local, known.covariance[t] + seen.covariance[s])
+    width = np.minimum(known.width[t], seen.width[s])
+    return gap, with_floor(spread, seen.range[s], width), axes, point
 
 
 def _camera_motion(
@@ -178,15 +231,14 @@ def _camera_motion(
     """Motion of the known planes to those that are seen, of sure pairs of them.
 
     Gauss-Newton steps for the turn and the shift, weighted by the covariances of the pairs; those
-    that fit badly (things that move by themselves) count less. Directions in which the planes
-    leave the motion open are held by a prior, with the inverse variances `prior` (6,): the motion
-    that was told, or none. Weights are relative to the
-    median misfit, so that a wrong motion is corrected.
+    that fit badly (things that move by themselves) count less. Weights are relative to the median
+    misfit, so that a wrong motion is corrected. Directions in which the planes leave the motion
+    open are held by a prior, with the inverse variances `prior` (6,): the motion told, or none.
     """
     t, s = pairs
     rotation, shift = told or (np.eye(3), np.zeros(3))
     for _ in range(_MOTION_ROUNDS if len(t) else 0):
-        gap, spread, axes, point = differences(known.moved(rotation, shift), seen, t, s)
+        gap, spread, axes, point = _differences(known.moved(rotation, shift), seen, t, s)
         design = by_motion(np.cross(axes[:, 0], axes[:, 1]), axes, point)
         value = mahalanobis(gap, spread)
         weight = 1 / (1 + value / (4 * max(float(np.median(value)), 1)))
@@ -205,8 +257,8 @@ def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.float32]) -> NDArray
 
     between = np.linalg.norm(known.centroid[:, None] - seen.centroid, axis=2)
     near = (shared > 0) | (between < np.add.outer(known.reach, seen.reach))
-    t, s = np.nonzero(near & near_planes(known, seen))
-    gap, spread, _, _ = differences(known, seen, t, s)
+    t, s = np.nonzero(near & _near(known, seen))
+    gap, spread, _, _ = _differences(known, seen, t, s)
     value = mahalanobis(gap, spread)
     fits = value < GATE
     t, s, value = t[fits], s[fits], value[fits]

@@ -1,9 +1,10 @@
-"""The camera of an organised cloud, where its points show one, and where it is in their frame."""
+"""What the points of an organised cloud tell of its sensor: its camera, its axes, and its rays."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,39 +15,27 @@ from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, CameraError
 # To which intrinsics are rounded, pixels: frames of a sensor share a camera. A power of two, as
 # numbers of few decimals are never halfway between two of these.
 _STEP = 2.0**-10
-# The same of quaternions: 0.001 pixels in the middle of an image of 1000.
-_TURN = 2.0**-20
+_TURN = 2.0**-20  # the same of quaternions: 0.001 pixels in the middle of an image of 1000
 # The same of places, metres: 0.001 pixels of a focal length of 1000, a metre away.
 _PLACE = 2.0**-20
 _ORIGIN = (0.0, 0.0, 0.0)
-# Largest error of the camera, pixels: less than any sensor's.
-_CLOSE = 0.01
+_CLOSE = 0.01  # largest error of the camera, pixels: less than any sensor's
 # Largest standard deviation of a camera's place over its distance from what it sees: half a degree
 # of the rays. Rounding leaves 1e-5 of what has any depth, and 1 of a plane or of parallel rays.
 _PLACED = 0.01
-# Rows and columns of the sample that the camera is estimated from, about.
-_SAMPLES = 64
+_SAMPLES = 64  # rows and columns of the sample that the camera is estimated from, about
+_DEGREE = 6  # of the polynomial: unit vectors over 120 degrees, to a hundredth of a pixel
+_GRID = 80  # rows and columns of the grid of pixels that it is fitted to, at most
+_SMOOTH = 0.5  # largest error, in pixels, of a grid that is smooth
 
 
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
-    """The pinhole camera that points lie on the rays of.
+    """The pinhole camera that points (H, W, 3), metres, lie on the rays of where valid (H, W).
 
     In its optical frame x / z is linear in the column then, and y / z in the row. Lenses and
-    scanners bend the lines by far more than what is let pass.
-
-    Parameters
-    ----------
-    points : (H, W, 3) float
-        In a frame of any axes, metres. The camera is at its origin where points tell no other
-        place, as those of a single plane.
-    valid : (H, W) bool
-        Which of them were measured.
-
-    Returns
-    -------
-    Camera or None
-        None where points lie on no such rays, or fill less than half of the rows or columns:
-        rays of the others would be guessed.
+    scanners bend the lines by far more than what is let pass. The camera is at the origin where
+    points tell no other place, as those of a single plane. None where points lie on no such rays,
+    or fill less than half of the rows or columns: rays of the others would be guessed.
     """
     height, width = valid.shape
     # Odd steps, as holes come in every second row or column.
@@ -62,8 +51,8 @@ def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera 
         columns, rows = _fitted_line(u, x / z, width), _fitted_line(v, y / z, height)
         if columns is None or rows is None:
             continue
-        lens = columns[0], rows[0], columns[1], rows[1]
-        camera = _camera(width, height, lens, turn, place)
+        focal, centre = zip(columns, rows, strict=True)
+        camera = _camera(width, height, *focal, *centre, turn=turn, place=place)
         if camera is not None and _on_rays(points, valid, camera):
             return camera
     return None
@@ -80,26 +69,61 @@ def depth_of(points: NDArray[np.floating], camera: Camera) -> NDArray[np.floatin
 
 
 def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """(3, 3) which axes of a cloud's frame are right, down and forward in it, as columns.
+    """(3, 3) which axes of a cloud's frame are nearest to right, down and forward, as columns.
 
-    Those nearest to them: which way a scanner looks is nothing exact.
-
-    Parameters
-    ----------
-    rays : (H, W, 3) float32
-        Unit vectors.
-    valid : (H, W) bool
-        Where they are known.
+    Of unit rays (H, W, 3) that are known where valid (H, W).
     """
     width = valid.shape[1]
-    # Of a scanner that turns all the way, the other half looks back.
     across = max(width // _SAMPLES, 1)
+    # Of a scanner that turns all the way, the other half looks back.
     front = slice(width // 4, width - width // 4, across)
     forward = _nearest_axis(rays[:, front][valid[:, front]].sum(axis=0, dtype=np.float64))
     both = (valid[1:] & valid[:-1])[:, ::across]
     steps = np.diff(rays[:, ::across], axis=0)[both].sum(axis=0, dtype=np.float64)
     down = _nearest_axis(steps, forward)
     return np.stack([np.cross(down, forward), down, forward], axis=1)
+
+
+def completed_rays(
+    rays: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
+    """Rays (H, W, 3) of a cloud, with unit vectors between others where they are not valid (H, W).
+
+    They change so smoothly over the grid that a polynomial through the others tells them; None
+    where they do not. And the pixels with measured ones on either side, in their row or column:
+    beyond these, a polynomial goes anywhere.
+    """
+    down, across = (max(size // _GRID, 1) for size in valid.shape)
+    v, u = np.nonzero(valid[::down, ::across])
+    v, u = v * down, u * across
+    neighbours = valid[:, 1:] & valid[:, :-1]
+    if len(v) < 10 * (_DEGREE + 1) ** 2 or not neighbours.any():
+        return None
+    known = rays[v, u].astype(np.float64)
+    basis = _basis(v, u, valid.shape)
+    coefficients = np.linalg.lstsq(basis, known, rcond=None)[0]
+    error = np.linalg.norm(basis @ coefficients - known, axis=1)
+    pixel = np.median(np.linalg.norm(np.diff(rays, axis=1)[neighbours], axis=1))
+    if np.quantile(error, 0.95) > _SMOOTH * pixel:
+        return None
+    between = np.zeros_like(valid)
+    for axis in (0, 1):
+        before = np.logical_or.accumulate(valid, axis)
+        between |= before & np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis), axis)
+    v, u = np.nonzero(between & ~valid)
+    completed = rays.copy()
+    found = _basis(v, u, valid.shape) @ coefficients
+    completed[v, u] = found / np.linalg.norm(found, axis=1, keepdims=True)
+    return completed, between
+
+
+def _basis(
+    rows: NDArray[np.intp], columns: NDArray[np.intp], shape: tuple[int, int]
+) -> NDArray[np.floating]:
+    """(N, M) Chebyshev polynomials of both coordinates."""
+    v, u = (2 * x / max(size - 1, 1) - 1 for x, size in zip((rows, columns), shape, strict=True))
+    basis: NDArray[np.floating] = np.polynomial.chebyshev.chebvander2d(v, u, [_DEGREE, _DEGREE])
+    return basis
 
 
 def _nearest_axis(
@@ -111,10 +135,7 @@ def _nearest_axis(
 
 
 def _candidate_frames(
-    points: NDArray[np.float64],
-    u: NDArray[np.intp],
-    v: NDArray[np.intp],
-    shape: tuple[int, int],
+    points: NDArray[np.float64], u: NDArray[np.intp], v: NDArray[np.intp], shape: tuple[int, int]
 ) -> Iterator[tuple[tuple[float, ...], tuple[float, ...]]]:
     """Turns and places of cameras that points (N, 3) of pixels may be from.
 
@@ -202,16 +223,10 @@ def _fitted_line(
 
 
 @lru_cache(maxsize=4)
-def _camera(
-    width: int,
-    height: int,
-    lens: tuple[float, float, float, float],
-    turn: tuple[float, ...],
-    place: tuple[float, ...],
-) -> Camera | None:
+def _camera(*lens: Any, **frame: Any) -> Camera | None:
     """One for all frames, as its rays are worked out once."""
     try:
-        return Camera(width, height, *lens, turn=turn, place=place)
+        return Camera(*lens, **frame)
     except CameraError:
         return None
 
