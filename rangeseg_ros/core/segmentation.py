@@ -92,6 +92,8 @@ class Segmentation:
         See `curved`, of `cells`; None where none were looked for.
     identified : bool
         False where `sensor` was to be measured and the image says too little: it is as stated.
+    disparity : bool
+        Whether the image is one of disparities; what is measured of planes is then in no unit.
     """
 
     labels: NDArray[np.uint16]
@@ -108,6 +110,7 @@ class Segmentation:
     cells: Cells | None = field(default=None, repr=False)
     curved_regions: NDArray[np.uint16] | None = field(default=None, repr=False)
     identified: bool = True
+    disparity: bool = False
 
     def __repr__(self) -> str:
         height, width = self.labels.shape
@@ -158,7 +161,8 @@ class Segmentation:
             plane.label: -plane.normal / (plane.distance + plane.normal @ place)
             for plane in self.planes
         }
-        return judge(self.image, self.labels, thetas, self.curved, self.identified)
+        doubts = self.identified, self.disparity
+        return judge(self.image, self.labels, thetas, self.curved, *doubts)
 
     def of_pixels(
         self, labels: NDArray[np.uint16], image: RangeImage, cells: Cells

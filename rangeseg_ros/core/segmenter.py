@@ -27,6 +27,7 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
+from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
 from rangeseg_ros.core.sensing.grid import GridEdges, View, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
@@ -79,7 +80,14 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        cells = enlargement(image)
+        if shows_disparity(image):
+            result = self._undone(from_disparity(image))
+            return replace(result, image=image, disparity=True)
+        return self._undone(image)
+
+    def _undone(self, image: RangeImage) -> Segmentation:
+        """Segment an image, of which a measurement fills several pixels or one."""
+        config, cells = self.config, enlargement(image)
         if cells is None:
             result = self._find_planes(image)
             return replace(result, survey=Survey.of(image, result.sensor, config))

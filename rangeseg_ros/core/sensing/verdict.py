@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
 
-# Logarithm of the odds at which one reading of an image is believed and not the other.
-_ODDS = float(np.log(1e4))
-# By which the bends of real planes differ, of that of a plane whose range is taken for depth.
-_SPREAD = 0.2
+ODDS = float(np.log(1e4))
+"""Logarithm of the odds at which one reading of an image is believed and not the other."""
+SPREAD = 0.2
+"""By which the bends of real planes differ, of that of planes whose values are misread."""
 _FEWEST = 40  # pixels that tell the bend of a plane
 _SAMPLE = 5000  # pixels that stand for an image
 # Step of the inverse depth of a Kinect, 1/m: an eighth of a pixel at 580 px and 75 mm.
@@ -25,7 +25,12 @@ _KINECT_STEP = 1 / (8 * 580 * 0.075)
 # Quotients of the units that files have: 1/1000, 1/5000 and 1/10000 m, and metres.
 _WRONG_UNITS = (5.0, 0.2, 10.0, 0.1, 1000.0, 0.001)
 # Reasons for which every metric result is wrong, not only less certain.
-_INVALID = {'range instead of z', 'scale improbable', 'millimetres in floats'}
+_INVALID = {
+    'disparity instead of depth',
+    'range instead of z',
+    'scale improbable',
+    'millimetres in floats',
+}
 
 
 class Verdict(NamedTuple):
@@ -54,6 +59,7 @@ def judge(
     planes: Mapping[int, NDArray[np.float64]],
     curved: NDArray[np.uint16] | None = None,
     identified: bool = True,
+    disparity: bool = False,
 ) -> Verdict:
     """Look for what makes an image doubtful in which planes, label -> theta (3,), were found.
 
@@ -70,7 +76,12 @@ def judge(
         found[f'filled {share:.0%}'.replace('%', ' %')] = (
             'Pixels beside edges copy their neighbours: holes were filled; switch that off.'
         )
-    if shows_range(image, labels, planes):
+    if disparity:
+        found['disparity instead of depth'] = (
+            'Surfaces are flat only if the values are disparities: they are segmented as such, in '
+            'no unit; depth is focal length times baseline over disparity.'
+        )
+    elif shows_range(image, labels, planes):
         found['range instead of z'] = (
             'Surfaces are flat only if the values are distances from the camera, not along its '
             'axis: multiply them by 1 / |ray|.'
@@ -152,9 +163,9 @@ def shows_range(
             rays = image.rays[::step, ::step][seen].astype(float)
             share, variance = _share_of_range(rays, inverse[seen], theta)
             # Real planes differ by more than their noise tells.
-            variance += _SPREAD**2
+            variance += SPREAD**2
             odds += np.log1p(share**2 / variance) - np.log1p((share - 1) ** 2 / variance)
-    return bool(odds > _ODDS)
+    return bool(odds > ODDS)
 
 
 def _share_of_range(
