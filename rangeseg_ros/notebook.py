@@ -22,7 +22,7 @@ from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.drawing import colours, overlay
 from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.planes import columns, values
+from rangeseg_ros.io.tables import columns, values
 
 
 def segment(

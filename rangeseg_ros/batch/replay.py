@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.batch.locator import Locator
@@ -16,19 +16,28 @@ from rangeseg_ros.batch.result_folder import LEADING, PICTURES, TERRAIN, ResultF
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.roles import Tilt
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.digest import code_digest
+from rangeseg_ros.digest import result_key
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.meaning import GROUND, STAIRS, ground_row, stairs_row, write_table
 from rangeseg_ros.io.meshes import write_mesh
-from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.io.poses import write_trajectory
+from rangeseg_ros.io.tables import (
+    GROUND,
+    STAIRS,
+    columns,
+    ground_values,
+    open_table,
+    stairs_values,
+    values,
+    write_table,
+)
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -42,30 +51,11 @@ Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
 class Outcome:
     """What became of a recording.
 
-    Attributes
-    ----------
-    frames : int
-        Number of frames segmented.
-    reasons : dict
-        Why frames have no planes -> number of these frames.
-    figures : dict
-        See `ReplayReport.figures`.
-    damage : str
-        What of the recording could not be read; empty when all of it was.
-    already_done : bool
-        The results were there already.
-    mapped : int
-        Number of planes in the map.
-    unlocated : dict
-        Which frame of tf was not known, and why -> number of images.
-    tilted : int
-        Number of frames whose planes say that up is elsewhere.
-    tilt : str
-        What is said of the one that is tilted most.
-    doubts : dict
-        What is doubtful about images -> number of these frames.
-    contradicted : list of str
-        What the planes say against the poses.
+    `figures` are those of `ReplayReport`. Number of frames by why they have no planes, by which
+    frame of tf was not known (`unlocated`), and by what is doubtful about them; `tilted` counts
+    those whose planes say that up is elsewhere, and `tilt` is what the one that is tilted most
+    says. `mapped` is the number of planes in the map, `contradicted` what they say against the
+    poses, `damage` what of the recording could not be read.
     """
 
     frames: int
@@ -90,23 +80,10 @@ class Replay:
     and the other results are the same; any other state is started anew, as ids depend on all
     frames before.
 
-    Attributes
-    ----------
-    recording, folder : Path
-        What to read, and where to leave the results.
-    config : Config
-    depth_topic, camera_topic : str or None
-        See `DepthBag`.
-    topics : tuple of str
-        Topics of the node to record, names of `OUTPUTS`.
-    copy : bool
-        Copy the topics of the recording into the bag.
-    raw : bool
-        See `DepthBag`.
-    terrain : bool
-        Also write terrain and height of every frame, and the tables of ground and stairs.
-    overwrite : bool
-        Also replace files with the names of results that no replay has written.
+    `topics` are names of `OUTPUTS` to record, and with `copy` those of the recording as well; see
+    `DepthBag` for where the images are. With `terrain` terrain and height of every frame are
+    written, and the tables of ground and stairs; with `overwrite` also files are replaced that
+    have the names of results and that no replay has written.
     """
 
     recording: Path
@@ -123,19 +100,13 @@ class Replay:
     def check(self) -> str:
         """Topics that will be read; BagError when the recording or the folder will not do."""
         ResultFolder(self.folder).check(self.recording, self.overwrite)
-        if self.copy:
-            open_source(self.recording).close()
         with self._open() as source:
+            if self.copy:
+                open_source(self.recording).close()
             return f'{source.depth_topic}, {source.camera_topic}'
 
     def run(self, progress: Progress | None = None) -> Outcome:
-        """Write the results, or find that they are there.
-
-        Raises
-        ------
-        ValueError
-            As `check`; a frame that is no range image.
-        """
+        """Write the results, or find that they are there; BagError as `check`."""
         key, results_folder = self._key(), ResultFolder(self.folder)
         record = read_record(results_folder.bag)
         if record.get('key') == key and results_folder.whole():
@@ -145,16 +116,16 @@ class Replay:
             results_folder.replacing() as made,
             self._open() as source,
             Locator(self.recording, self.config) as located,
-            PlaneTable(made.path / 'planes.csv', LEADING) as table,
+            open_table(made.path / 'planes.csv', [*LEADING, *columns()]) as add_planes,
             ResultBag(made.bag, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
-            results = _Results(self, made.path, table, bag, located)
+            results = _Results(self, made.path, add_planes, bag, located)
             streams = [results.messages(source, progress)]
             if self.copy:
                 originals = stack.enter_context(closing(open_source(self.recording)))
                 streams.append(bag.copies(originals))
-            bag.write(*streams)
+            bag.write_merged(*streams)
             outcome = results.finish(source)
             kept = asdict(outcome)
             del kept['already_done']
@@ -166,33 +137,32 @@ class Replay:
 
     def _key(self) -> str:
         """Digest of all that the results depend on: code, parameters, the recording's files."""
-        digest = hashlib.sha256(code_digest())
         settings = replace(self, recording=Path(), folder=Path(), overwrite=False)
-        digest.update(repr(settings).encode())
-        for path in correction_files(self.config):
-            digest.update(path.read_bytes())
         parts = [self.recording]
         if self.recording.is_dir():
             parts = [path for path in self.recording.iterdir() if path.suffix in _SUFFIXES]
-        for path in sorted(parts):
-            state = path.stat()
-            digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())
-        return digest.hexdigest()[:16]
+        return result_key(settings, correction_files(self.config), parts)
 
 
 class _Results:
     """Writes what a replay leaves of every frame, and of all of them."""
 
     def __init__(
-        self, replay: Replay, folder: Path, table: PlaneTable, bag: ResultBag, located: Locator
+        self,
+        replay: Replay,
+        folder: Path,
+        add_planes: Callable[[Iterable[Iterable[Any]]], None],
+        bag: ResultBag,
+        located: Locator,
     ) -> None:
         self._terrain, self._config = replay.terrain, replay.config
-        self._folder, self._table, self._bag, self._located = folder, table, bag, located
+        self._folder, self._bag, self._located = folder, bag, located
+        self._add_planes = add_planes
         self._report = ReplayReport(replay.recording.name, replay.config)
         self._sequence = SequenceSegmenter(replay.config)
         self._trajectory: list[tuple[int, Transform]] = []
-        self._ground: list[list[str]] = []
-        self._stairs: list[list[str]] = []
+        self._ground: list[list[Any]] = []
+        self._stairs: list[list[Any]] = []
         self._tilts: list[Tilt] = []
         self._doubts: Counter[str] = Counter()
 
@@ -212,14 +182,14 @@ class _Results:
         kinds = PICTURES + TERRAIN if self._terrain else PICTURES
         stem = f'{index:06d}_{leading[1]}'
         files = write_frame(self._folder, stem, image, result, kinds)
-        self._table.write(result.planes, *leading)
+        self._add_planes([*leading, *values(plane)] for plane in result.planes)
         self._report.add(stamp, result, files['overlay'])
         self._doubts.update(result.verdict.details)
         if result.tilt:
             self._tilts.append(result.tilt)
         if self._terrain:
-            self._ground.append([*leading, *ground_row(result)])
-            self._stairs += [[*leading, *stairs_row(seen)] for seen in result.stairs]
+            self._ground.append([*leading, *ground_values(result)])
+            self._stairs += [[*leading, *stairs_values(seen)] for seen in result.stairs]
         if self._sequence.motion:
             self._trajectory.append((stamp, self._sequence.motion.pose))
 
@@ -232,7 +202,9 @@ class _Results:
         if config.odometry:
             write_trajectory(folder / 'trajectory.txt', self._trajectory)
         if config.map_frame:
-            write_map(folder / 'map.csv', mapped.planes)
+            without = ('label',)
+            rows = [values(plane, without) for plane in mapped.planes]
+            write_table(folder / 'map.csv', columns(MapPlane, without), rows)
             shades = colours([plane.id for plane in mapped.planes])
             write_mesh(folder / 'map.ply', mapped.planes, shades)
         damage = [source.damage, source.loss()]

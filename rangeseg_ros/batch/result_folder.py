@@ -34,13 +34,7 @@ _OWN = re.compile(
 
 @dataclass(frozen=True)
 class ResultFolder:
-    """Where a replay leaves its results.
-
-    Attributes
-    ----------
-    path : Path
-        Need not exist.
-    """
+    """Where a replay leaves its results; it need not exist."""
 
     path: Path
 

@@ -68,7 +68,7 @@ def read_label_image(path: Path) -> NDArray[np.uint16]:
 
     Raises
     ------
-    SegcompError, ImageFileError
+    SegcompError, FileError
         A missing or malformed file.
     """
     if path.suffix in SEGCOMP_SUFFIXES:

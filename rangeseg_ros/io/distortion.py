@@ -28,13 +28,7 @@ _DESCRIPTION = 270
 
 
 def read_distortion(path: Path) -> DistortionMap:
-    """Read a distortion map.
-
-    Raises
-    ------
-    DistortionError
-        A missing or unreadable file; pages that are not float32 of one size, or not finite.
-    """
+    """Read a distortion map; DistortionError where it is none, or its values are not finite."""
     try:
         # Of damage the reader only warns.
         with warnings.catch_warnings():

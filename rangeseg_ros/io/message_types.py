@@ -9,11 +9,8 @@ from typing import Any
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-IMAGE = 'sensor_msgs/msg/Image'
-COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
-CAMERA_INFO = 'sensor_msgs/msg/CameraInfo'
-CLOUD = 'sensor_msgs/msg/PointCloud2'
-TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+from rangeseg_ros.messages.make import TRANSFORMS
+
 EARLY_TRANSFORMS = 'tf/msg/tfMessage'
 """Of ROS 1, until its nodes used tf2."""
 

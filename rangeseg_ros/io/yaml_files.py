@@ -8,38 +8,24 @@ from typing import Any
 
 import yaml
 
+from rangeseg_ros.io.files import FileError, read_bytes
+
 LARGEST = 2**20
 """Bytes; of calibrations and parameters a thousand times what they have."""
-
-
-class YamlError(ValueError):
-    """A file that cannot be read as YAML."""
 
 
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file, or of a JSON file that is called *.json.
 
-    Raises
-    ------
-    YamlError
-        A missing file or one that cannot be read; no YAML; one that is too large or too deep.
+    FileError: it cannot be read, is no YAML, too large or too deep.
     """
     # JSON may be indented by tabs, YAML may not.
     parse, kind = (json.loads, 'JSON') if path.suffix == '.json' else (yaml.safe_load, 'YAML')
+    data = read_bytes(path, LARGEST)
     try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise YamlError(f'{path}: not a regular file')
-        if size > LARGEST:
-            raise YamlError(f'{path}: too large for such a file')
-        content = parse(path.read_text())
-    except OSError as error:
-        raise YamlError(f'{path}: {error.strerror}') from None
+        return parse(data.decode())
     except RecursionError:
-        raise YamlError(f'{path}: nested too deeply') from None
-    except YamlError:
-        raise
+        raise FileError(f'{path}: nested too deeply') from None
     # Not of YAML alone: dates and numbers raise errors of Python.
     except (ValueError, OverflowError, yaml.YAMLError):
-        raise YamlError(f'{path}: not a {kind} file') from None
-    return content
+        raise FileError(f'{path}: not a {kind} file') from None

@@ -10,51 +10,32 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.ground.classes import GROUND, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.rotations import rotation_matrix
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import GRID, Make, header_of, pose_of
 
-GRID = 'nav_msgs/msg/OccupancyGrid'
-"""Type of `grid_message`."""
 _LETHAL = 100
 
 
 def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
     """nav_msgs/OccupancyGrid: 0 ground, 100 obstacle or drop, -1 unknown.
 
-    Parameters
-    ----------
-    make : Make
-    header : std_msgs/Header
-        Of the image: its frame is used where the grid has no fixed one.
-    grid : GroundGrid
+    `header` is that of the image: its frame is used where the grid has no fixed one.
     """
     values = np.where(grid.classes == GROUND, 0, _LETHAL).astype(np.int8)
     values[grid.classes == UNKNOWN] = -1
-
-    def named(kind: str, numbers: NDArray[np.float64]) -> Any:
-        fields = dict(zip('xyzw', map(float, numbers), strict=False))
-        return make(f'geometry_msgs/msg/{kind}', **fields)
-
-    corner = make(
-        'geometry_msgs/msg/Pose',
-        position=named('Point', grid.origin),
-        orientation=named('Quaternion', grid.orientation),
-    )
     info = make(
         'nav_msgs/msg/MapMetaData',
         map_load_time=make('builtin_interfaces/msg/Time', sec=0, nanosec=0),
         resolution=float(grid.resolution),
         width=values.shape[1],
         height=values.shape[0],
-        origin=corner,
+        origin=pose_of(make, grid.origin, grid.orientation),
     )
     return make(GRID, header=grid_header(make, header, grid), info=info, data=values.ravel())
 
 
 def grid_header(make: Make, header: Any, grid: GroundGrid) -> Any:
     """Header of the messages of a grid: in the fixed frame where it has one."""
-    if not grid.frame:
-        return header
-    return make('std_msgs/msg/Header', stamp=header.stamp, frame_id=grid.frame)
+    return header_of(make, header.stamp, grid.frame) if grid.frame else header
 
 
 def grid_points(grid: GroundGrid) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import IMAGE, Make
 
 # REP 118: millimetres as unsigned integers, or metres as floats.
 PIXEL_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
@@ -29,22 +29,9 @@ def depth_from_message(
 ) -> NDArray[np.uint16] | NDArray[np.float32]:
     """Depth image (H, W) of a sensor_msgs/Image, or a CompressedImage of compressedDepth.
 
-    Parameters
-    ----------
-    message : sensor_msgs/Image or CompressedImage
-    shape : (int, int), optional
-        (H, W) that a compressed image must have; one of another size is not decoded.
-
-    Returns
-    -------
-    (H, W) uint16 in millimetres or float32 in metres, native byte order; a view of the data where
-    that is possible, so not to be written to.
-
-    Raises
-    ------
-    EncodingError
-        Another encoding or compression, an empty image, data too short for the size or damaged, or
-        another size.
+    uint16 in millimetres or float32 in metres, native byte order; a view of the data where that is
+    possible, so not to be written to. EncodingError: no depth image, a damaged one or, before it
+    is decoded, a compressed one of another size than `shape` (H, W).
     """
     return _compressed(message, shape) if hasattr(message, 'format') else _plain(message)
 
@@ -136,7 +123,7 @@ def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> An
     """sensor_msgs/Image of an array (H, W) or (H, W, channels)."""
     rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
     return make(
-        'sensor_msgs/msg/Image',
+        IMAGE,
         header=header,
         height=rows.shape[0],
         width=rows.shape[1],

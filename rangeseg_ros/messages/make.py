@@ -7,7 +7,7 @@ publish and write the same bytes, and this package imports without ROS.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -18,6 +18,14 @@ import numpy as np
 # make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=1.0); octets are given as uint8 arrays, and a
 # single one as a number.
 Make = Callable[..., Any]
+
+
+CAMERA_INFO, IMAGE = 'sensor_msgs/msg/CameraInfo', 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE, CLOUD = 'sensor_msgs/msg/CompressedImage', 'sensor_msgs/msg/PointCloud2'
+GRID, ODOMETRY = 'nav_msgs/msg/OccupancyGrid', 'nav_msgs/msg/Odometry'
+MARKERS = 'visualization_msgs/msg/MarkerArray'
+STATUS = 'diagnostic_msgs/msg/DiagnosticArray'
+TRANSFORMS = 'tf2_msgs/msg/TFMessage'
 
 
 def make_rclpy(kind: str, **fields: Any) -> Any:
@@ -51,3 +59,32 @@ def message_class(kind: str) -> type:
     package, _, name = kind.split('/')
     found: type = getattr(import_module(f'{package}.msg'), name)
     return found
+
+
+def header_of(make: Make, stamp: Any, frame: str) -> Any:
+    """std_msgs/Header of a stamp, a message or nanoseconds."""
+    if isinstance(stamp, int):
+        sec, nanosec = divmod(stamp, 10**9)
+        stamp = make('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
+    return make('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
+
+
+def nanoseconds(stamp: Any) -> int:
+    """Of a builtin_interfaces/Time; rclpy's own Time refuses negative ones.
+
+    ROS 1 calls the parts secs and nsecs; rosbags gives both the names of ROS 2.
+    """
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def vector(make: Make, kind: str, numbers: Iterable[float]) -> Any:
+    """Message of geometry_msgs with the fields x, y, z or x, y, z, w."""
+    return make(
+        f'geometry_msgs/msg/{kind}', **dict(zip('xyzw', map(float, numbers), strict=False))
+    )
+
+
+def pose_of(make: Make, place: Iterable[float], turn: Iterable[float]) -> Any:
+    """geometry_msgs/Pose of a point and a quaternion."""
+    point, quaternion = vector(make, 'Point', place), vector(make, 'Quaternion', turn)
+    return make('geometry_msgs/msg/Pose', position=point, orientation=quaternion)

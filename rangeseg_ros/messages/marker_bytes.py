@@ -28,11 +28,7 @@ _NO_MESH = 2 * _EMPTY_TEXT + bytes(5)
 def markers_bytes(header: Any, markers: Iterable[Marker]) -> bytes:
     """A serialised visualization_msgs/MarkerArray of `markers`, and of no older ones.
 
-    Parameters
-    ----------
-    header : std_msgs/Header
-        Of rclpy or rosbags.
-    markers : iterable of Marker
+    `header` is a std_msgs/Header of rclpy or rosbags.
     """
     out = bytearray(_LITTLE_ENDIAN)
     drawn = [CLEAR, *markers]

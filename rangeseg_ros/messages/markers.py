@@ -24,21 +24,9 @@ _NOWHERE = np.zeros((0, 3))
 
 
 class Marker(NamedTuple):
-    """What a visualization_msgs/Marker says, at the origin unless it is a text.
+    """What a visualization_msgs/Marker says, at the origin unless it is a text at `position`.
 
-    Attributes
-    ----------
-    namespace, number, kind : str, int, int
-        Its ns, id and type.
-    scale : tuple of 3 float
-        Metres.
-    colour : tuple of 4 float
-        Red, green, blue, opacity, 0...1.
-    points : (N, 3) float64
-        Metres.
-    text, position : str, tuple of 3 float
-        Letters, and where they are.
-    action : int
+    Its ns, id and type; metres; red, green, blue and opacity, 0...1; points (N, 3), metres.
     """
 
     namespace: str

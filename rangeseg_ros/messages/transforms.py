@@ -5,26 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import TransformBuffer, TransformError
+from rangeseg_ros.messages.make import nanoseconds
 
 
 def insert_transforms(buffer: TransformBuffer, message: Any, static: bool) -> list[str]:
     """Take in a tf2_msgs/TFMessage of /tf, or `static` of /tf_static.
 
-    Returns
-    -------
-    list of str
-        What is wrong with transforms that were left out.
+    Returns what is wrong with transforms that were left out.
     """
     problems = []
     for stamped in message.transforms:
-        stamp = stamped.header.stamp
         turn, place = stamped.transform.rotation, stamped.transform.translation
         try:
             buffer.insert(
                 stamped.header.frame_id,
                 stamped.child_frame_id,
-                # ROS 1 calls the parts secs and nsecs; rosbags gives both the names of ROS 2.
-                stamp.sec * 10**9 + stamp.nanosec,
+                nanoseconds(stamped.header.stamp),
                 (turn.x, turn.y, turn.z, turn.w),
                 (place.x, place.y, place.z),
                 static,

@@ -18,7 +18,7 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.motion import odometry_message
-from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target
+from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS, messages_of
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.settings import Settings
 
@@ -84,17 +84,10 @@ class Publication:
         """Publish what somebody listens to, and report the frame."""
         frame, image, found, start, ticks = result[:5]
         doing = self._statistics.activity.now
-        here = frame.message.header, found
-        there = in_target(make_rclpy, *here, *result.target) if result.target else here
-        for name in self._settings.in_order(OUTPUTS, _FIRST):
-            output = OUTPUTS[name]
-            publisher = self._publishers[name]
-            if publisher.get_subscription_count():
-                doing(f'publishing {name}')
-                if not self._settings.ready_for(name):
-                    return
-                header, shown = there if name in IN_TARGET else here
-                publisher.publish(output.message(make_rclpy, header, image, shown))
+        header = frame.message.header
+        names = (name for name in OUTPUTS if self._publishers[name].get_subscription_count())
+        for name, message in messages_of(make_rclpy, header, image, found, result.target, names):
+            self._publishers[name].publish(message)
         if result.motion and self._odometry_publisher.get_subscription_count():
             message = odometry_message(make_rclpy, frame.message.header, result.motion)
             self._odometry_publisher.publish(message)
