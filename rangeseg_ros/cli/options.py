@@ -17,25 +17,10 @@ from rangeseg_ros import interrupts
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.depth_files import Intrinsics
-from rangeseg_ros.io.files import (
-    NotReplacedError,
-    check_regular,
-    replacing,
-    resolved,
-)
+from rangeseg_ros.io.files import NotReplacedError, check_regular, replacing, resolved
 from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
-
-
-class _RegularFile(click.Path):
-    """A file that can be read to its end: no pipe, no device."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        path = Path(str(super().convert(value, param, ctx)))
-        if not path.is_file():
-            self.fail(f'{path} is not a regular file.', param, ctx)
-        return path
 
 
 class Finite(click.FloatRange):
@@ -52,7 +37,7 @@ class Finite(click.FloatRange):
         return '' if self.min is None and self.max is None else super()._describe_range()
 
 
-FILE = _RegularFile(exists=True, dir_okay=False, path_type=Path)
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 Decorator = Callable[..., Any]

@@ -28,12 +28,7 @@ from rangeseg_ros.io.recordings import BagError
     help='Intrinsics: a ROS camera-calibration YAML file.',
 )
 @options.raw
-@click.option(
-    '--output',
-    type=click.Path(path_type=Path),
-    required=True,
-    help='Recording to make: a rosbag2 folder (mcap).',
-)
+@options.output_folder('Recording to make: a rosbag2 folder (mcap).')
 @click.option(
     '--rate',
     type=options.Finite(min=0, min_open=True, max=1e9),

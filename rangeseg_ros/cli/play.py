@@ -52,7 +52,9 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
         publishers = _publishers(node, reader.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
-        times = _clock_publisher(node) if clock and CLOCK not in publishers else None
+        times = None
+        if clock and CLOCK not in publishers:
+            times = node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
             interrupts.check()
             time.sleep(0.05)
@@ -103,10 +105,6 @@ def _offered(connection: Connection) -> Any:
     if any(offer.durability.name == 'TRANSIENT_LOCAL' for offer in offers):
         quality.durability = DurabilityPolicy.TRANSIENT_LOCAL
     return quality
-
-
-def _clock_publisher(node: Any) -> Any:
-    return node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
 
 
 def _timed(

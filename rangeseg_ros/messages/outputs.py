@@ -106,9 +106,12 @@ OUTPUTS = {
     # What a robot stops for is published before pictures. Of edges, no point is left out that has
     # no other near it, however many there are.
     'drops': _points(drops, sys.maxsize),
+    'grid': _result(
+        GRID, lambda make, header, result: grid_message(make, header, result.grid or empty_grid())
+    ),
     'obstacles': _points(lambda image, terrain: points_of_class(image, terrain, OBSTACLE)),
-    'unseen': _points(unseen, sys.maxsize),
     'ground': _points(lambda image, terrain: points_of_class(image, terrain, GROUND)),
+    'unseen': _points(unseen, sys.maxsize),
     'terrain': _image('mono8', lambda image, result: result.terrain),
     'labels': _image('mono16', lambda image, result: result.labels),
     'planes': _result(
@@ -126,9 +129,6 @@ OUTPUTS = {
     'stairs': _markers(lambda image, result: of_stairs(result.stairs) + of_ramps(result.ramps)),
     'stairs_points': _result(
         CLOUD, lambda make, header, result: stairs_message(make, header, result.stairs)
-    ),
-    'grid': _result(
-        GRID, lambda make, header, result: grid_message(make, header, result.grid or empty_grid())
     ),
     'grid_points': _result(CLOUD, _grid_points),
     'status': _result(STATUS, status_message),

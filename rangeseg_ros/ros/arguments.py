@@ -17,7 +17,7 @@ from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.core.runtime.cache import writable
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.depth_input import input_topics
-from rangeseg_ros.ros.gravity import IMU_TOPIC
+from rangeseg_ros.ros.locator import IMU_TOPIC
 from rangeseg_ros.ros.parameters import NodeConfig
 
 USAGE = """\

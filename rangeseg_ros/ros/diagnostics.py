@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import get_ident
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -17,16 +17,9 @@ from rangeseg_ros.ros.depth_input import DepthInput
 class FrameTimes:
     """Where the time of a frame went, milliseconds.
 
-    Attributes
-    ----------
-    transport : float
-        Stamp of the depth message to its arrival.
-    waiting : float
-        Arrival to the start of the work: for camera_info, or for the frame before.
-    conversion, compute, publication : float
-        Message to range image, segmentation, and result to published messages.
-    stages : dict
-        Stages of the computation.
+    Transport, from the stamp of the message to its arrival; waiting, to the start of the work: for
+    camera_info, or for the frame before; conversion to a range image, computation, of which
+    `stages` are parts, and publication.
     """
 
     transport: float
@@ -34,12 +27,7 @@ class FrameTimes:
     conversion: float
     compute: float
     publication: float
-    stages: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def work(self) -> float:
-        """Arrival to the end of the publication."""
-        return self.waiting + self.conversion + self.compute + self.publication
+    stages: dict[str, float]
 
     def values(self, longest_transport: float) -> dict[str, str]:
         """By name as diagnostics show them; without what other clocks would make of them.
@@ -47,18 +35,17 @@ class FrameTimes:
         Stamps of recordings, or of clocks that differ, say nothing of the transport: messages do
         not queue up, so that one which took longer than `longest_transport` ms did not come late.
         """
-        shown = {'latency since arrival (ms)': f'{self.work:.2f}'}
+        work = self.waiting + self.conversion + self.compute + self.publication
+        times = {'latency since arrival': work}
+        unknown = {}
         if abs(self.transport) <= longest_transport:
-            shown['latency (ms)'] = f'{self.transport + self.work:.2f}'
-            shown['transport (ms)'] = f'{self.transport:.2f}'
+            times |= {'latency': self.transport + work, 'transport': self.transport}
         else:
-            shown['latency (ms)'] = 'unknown: the stamps are not of the clock of the node'
-        for part in ('waiting', 'conversion', 'compute'):
-            shown[f'{part} (ms)'] = f'{getattr(self, part):.2f}'
-        for stage, milliseconds in self.stages.items():
-            shown[f'compute: {stage} (ms)'] = f'{milliseconds:.2f}'
-        shown['publication (ms)'] = f'{self.publication:.2f}'
-        return shown
+            unknown = {'latency (ms)': 'unknown: the stamps are not of the clock of the node'}
+        times |= {part: getattr(self, part) for part in ('waiting', 'conversion', 'compute')}
+        times |= {f'compute: {stage}': time for stage, time in self.stages.items()}
+        times['publication'] = self.publication
+        return {f'{name} (ms)': f'{time:.2f}' for name, time in times.items()} | unknown
 
 
 class Activity:
@@ -81,51 +68,24 @@ class Activity:
 
 
 class FrameStatistics:
-    """Counts what becomes of the frames.
+    """Counts what becomes of the frames, and keeps what is told of the last one.
 
-    Attributes
-    ----------
-    received, published, dropped, refused : Window
-        Frames that arrived complete; were segmented and published; were replaced by a newer
-        one; could not be segmented.
-    losses : Losses
-        Depth messages that never arrived.
-    compiling : str
-        How far the compilation of kernels is that frames wait for; empty when none do.
-    activity : Activity
-        Of the threads that work on frames.
-    pending : str
-        What is being done with parameters that are not in use yet; empty when all are.
-    problem : str
-        Why the last frame could not be segmented; empty when it could.
-    sources : dict of str
-        What up, fixed frame, target frame and map of the last frame come from.
-    no_terrain : str
-        Why there is no terrain: up is not known, or not where it is said; empty where there is.
-    missing : str
-        Which frames of the parameters were not known for the last frame, and why.
-    found : Segmentation or None
-        What was found in the last frame.
-    ground, stairs : str
-        Of the last frame; empty when nobody listens to what needs it.
-    times : FrameTimes or None
-        Of the last frame.
+    `received` arrived complete, `dropped` were replaced by a newer one, `refused` could not be
+    segmented, of which `problem` says why. `sources` tells what up, the frames and the map come
+    from, `missing` which frames were not known, `no_terrain` why up is not. Empty where there is
+    nothing to tell.
     """
 
     def __init__(self) -> None:
         self.received, self.published = Window(), Window()
         self.dropped, self.refused = Window(), Window()
         self.losses = Losses()
-        self.compiling = ''
         self.activity = Activity()
-        self.pending = ''
-        self.problem = ''
+        self.compiling = ''
+        self.pending = False
+        self.problem = self.missing = self.no_terrain = ''
         self.sources: dict[str, str] = {}
-        self.missing = ''
-        self.no_terrain = ''
         self.found: Segmentation | None = None
-        self.ground = ''
-        self.stairs = ''
         self.times: FrameTimes | None = None
         self._unanswered: float | None = None
 
@@ -142,6 +102,11 @@ class FrameStatistics:
         counter.add()
         self._unanswered = None
 
+    def done(self, found: Segmentation, times: FrameTimes) -> None:
+        """Count a frame that is published."""
+        self.found, self.times = found, times
+        self.answered(self.published)
+
     def stalled(self) -> float:
         """Seconds since the first frame to which there was no answer yet; 0 when there is none."""
         since = self._unanswered
@@ -154,6 +119,8 @@ class FrameStatistics:
         level, message = self._judge(source, stall_timeout)
         found = self.found
         unseen = self.losses.unseen
+        # Only what was worked out for a listener.
+        known = vars(found) if found else {}
         values = {
             'input rate (Hz)': f'{self.received.rate():.2f}',
             'output rate (Hz)': f'{self.published.rate():.2f}',
@@ -168,15 +135,15 @@ class FrameStatistics:
             ),
             'camera_info': source.pairing if source else '',
             'doing': self.doing() or 'waiting for a frame',
-            'parameters': self.pending or 'in use',
+            'parameters': 'in preparation, those before serve' if self.pending else 'in use',
             **{f'{what} from': source for what, source in self.sources.items()},
             'input': str(found.verdict) if found else '',
             'planes': str(len(found.planes)) if found else '0',
             'reason for no planes': found.reason if found else '',
             'sensor': str(found.sensor) if found else '',
             'work_budget': f'{found.work_budget:g}' if found else '1',
-            'ground': self.ground,
-            'stairs': self.stairs,
+            'ground': str(known.get('ground', '')),
+            'stairs': ', '.join(map(str, known.get('stairs', ()))),
         }
         if self.times:
             values.update(self.times.values(1000 * stall_timeout))
