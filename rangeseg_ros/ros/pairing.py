@@ -24,12 +24,8 @@ class StampPairing(Generic[Item]):
     """Pairs by stamp where both carry one; the last otherwise, as some cameras send one only.
 
     Which of both a camera does is learned from what it sends: once a pair of equal stamps was
-    seen, an image waits for its own, until the next image shows that there will be none.
-
-    Attributes
-    ----------
-    by_stamp : bool
-        Whether images wait for the item of their own stamp.
+    seen, an image waits for its own (`by_stamp`), until the next image shows that there will be
+    none.
     """
 
     def __init__(self) -> None:

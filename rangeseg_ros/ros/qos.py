@@ -21,17 +21,7 @@ class MatchedSubscription:
     The middleware's own `best_available` policy looks once, when the subscription is made, and
     takes a topic without publishers for a reliable one. Here the choice is made anew when
     publishers come or go. The parameter `qos_overrides.<topic>.subscription.reliability` ends it.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    kind : type
-        Class of the messages.
-    topic : str
-    callback : callable
-        Gets every message.
-    losses : Losses, optional
-        Counts the messages that arrive and those that are lost.
+    `losses` counts the messages that arrive and those that are lost.
     """
 
     def __init__(
@@ -57,14 +47,12 @@ class MatchedSubscription:
     @property
     def topic(self) -> str:
         """Name of the topic, remapped."""
-        name: str = self._subscription.topic_name
-        return name
+        return str(self._subscription.topic_name)
 
     @property
     def publishers(self) -> int:
         """Number of publishers, whether their quality of service fits or not."""
-        count: int = self._node.count_publishers(self.topic)
-        return count
+        return int(self._node.count_publishers(self.topic))
 
     @property
     def other_types(self) -> list[str]:
@@ -132,8 +120,9 @@ class MatchedSubscription:
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-        best = (
+        if not offers:
+            return None
+        return (
             ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        return best if offers else None
