@@ -21,8 +21,8 @@ from rangeseg_ros.io.images import (
     read_labels,
     write_image,
 )
-from rangeseg_ros.io.message_types import message_types
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
+from rangeseg_ros.io.recordings import message_types
 from rangeseg_ros.io.tables import columns, values, write_table
 
 

@@ -49,26 +49,20 @@ Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording.
+    """What became of a recording: frames, those of them without planes, and planes in the map.
 
-    `figures` are those of `ReplayReport`. Number of frames by why they have no planes, by which
-    frame of tf was not known (`unlocated`), and by what is doubtful about them; `tilted` counts
-    those whose planes say that up is elsewhere, and `tilt` is what the one that is tilted most
-    says. `mapped` is the number of planes in the map, `contradicted` what they say against the
-    poses, `damage` what of the recording could not be read.
+    `figures` are those of `ReplayReport`; `notes` and `warnings` tell of frames, `damage` what of
+    the recording could not be read.
     """
 
     frames: int
-    reasons: dict[str, int]
+    empty: int
     figures: dict[str, float]
+    mapped: int = 0
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     damage: str = ''
     already_done: bool = False
-    mapped: int = 0
-    unlocated: dict[str, int] = field(default_factory=dict)
-    tilted: int = 0
-    tilt: str = ''
-    doubts: dict[str, int] = field(default_factory=dict)
-    contradicted: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -110,7 +104,7 @@ class Replay:
         key, results_folder = self._key(), ResultFolder(self.folder)
         record = read_record(results_folder.bag)
         if record.get('key') == key and results_folder.whole():
-            return Outcome(**record['outcome'], already_done=True)
+            return Outcome(**record['outcome'] | {'already_done': True})
         self.check()
         with (
             results_folder.replacing() as made,
@@ -127,9 +121,7 @@ class Replay:
                 streams.append(bag.copies(originals))
             bag.write_merged(*streams)
             outcome = results.finish(source)
-            kept = asdict(outcome)
-            del kept['already_done']
-            bag.record({'key': key, 'outcome': kept, 'files': made.digest()})
+            bag.record({'key': key, 'outcome': asdict(outcome), 'files': made.digest()})
         return outcome
 
     def _open(self) -> DepthBag:
@@ -211,20 +203,24 @@ class _Results:
         if lost := self._bag.lost:
             reason, count = lost.most_common(1)[0]
             damage.append(f'{lost.total()} messages not copied, {count} of {reason}')
-        tilts = self._tilts
+        report, contradicted = self._report, mapped.doubts if config.map_frame else []
+        notes = [f'{n} frames without a plane: {why}' for why, n in report.reasons.items()]
+        notes += [f'{n} frames without the {what}' for what, n in self._located.problems.items()]
+        warnings = [f'{n} frames: {doubt}' for doubt, n in self._doubts.items()]
+        if self._tilts:
+            worst = max(self._tilts, key=lambda tilt: tilt.degrees)
+            warnings.append(f'{len(self._tilts)} frames: {worst}')
+        warnings += [f'poses: {doubt}' for doubt in contradicted]
         outcome = Outcome(
-            self._report.frames,
-            dict(self._report.reasons),
-            self._report.figures(),
+            report.frames,
+            report.reasons.total(),
+            report.figures(),
+            len(mapped.planes),
+            notes,
+            warnings,
             '; '.join(filter(None, damage)),
-            mapped=len(mapped.planes),
-            unlocated=dict(self._located.problems),
-            tilted=len(tilts),
-            tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
-            doubts=dict(self._doubts),
-            contradicted=mapped.doubts if config.map_frame else [],
         )
-        self._report.write(folder / 'report.html', outcome.damage, outcome.contradicted)
+        report.write(folder / 'report.html', outcome.damage, contradicted)
         return outcome
 
 

@@ -17,8 +17,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_writer import BagWriter
-from rangeseg_ros.io.message_types import is_rosbag1, make_rosbags
-from rangeseg_ros.io.recordings import BagError, Lost, Recording
+from rangeseg_ros.io.recordings import BagError, Lost, Recording, is_rosbag1, make_rosbags
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import ODOMETRY, header_of
 from rangeseg_ros.messages.motion import odometry_message

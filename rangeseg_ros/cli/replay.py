@@ -94,12 +94,10 @@ def command(
 
 def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
     """Row of a recording in the overview."""
-    name = task.folder.name
+    row = {'name': task.folder.name, 'failed': isinstance(outcome, Failure)}
     if isinstance(outcome, Failure):
         nothing = dict.fromkeys(('frames', 'empty', 'duration', 'planes_per_frame', 'ids'), 0)
-        return {'name': name, 'failed': True, 'damage': one_line(outcome.error), **nothing}
-    empty = sum(outcome.reasons.values())
-    row = {'name': name, 'failed': False, 'empty': empty}
+        return {**row, **nothing, 'damage': one_line(outcome.error)}
     return {**row, **asdict(outcome), **outcome.figures}
 
 
@@ -107,14 +105,9 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
     """Say what became of a recording; the exit code."""
     if isinstance(outcome, Failure):
         return recordings.report_failure(task, outcome)
-    for reason, count in outcome.reasons.items():
-        click.echo(f'{count} frames without a plane: {reason}')
-    for problem, count in outcome.unlocated.items():
-        click.echo(f'{count} frames without the {problem}')
-    warnings = [f'{count} frames: {doubt}' for doubt, count in outcome.doubts.items()]
-    warnings += [f'{outcome.tilted} frames: {outcome.tilt}'] if outcome.tilted else []
-    warnings += [f'poses: {doubt}' for doubt in outcome.contradicted]
-    for warning in warnings:
+    for note in outcome.notes:
+        click.echo(note)
+    for warning in outcome.warnings:
         click.echo(f'rangeseg: {warning}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
     already = ', done before' if outcome.already_done else ''

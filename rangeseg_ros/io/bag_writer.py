@@ -16,8 +16,7 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.message_types import make_rosbags, message_types
-from rangeseg_ros.io.recordings import BagError
+from rangeseg_ros.io.recordings import BagError, make_rosbags, message_types
 from rangeseg_ros.messages.cameras import camera_info_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import CAMERA_INFO, IMAGE, TRANSFORMS, header_of, vector

@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -17,17 +18,41 @@ from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import MAXSIZE, McapReader, msgsrc
-from rosbags.typesys import Stores
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from rangeseg_ros.io.files import FileError, check_regular, natural_order
-from rangeseg_ros.io.message_types import is_rosbag1, message_types
+from rangeseg_ros.messages.make import TRANSFORMS
 
+EARLY_TRANSFORMS = 'tf/msg/tfMessage'
+"""Of ROS 1, until its nodes used tf2."""
 # Of mcap: the records that end the data, and the bytes of a record before its content.
 _FOOTER, _DATA_END, _HEAD = 2, 15, 9
 
 
 class BagError(FileError):
     """A recording that cannot be read or written, or that lacks depth images or their camera."""
+
+
+@cache
+def message_types(distribution: Stores) -> Typestore:
+    """Message types of a ROS distribution; compiled once, at their first use."""
+    store = get_typestore(distribution)
+    if distribution is Stores.ROS1_NOETIC:
+        # `rosbags` has them for ROS 2 only.
+        for kind in (TRANSFORMS, EARLY_TRANSFORMS):
+            store.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', kind))
+    return store
+
+
+def make_rosbags(kind: str, **fields: Any) -> Any:
+    """Make a message of `rosbags`' Jazzy types, see `messages.Make`."""
+    return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
+
+
+def is_rosbag1(path: Path) -> bool:
+    """Whether it is a bag of ROS 1, and no folder of a rosbag2 that is called *.bag."""
+    return path.suffix == '.bag' and not path.is_dir()
 
 
 class Record(NamedTuple):

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
-from rangeseg_ros.io.message_types import EARLY_TRANSFORMS
-from rangeseg_ros.io.recordings import BagError, Lost, Recording
+from rangeseg_ros.io.recordings import EARLY_TRANSFORMS, BagError, Lost, Recording
 from rangeseg_ros.messages.make import TRANSFORMS
 from rangeseg_ros.messages.transforms import insert_transforms
 

@@ -37,9 +37,9 @@ from rangeseg_ros.messages.clouds import (
 from rangeseg_ros.messages.grids import grid_header, grid_message, grid_points
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import CLOUD, GRID, IMAGE, MARKERS, STATUS, Make, header_of
-from rangeseg_ros.messages.marker_bytes import markers_bytes
 from rangeseg_ros.messages.markers import (
     Marker,
+    markers_bytes,
     of_outline,
     of_planes,
     of_ramps,
