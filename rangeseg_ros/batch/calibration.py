@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.calibrate import CalibrationError
-from rangeseg_ros.core.calibration.sightings import Sightings, find_sightings
+from rangeseg_ros.core.calibration.sightings import Sightings, concatenate, find_sightings
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
@@ -40,7 +39,7 @@ class Source:
 
     path: Path
     camera: Camera | None = None
-    scale: float | None = None
+    depth_scale: float | None = None
     depth_topic: str | None = None
     camera_topic: str | None = None
 
@@ -65,7 +64,7 @@ class Source:
             assert self.camera is not None
             for path in self.files()[first:after]:
                 try:
-                    yield RangeImage.from_depth(read_depth(path), self.camera, self.scale)
+                    yield RangeImage.from_depth(read_depth(path), self.camera, self.depth_scale)
                 except RangeImageError as error:
                     raise RangeImageError(f'{path}: {error}') from None
             return
@@ -80,7 +79,7 @@ class Source:
 class Seen(NamedTuple):
     """Sightings of the frames of one part, and what they are of."""
 
-    frames: list[Sightings]
+    sightings: Sightings
     shape: tuple[int, int]
     camera: Camera | None
 
@@ -114,9 +113,19 @@ class SightingsOfPart:
             frames.append(find_sightings(segmenter.segment(image).labels, image))
         if shape is None:
             raise CalibrationError(f'{self.source.path}: no frames')
-        seen = Seen(frames, shape, camera)
-        _write(path, seen)
-        return seen
+        sightings = concatenate(frames)
+        told = json.dumps(camera and asdict(camera))
+        with replacing(path) as partial:
+            np.savez(partial, shape=shape, camera=told, **sightings._asdict())
+        return Seen(sightings, shape, camera)
+
+
+def _read(path: Path) -> Seen:
+    with np.load(path) as stored:
+        sightings = Sightings(*(stored[name] for name in Sightings._fields))
+        camera = json.loads(str(stored['camera']))
+        height, width = stored['shape'].tolist()
+    return Seen(sightings, (height, width), camera and Camera(**camera))
 
 
 class Residuals(NamedTuple):
@@ -165,27 +174,3 @@ def parts(sources: list[Source], config: Config, kept: Path) -> list[SightingsOf
         for count in [len(source)]
         for first in range(0, count, PART)
     ]
-
-
-def _write(path: Path, seen: Seen) -> None:
-    arrays = {
-        f'{number}_{name}': value
-        for number, frame in enumerate(seen.frames)
-        for name, value in frame._asdict().items()
-    }
-    camera = json.dumps(None if seen.camera is None else asdict(seen.camera))
-    buffer = io.BytesIO()
-    np.savez(buffer, shape=seen.shape, camera=camera, count=len(seen.frames), **arrays)
-    with replacing(path) as partial:
-        partial.write_bytes(buffer.getvalue())
-
-
-def _read(path: Path) -> Seen:
-    with np.load(path) as stored:
-        frames = [
-            Sightings(*(stored[f'{number}_{name}'] for name in Sightings._fields))
-            for number in range(int(stored['count']))
-        ]
-        height, width = stored['shape']
-        camera = json.loads(str(stored['camera']))
-        return Seen(frames, (int(height), int(width)), camera and Camera(**camera))

@@ -38,6 +38,7 @@ class Finite(click.FloatRange):
 
 
 FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+EXISTING = click.Path(exists=True, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 Decorator = Callable[..., Any]
@@ -65,7 +66,8 @@ count = partial(click.option, type=click.IntRange(min=1), show_default=True)
 number = partial(click.option, type=click.IntRange(min=0), show_default=True)
 """An integer from 0 on."""
 
-camera: Decorator = click.option(
+camera = partial(
+    click.option,
     '--camera',
     'camera_file',
     type=FILE,
@@ -143,7 +145,7 @@ def intrinsics(command: Callable[..., Any]) -> Any:
         return command(*args, intrinsics=known, **given)
 
     options = [click.option(name, type=Finite(), help=text) for name, text in _NUMBERS.items()]
-    return together(camera, *options, raw)(with_intrinsics)
+    return together(camera(), *options, raw)(with_intrinsics)
 
 
 depth_scale: Decorator = click.option(
@@ -178,6 +180,8 @@ def _checked_json(
 ) -> Path | None:
     # Before the work that the figures are of.
     if path:
+        if not path.parent.is_dir():
+            raise click.ClickException(f'{path}: no such folder')
         check_replaceable(path, b'{')
     return path
 
@@ -205,13 +209,8 @@ def _as_json(value: Any) -> Any:
 
 
 def check_replaceable(path: Path, beginning: bytes) -> None:
-    """Refuse to replace what is no earlier result: a file that does not begin like one.
-
-    Also what is no regular file, and a file in a folder that is not there.
-    """
+    """Refuse to replace what is no earlier result: a file that does not begin like one."""
     check_regular(path)
-    if not path.parent.is_dir():
-        raise click.ClickException(f'{path}: no such folder')
     if path.is_file() and path.stat().st_size:
         with path.open('rb') as file:
             if file.read(len(beginning)) != beginning:

@@ -20,13 +20,7 @@ from rangeseg_ros.io.recordings import BagError
 
 @click.command()
 @click.argument('frames_dir', type=options.FOLDER)
-@click.option(
-    '--camera',
-    'camera_file',
-    type=options.FILE,
-    required=True,
-    help='Intrinsics: a ROS camera-calibration YAML file.',
-)
+@options.camera(required=True)
 @options.raw
 @options.output_folder('Recording to make: a rosbag2 folder (mcap).')
 @click.option(

@@ -21,7 +21,7 @@ CLOCK_PERIOD = 0.025
 
 
 @click.command()
-@click.argument('bag', type=click.Path(exists=True, path_type=Path))
+@click.argument('bag', type=options.EXISTING)
 @click.option(
     '--rate',
     type=options.Finite(min=0, min_open=True),

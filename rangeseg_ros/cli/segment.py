@@ -25,7 +25,7 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 
 
 @click.command()
-@click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.argument('depth', nargs=-1, required=True, type=options.EXISTING)
 @options.intrinsics
 @options.output_folder()
 @options.depth_scale
