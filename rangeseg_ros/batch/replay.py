@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -117,7 +117,7 @@ class Replay:
             results = _Results(self, made.path, add_planes, bag, located)
             streams = [results.messages(source, progress)]
             if self.copy:
-                originals = stack.enter_context(closing(open_source(self.recording)))
+                originals = stack.enter_context(open_source(self.recording))
                 streams.append(bag.copies(originals))
             bag.write_merged(*streams)
             outcome = results.finish(source)

@@ -93,23 +93,19 @@ params: Decorator = click.option(
     type=FILE,
     help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
 )
-_PARAMETERS: dict[str, Decorator] = {
-    'method': click.option(
-        '--method',
-        type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
-        help='Method, in place of that of the parameters.',
-    ),
-    'exact': click.option(
-        '--exact',
-        is_flag=True,
-        help='Minimise with every label at full resolution instead of coarse to fine: slow.',
-    ),
-    'fixed_frame': click.option(
-        '--fixed-frame',
-        metavar='FRAME',
-        help='Frame in which planes stay put, such as odom.  [default: that of the parameters]',
-    ),
-}
+
+
+def _parameter(name: str) -> Decorator:
+    """An option for a parameter, by default that of --params."""
+    field = Config.__dataclass_fields__[name]
+    choices, flag = field.metadata['choices'], field.default is False
+    text = str(field.metadata['description'])
+    return click.option(
+        f'--{name.replace("_", "-")}',
+        type=click.Choice(choices) if choices else None,
+        is_flag=flag,
+        help=f'{text[0].upper()}{text[1:]}.' + ('' if flag else '  [default: as in --params]'),
+    )
 
 
 def config(*names: str) -> Decorator:
@@ -122,7 +118,7 @@ def config(*names: str) -> Decorator:
             chosen = {name: value for name, value in named.items() if value not in (None, False)}
             return command(*args, config=read_config(params_file, **chosen), **given)
 
-        return together(params, *(_PARAMETERS[name] for name in names))(with_config)
+        return together(params, *map(_parameter, names))(with_config)
 
     return decorate
 

@@ -54,9 +54,8 @@ def command(
     depth_scale: float | None,
     config: Config,
     overwrite: bool,
-    normals: bool,
-    curved: bool,
     sensor: bool,
+    **asked: bool,
 ) -> None:
     """Segment DEPTH images or organised clouds into planes.
 
@@ -73,7 +72,6 @@ def command(
     if count > 1:
         raise click.UsageError(f'{count} images named {name} would write the same results')
     segmenter = Segmenter(config)
-    asked = {'normals': normals, 'curved': curved}
     files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
     options.check_new(outputs, [path for path, _ in frames], overwrite)

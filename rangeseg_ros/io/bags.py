@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.io.recordings import BagError, Lost, Recording
+from rangeseg_ros.io.recordings import BagError, Closing, Lost, Recording
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.images import PIXEL_TYPES
@@ -25,7 +24,7 @@ class DamagedBagError(BagError):
     """A recording that cannot be read further than here."""
 
 
-class DepthBag:
+class DepthBag(Closing):
     """Iterates over the depth frames of one recording, in the order of the recording.
 
     Parameters
@@ -82,12 +81,6 @@ class DepthBag:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> DepthBag:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the files."""
@@ -228,7 +221,7 @@ class DepthBag:
 
 def open_frames(path: Path, topic: str | None, camera_topic: str | None) -> DepthBag:
     """Frames of a recording: those on `topic`, else depth images, else the only point clouds."""
-    with closing(Recording(path)) as recording:
+    with Recording(path) as recording:
         types, counts = recording.types, recording.counts
     clouds = sorted(name for name, kind in types.items() if kind == CLOUD and counts[name])
     if topic in clouds:

@@ -12,7 +12,7 @@ from collections.abc import Collection, Iterator, Mapping
 from functools import cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
@@ -23,6 +23,8 @@ from rosbags.typesys.store import Typestore
 
 from rangeseg_ros.io.files import FileError, check_regular, natural_order
 from rangeseg_ros.messages.make import TRANSFORMS
+
+Own = TypeVar('Own', bound='Closing')
 
 EARLY_TRANSFORMS = 'tf/msg/tfMessage'
 """Of ROS 1, until its nodes used tf2."""
@@ -53,6 +55,19 @@ def make_rosbags(kind: str, **fields: Any) -> Any:
 def is_rosbag1(path: Path) -> bool:
     """Whether it is a bag of ROS 1, and no folder of a rosbag2 that is called *.bag."""
     return path.suffix == '.bag' and not path.is_dir()
+
+
+class Closing:
+    """What is closed at the end of a with statement."""
+
+    def close(self) -> None:
+        """Close the files."""
+
+    def __enter__(self: Own) -> Own:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 class Record(NamedTuple):
@@ -142,7 +157,7 @@ class _Reader(rosbag2.Reader):
     }
 
 
-class Recording:
+class Recording(Closing):
     """A rosbag2 (directory, .mcap or .db3 file) or a ROS 1 .bag; BagError where it is neither.
 
     Attributes

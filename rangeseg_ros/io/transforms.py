@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
-from rangeseg_ros.io.recordings import EARLY_TRANSFORMS, BagError, Lost, Recording
+from rangeseg_ros.io.recordings import EARLY_TRANSFORMS, BagError, Closing, Lost, Recording
 from rangeseg_ros.messages.make import TRANSFORMS
 from rangeseg_ros.messages.transforms import insert_transforms
-
-Own = TypeVar('Own', bound='RecordedTransforms')
 
 MOVING, STATIC = '/tf', '/tf_static'
 TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
@@ -21,7 +19,7 @@ TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
 _LOOKED_AT = 10_000
 
 
-class RecordedTransforms:
+class RecordedTransforms(Closing):
     """What the node would know of frames when an image has waited for them.
 
     All static transforms count from the beginning. Of the others, what was recorded up to
@@ -35,10 +33,8 @@ class RecordedTransforms:
         self._moving = self._read()
         self._next = next(self._moving, None)
 
-    def __enter__(self: Own) -> Own:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
+    def close(self) -> None:
+        """Close the files."""
         self._recording.close()
 
     def lookup(self, target: str, source: str, stamp: int, time: int) -> Transform:
@@ -75,7 +71,7 @@ def fixed_frame_of(path: Path) -> str:
     parents: dict[str, str] = {}
     moving: set[str] = set()
     # What a recording lacks that is cut off is told by whoever reads the images.
-    with closing(Recording(path)) as recording, suppress(BagError):
+    with Recording(path) as recording, suppress(BagError):
         for topic in (STATIC, MOVING):
             for _, message in islice(_messages(recording, topic), _LOOKED_AT):
                 for one in message.transforms:

@@ -5,21 +5,26 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from rangeseg_ros.core.ground.classes import GROUND, UNKNOWN
-from rangeseg_ros.core.ground.grid import GroundGrid
+from rangeseg_ros.core.ground.grid import GroundGrid, empty_grid
 from rangeseg_ros.core.rotations import rotation_matrix
+from rangeseg_ros.messages.clouds import POINT_TYPE, cloud_message
 from rangeseg_ros.messages.make import GRID, Make, header_of, pose_of
 
 _LETHAL = 100
+_CELL_TYPE = np.dtype(
+    [*POINT_TYPE.descr, ('height_variance', '<f4'), ('class', '<u4'), ('age', '<f4')]
+)
 
 
-def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
+def grid_message(make: Make, header: Any, grid: GroundGrid | None) -> Any:
     """nav_msgs/OccupancyGrid: 0 ground, 100 obstacle or drop, -1 unknown.
 
     `header` is that of the image: its frame is used where the grid has no fixed one.
     """
+    grid = grid or empty_grid()
     values = np.where(grid.classes == GROUND, 0, _LETHAL).astype(np.int8)
     values[grid.classes == UNKNOWN] = -1
     info = make(
@@ -30,19 +35,15 @@ def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
         height=values.shape[0],
         origin=pose_of(make, grid.origin, grid.orientation),
     )
-    return make(GRID, header=grid_header(make, header, grid), info=info, data=values.ravel())
+    return make(GRID, header=_header(make, header, grid), info=info, data=values.ravel())
 
 
-def grid_header(make: Make, header: Any, grid: GroundGrid) -> Any:
-    """Header of the messages of a grid: in the fixed frame where it has one."""
-    return header_of(make, header.stamp, grid.frame) if grid.frame else header
-
-
-def grid_points(grid: GroundGrid) -> NDArray[np.float32]:
-    """Cells (N, 6) of a grid that are known: x, y, z, variance of the height, class, age.
+def grid_points_message(make: Make, header: Any, grid: GroundGrid | None) -> Any:
+    """sensor_msgs/PointCloud2 of the cells that are known.
 
     z is the height of the ground, or that of the ground below the camera where none was seen.
     """
+    grid = grid or empty_grid()
     rows, columns = np.nonzero(grid.classes != UNKNOWN)
     place = (np.column_stack([columns, rows]) + 0.5) * grid.resolution
     place = np.column_stack([place, np.zeros(len(rows))]) @ rotation_matrix(grid.orientation).T
@@ -51,4 +52,11 @@ def grid_points(grid: GroundGrid) -> NDArray[np.float32]:
     if grid.frame:
         place[:, 2] = np.where(np.isnan(height), place[:, 2], height)
     others = (values[rows, columns] for values in (grid.variance, grid.classes, grid.age))
-    return np.column_stack([place, *others]).astype(np.float32)
+    points = np.column_stack([place, *others])
+    records = unstructured_to_structured(points, _CELL_TYPE, casting='unsafe')
+    return cloud_message(make, _header(make, header, grid), records)
+
+
+def _header(make: Make, header: Any, grid: GroundGrid) -> Any:
+    """In the fixed frame where the grid has one."""
+    return header_of(make, header.stamp, grid.frame) if grid.frame else header

@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 # Makes a message from the name of its type and all its fields, e.g.
 # make('geometry_msgs/msg/Point', x=0.0, y=0.0, z=1.0); octets are given as uint8 arrays, and a
@@ -26,6 +27,10 @@ GRID, ODOMETRY = 'nav_msgs/msg/OccupancyGrid', 'nav_msgs/msg/Odometry'
 MARKERS = 'visualization_msgs/msg/MarkerArray'
 STATUS = 'diagnostic_msgs/msg/DiagnosticArray'
 TRANSFORMS = 'tf2_msgs/msg/TFMessage'
+
+
+class MessageError(ValueError):
+    """A message that is damaged, or not what is asked for."""
 
 
 def make_rclpy(kind: str, **fields: Any) -> Any:
@@ -75,6 +80,22 @@ def nanoseconds(stamp: Any) -> int:
     ROS 1 calls the parts secs and nsecs; rosbags gives both the names of ROS 2.
     """
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+def elements(message: Any, kind: np.dtype, step: int, what: str) -> NDArray:
+    """Elements (H, W) of an image or a cloud, native byte order; rows begin every `step` bytes.
+
+    The last row need not be padded. MessageError where its data are too few.
+    """
+    height, width, data = message.height, message.width, np.frombuffer(message.data, np.uint8)
+    row = width * kind.itemsize
+    if step < row or data.size < step * (height - 1) + row:
+        raise MessageError(
+            f'{data.size} bytes of data are too few for {width}x{height} {what} of '
+            f'{kind.itemsize} bytes in rows of {step} bytes'
+        )
+    found: NDArray = np.ndarray((height, width), kind, data, 0, (step, kind.itemsize))
+    return found.astype(kind.newbyteorder('='), copy=False)
 
 
 def vector(make: Make, kind: str, numbers: Iterable[float]) -> Any:

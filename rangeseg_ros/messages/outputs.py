@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.ground.grid import empty_grid
 from rangeseg_ros.core.ground.points import (
     MOST_POINTS,
     drops,
@@ -29,12 +28,11 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
 from rangeseg_ros.messages.clouds import (
-    grid_points_message,
     planes_message,
     points_message,
     stairs_message,
 )
-from rangeseg_ros.messages.grids import grid_header, grid_message, grid_points
+from rangeseg_ros.messages.grids import grid_message, grid_points_message
 from rangeseg_ros.messages.images import image_message
 from rangeseg_ros.messages.make import CLOUD, GRID, IMAGE, MARKERS, STATUS, Make, header_of
 from rangeseg_ros.messages.markers import (
@@ -92,31 +90,24 @@ def _points(
     return Output(CLOUD, message)
 
 
-def _result(kind: str, message: Callable[[Make, Any, Segmentation], Any]) -> Output:
-    """A topic that needs no image."""
-    return Output(kind, lambda make, header, image, result: message(make, header, result))
-
-
-def _grid_points(make: Make, header: Any, result: Segmentation) -> Any:
-    grid = result.grid or empty_grid()
-    return grid_points_message(make, grid_header(make, header, grid), grid_points(grid))
+def _of(
+    kind: str, message: Callable[[Make, Any, Any], Any], pick: Callable[[Segmentation], Any]
+) -> Output:
+    """A topic of a part of the result."""
+    return Output(kind, lambda make, header, image, result: message(make, header, pick(result)))
 
 
 OUTPUTS = {
     # What a robot stops for is published before pictures. Of edges, no point is left out that has
     # no other near it, however many there are.
     'drops': _points(drops, sys.maxsize),
-    'grid': _result(
-        GRID, lambda make, header, result: grid_message(make, header, result.grid or empty_grid())
-    ),
+    'grid': _of(GRID, grid_message, lambda result: result.grid),
     'obstacles': _points(lambda image, terrain: points_of_class(image, terrain, OBSTACLE)),
     'ground': _points(lambda image, terrain: points_of_class(image, terrain, GROUND)),
     'unseen': _points(unseen, sys.maxsize),
     'terrain': _image('mono8', lambda image, result: result.terrain),
     'labels': _image('mono16', lambda image, result: result.labels),
-    'planes': _result(
-        CLOUD, lambda make, header, result: planes_message(make, header, result.planes)
-    ),
+    'planes': _of(CLOUD, planes_message, lambda result: result.planes),
     'markers': _markers(lambda image, result: of_planes(result.planes)),
     'overlay': _image(
         'rgb8', lambda image, result: overlay(image.inverse, result.labels, result.planes)
@@ -127,11 +118,9 @@ OUTPUTS = {
         lambda image, result: of_outline(outlines(image, result.ground) if result.ground else [])
     ),
     'stairs': _markers(lambda image, result: of_stairs(result.stairs) + of_ramps(result.ramps)),
-    'stairs_points': _result(
-        CLOUD, lambda make, header, result: stairs_message(make, header, result.stairs)
-    ),
-    'grid_points': _result(CLOUD, _grid_points),
-    'status': _result(STATUS, status_message),
+    'stairs_points': _of(CLOUD, stairs_message, lambda result: result.stairs),
+    'grid_points': _of(CLOUD, grid_points_message, lambda result: result.grid),
+    'status': _of(STATUS, status_message, lambda result: result),
 }
 
 IN_TARGET = frozenset({'planes', 'markers'})

@@ -180,27 +180,22 @@ class FrameStatistics:
         if source is None:
             busy = f'; {self.compiling}' if self.compiling else ''
             return DiagnosticStatus.OK, f'idle: nobody listens{busy}'
-        lost = self.lost(source)
-        if silent := self.silence(source, stall_timeout):
-            return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
-        if problem := source.problem or self.problem:
-            return DiagnosticStatus.ERROR, problem
-        found = self.found
-        if found and found.verdict.invalid:
-            return DiagnosticStatus.ERROR, str(found.verdict)
-        if (stalled := self.stalled()) > stall_timeout:
-            return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {self.doing()}'
-        if self.compiling:
-            return DiagnosticStatus.WARN, self.compiling
-        if lost:
-            return DiagnosticStatus.WARN, lost
-        if self.no_terrain:
-            return DiagnosticStatus.ERROR, self.no_terrain
-        if self.missing:
-            return DiagnosticStatus.WARN, self.missing
-        if found and not found.verdict.ok:
-            return DiagnosticStatus.WARN, str(found.verdict)
-        if found and not found.planes:
-            return DiagnosticStatus.WARN, f'no planes: {found.reason}'
+        error, warning = DiagnosticStatus.ERROR, DiagnosticStatus.WARN
+        lost, found, stalled = self.lost(source), self.found, self.stalled()
+        silence = self.silence(source, stall_timeout)
+        no_output = f'no output for {stalled:.1f} s: {self.doing()}'
+        problems = [
+            (error, '; '.join(filter(None, (lost, silence))) if silence else ''),
+            (error, source.problem or self.problem),
+            (error, str(found.verdict) if found and found.verdict.invalid else ''),
+            (error, no_output if stalled > stall_timeout else ''),
+            (warning, self.compiling),
+            (warning, lost),
+            (error, self.no_terrain),
+            (warning, self.missing),
+            (warning, str(found.verdict) if found and not found.verdict.ok else ''),
+            (warning, f'no planes: {found.reason}' if found and not found.planes else ''),
+        ]
         count = len(found.planes) if found else 0
-        return DiagnosticStatus.OK, f'{count} planes at {self.published.rate():.1f} Hz'
+        fine = DiagnosticStatus.OK, f'{count} planes at {self.published.rate():.1f} Hz'
+        return next((problem for problem in problems if problem[1]), fine)
