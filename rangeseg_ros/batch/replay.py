@@ -136,63 +136,61 @@ class Replay:
         return result_key(settings, correction_files(self.config), parts)
 
 
+@dataclass
 class _Results:
     """Writes what a replay leaves of every frame, and of all of them."""
 
-    def __init__(
-        self,
-        replay: Replay,
-        folder: Path,
-        add_planes: Callable[[Iterable[Iterable[Any]]], None],
-        bag: ResultBag,
-        located: Locator,
-    ) -> None:
-        self._terrain, self._config = replay.terrain, replay.config
-        self._folder, self._bag, self._located = folder, bag, located
-        self._add_planes = add_planes
-        self._report = ReplayReport(replay.recording.name, replay.config)
-        self._sequence = SequenceSegmenter(replay.config)
-        self._trajectory: list[tuple[int, Transform]] = []
-        self._ground: list[list[Any]] = []
-        self._stairs: list[list[Any]] = []
-        self._tilts: list[Tilt] = []
-        self._doubts: Counter[str] = Counter()
+    replay: Replay
+    folder: Path
+    add_planes: Callable[[Iterable[Iterable[Any]]], None]
+    bag: ResultBag
+    located: Locator
+    trajectory: list[tuple[int, Transform]] = field(default_factory=list)
+    ground: list[list[Any]] = field(default_factory=list)
+    stairs: list[list[Any]] = field(default_factory=list)
+    tilts: list[Tilt] = field(default_factory=list)
+    doubts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.config = self.replay.config
+        self.report = ReplayReport(self.replay.recording.name, self.config)
+        self.sequence = SequenceSegmenter(self.config)
 
     def messages(self, source: DepthBag, progress: Progress | None) -> Iterator[Timed]:
         """Segment the frames and write their files; the messages for the bag."""
-        sequence, target_frame = self._sequence, self._config.target_frame
+        sequence, target_frame = self.sequence, self.config.target_frame
         for index, frame, image, result in segment_frames(
-            source, sequence, self._located.place, progress
+            source, sequence, self.located.place, progress
         ):
             self._write(index, frame.stamp, image, result)
-            to_target = self._located.last.target
+            to_target = self.located.last.target
             target = (target_frame, to_target) if to_target else None
-            yield from self._bag.messages(frame, image, result, target, sequence.motion)
+            yield from self.bag.messages(frame, image, result, target, sequence.motion)
 
     def _write(self, index: int, stamp: int, image: RangeImage, result: Segmentation) -> None:
         leading = [str(index), '{}.{:09d}'.format(*divmod(stamp, 10**9))]
-        kinds = PICTURES + TERRAIN if self._terrain else PICTURES
+        kinds = PICTURES + TERRAIN if self.replay.terrain else PICTURES
         stem = f'{index:06d}_{leading[1]}'
-        files = write_frame(self._folder, stem, image, result, kinds)
-        self._add_planes([*leading, *values(plane)] for plane in result.planes)
-        self._report.add(stamp, result, files['overlay'])
-        self._doubts.update(result.verdict.details)
+        files = write_frame(self.folder, stem, image, result, kinds)
+        self.add_planes([*leading, *values(plane)] for plane in result.planes)
+        self.report.add(stamp, result, files['overlay'])
+        self.doubts.update(result.verdict.details)
         if result.tilt:
-            self._tilts.append(result.tilt)
-        if self._terrain:
-            self._ground.append([*leading, *ground_values(result)])
-            self._stairs += [[*leading, *stairs_values(seen)] for seen in result.stairs]
-        if self._sequence.motion:
-            self._trajectory.append((stamp, self._sequence.motion.pose))
+            self.tilts.append(result.tilt)
+        if self.replay.terrain:
+            self.ground.append([*leading, *ground_values(result)])
+            self.stairs += [[*leading, *stairs_values(seen)] for seen in result.stairs]
+        if self.sequence.motion:
+            self.trajectory.append((stamp, self.sequence.motion.pose))
 
     def finish(self, source: DepthBag) -> Outcome:
         """Write what is of all frames."""
-        folder, config, mapped = self._folder, self._config, self._sequence.map
-        if self._terrain:
-            write_table(folder / 'ground.csv', [*LEADING, *GROUND], self._ground)
-            write_table(folder / 'stairs.csv', [*LEADING, *STAIRS], self._stairs)
+        folder, config, mapped = self.folder, self.config, self.sequence.map
+        if self.replay.terrain:
+            write_table(folder / 'ground.csv', [*LEADING, *GROUND], self.ground)
+            write_table(folder / 'stairs.csv', [*LEADING, *STAIRS], self.stairs)
         if config.odometry:
-            write_trajectory(folder / 'trajectory.txt', self._trajectory)
+            write_trajectory(folder / 'trajectory.txt', self.trajectory)
         if config.map_frame:
             without = ('label',)
             rows = [values(plane, without) for plane in mapped.planes]
@@ -200,16 +198,16 @@ class _Results:
             shades = colours([plane.id for plane in mapped.planes])
             write_mesh(folder / 'map.ply', mapped.planes, shades)
         damage = [source.damage, source.loss()]
-        if lost := self._bag.lost:
+        if lost := self.bag.lost:
             reason, count = lost.most_common(1)[0]
             damage.append(f'{lost.total()} messages not copied, {count} of {reason}')
-        report, contradicted = self._report, mapped.doubts if config.map_frame else []
+        report, contradicted = self.report, mapped.doubts if config.map_frame else []
         notes = [f'{n} frames without a plane: {why}' for why, n in report.reasons.items()]
-        notes += [f'{n} frames without the {what}' for what, n in self._located.problems.items()]
-        warnings = [f'{n} frames: {doubt}' for doubt, n in self._doubts.items()]
-        if self._tilts:
-            worst = max(self._tilts, key=lambda tilt: tilt.degrees)
-            warnings.append(f'{len(self._tilts)} frames: {worst}')
+        notes += [f'{n} frames without the {what}' for what, n in self.located.problems.items()]
+        warnings = [f'{n} frames: {doubt}' for doubt, n in self.doubts.items()]
+        if self.tilts:
+            worst = max(self.tilts, key=lambda tilt: tilt.degrees)
+            warnings.append(f'{len(self.tilts)} frames: {worst}')
         warnings += [f'poses: {doubt}' for doubt in contradicted]
         outcome = Outcome(
             report.frames,

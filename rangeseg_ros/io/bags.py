@@ -27,32 +27,17 @@ class DamagedBagError(BagError):
 class DepthBag(Closing):
     """Iterates over the depth frames of one recording, in the order of the recording.
 
-    Parameters
-    ----------
-    path : Path
-        Directory or .mcap or .db3 file of a rosbag2, or .bag file of ROS 1.
-    depth_topic, camera_topic : str, optional
-        Where to find images and intrinsics. By default the depth image is found by type and
-        name, or encoding; its camera_info is the sibling topic, or the only one there is.
-    raw : bool
-        The images are raw whatever the name of their topic says, see `raw_by_name`.
-    clouds : bool
-        The frames are the clouds on `depth_topic`, which need no camera.
+    `path` is a directory or .mcap or .db3 file of a rosbag2, or a .bag file of ROS 1. By default
+    the depth image is found by type and name, or encoding; its camera_info is the sibling topic,
+    or the only one there is. `raw` says that the images are raw whatever the name of their topic
+    says, `clouds` that the frames are the clouds on `depth_topic`, which need no camera.
 
-    Attributes
-    ----------
-    lost : Counter of str
-        Why frames were left out while iterating -> how many.
-    damage : str
-        For those who iterate to note what ended it.
+    `lost` counts why frames were left out while iterating; `damage` is for those who iterate to
+    note what ended it.
 
-    Raises
-    ------
-    BagError
-        Not a recording, or one without depth images or camera_info: the message lists its
-        topics. Also one without any image of a known encoding that its camera_info fits.
-    DamagedBagError
-        While iterating, after the last frame before the damage.
+    BagError: not a recording, or one without depth images or camera_info (the message lists its
+    topics), or without any image of a known encoding that its camera_info fits. DamagedBagError:
+    while iterating, after the last frame before the damage.
     """
 
     def __init__(

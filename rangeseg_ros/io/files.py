@@ -35,14 +35,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     On success it is moved to `path`, or to what that links to; after an exception nothing is
     left. A file keeps its mode; other names (hard links) of one that is replaced stay with what it
-    was.
-
-    Raises
-    ------
-    FileError
-        `path` is a device, a pipe or the like.
-    OSError
-        It cannot be written; of a full disk, too, the error names the file.
+    was. FileError: `path` is a device, a pipe or the like. OSError: it cannot be written; of a
+    full disk, too, the error names the file.
     """
     path = resolved(path) if path.is_symlink() else path
     check_regular(path)

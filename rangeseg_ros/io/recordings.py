@@ -160,16 +160,9 @@ class _Reader(rosbag2.Reader):
 class Recording(Closing):
     """A rosbag2 (directory, .mcap or .db3 file) or a ROS 1 .bag; BagError where it is neither.
 
-    Attributes
-    ----------
-    types : dict of str
-        Message type of each topic, in the ROS 2 form.
-    counts : Counter of str
-        Messages of each topic, of a file without its end those that can be read.
-    connections : list of rosbags.interfaces.Connection
-        The topics with all that is recorded of them.
-    cut : str
-        Why a file has no end; empty when all have.
+    `types` are the message types of the topics, in the ROS 2 form; `counts` the numbers of their
+    messages, of a file without its end those that can be read; `connections` all that is recorded
+    of them. `cut` says why a file has no end; empty when all have.
     """
 
     def __init__(self, path: Path) -> None:

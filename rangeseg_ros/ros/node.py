@@ -55,12 +55,8 @@ class SegmentPlanes(LifecycleNode):
     The executor's thread receives, answers parameter requests and reports; the threads of
     `Pipeline` compute and publish, and that of `Settings` has kernels compiled.
 
-    A managed node with the parameter `managed`; else it is configured and active at once.
-
-    Parameters
-    ----------
-    **node_kwargs
-        Of `rclpy.node.Node`, such as `namespace`: several fit into one process.
+    A managed node with the parameter `managed`; else it is configured and active at once. The
+    arguments are those of `rclpy.node.Node`, such as `namespace`: several fit into one process.
     """
 
     def __init__(self, node_name: str = 'segment_planes', **node_kwargs: Any) -> None:
