@@ -17,6 +17,19 @@ from rangeseg_ros.io.params import read_config
 from rangeseg_ros.io.yaml_files import read_yaml
 
 
+def grown(part, whole):
+    """A small file whose aliases stand for millions of nodes."""
+    lines = [f'a{k}: &a{k} ' + whole.format(9 * part.format(f'*a{k - 1}')) for k in range(1, 9)]
+    return '\n'.join(['a0: &a0 {y: 1}', *lines])
+
+
+def test_aliases_are_read(tmp_path):
+    path = tmp_path / 'file.yaml'
+    path.write_text('a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]')
+    a = {'x': 1, 'y': 2}
+    assert read_yaml(path) == {'a': a, 'b': {'x': 1, 'y': 3}, 'c': [a, a]}
+
+
 @pytest.mark.parametrize(
     ('content', 'message'),
     [
@@ -24,6 +37,12 @@ from rangeseg_ros.io.yaml_files import read_yaml
         ('a: ' + 'x' * 2**21, 'too large'),
         ('a: 2001-99-99', 'not a YAML file'),
         ('a: \x00', 'not a YAML file'),
+        (grown('{}, ', '{{x: [{}]}}'), 'too often'),
+        (grown('{}, ', '{{<<: [{}]}}'), 'too often'),
+        (
+            f'a: &a {{{"".join(f"{k}: 1, " for k in range(3000))}}}\nb: [{"*a, " * 9000}]',
+            'too often',
+        ),
     ],
 )
 def test_yaml_that_would_take_for_ever(tmp_path, content, message):
