@@ -74,10 +74,19 @@ def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R
     if jobs <= 1:
         yield from map(_attempted, tasks)
         return
-    waiting = deque(range(len(tasks)))
     results: dict[int, R | Failure] = {}
     given = 0
-    while given < len(tasks):
+    for number, result in _completed(tasks, jobs):
+        results[number] = result
+        while given in results:
+            yield results.pop(given)
+            given += 1
+
+
+def _completed(tasks: Sequence[Task[R]], jobs: int) -> Iterator[tuple[int, R | Failure]]:
+    """Numbers of tasks and what came of them, in the order in which they end."""
+    waiting = deque(range(len(tasks)))
+    while waiting:
         running: dict[Future[R | Failure], int] = {}
         with _workers(jobs) as pool, suppress(BrokenProcessPool):
             while waiting or running:
@@ -86,16 +95,10 @@ def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R
                     future = pool.submit(_attempted, tasks[waiting[0]])
                     running[future] = waiting.popleft()
                 for future in wait_for(running, return_when=FIRST_COMPLETED).done:
-                    results[running[future]] = future.result()
-                    del running[future]
-                while given in results:
-                    yield results.pop(given)
-                    given += 1
+                    result = future.result()
+                    yield running.pop(future), result
         for number in sorted(running.values()):
-            results[number] = _attempted_alone(tasks[number])
-        while given in results:
-            yield results.pop(given)
-            given += 1
+            yield number, _attempted_alone(tasks[number])
 
 
 def _attempted(task: Task[R]) -> R | Failure:

@@ -24,20 +24,11 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.digest import result_key
 from rangeseg_ros.drawing import colours
+from rangeseg_ros.io import tables
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
 from rangeseg_ros.io.meshes import write_mesh
 from rangeseg_ros.io.poses import write_trajectory
-from rangeseg_ros.io.tables import (
-    GROUND,
-    STAIRS,
-    columns,
-    ground_values,
-    open_table,
-    stairs_values,
-    values,
-    write_table,
-)
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
 
@@ -110,7 +101,9 @@ class Replay:
             results_folder.replacing() as made,
             self._open() as source,
             Locator(self.recording, self.config) as located,
-            open_table(made.path / 'planes.csv', [*LEADING, *columns()]) as add_planes,
+            tables.open_table(
+                made.path / 'planes.csv', [*LEADING, *tables.columns()]
+            ) as add_planes,
             ResultBag(made.bag, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
@@ -172,14 +165,14 @@ class _Results:
         kinds = PICTURES + TERRAIN if self.replay.terrain else PICTURES
         stem = f'{index:06d}_{leading[1]}'
         files = write_frame(self.folder, stem, image, result, kinds)
-        self.add_planes([*leading, *values(plane)] for plane in result.planes)
+        self.add_planes([*leading, *tables.values(plane)] for plane in result.planes)
         self.report.add(stamp, result, files['overlay'])
         self.doubts.update(result.verdict.details)
         if result.tilt:
             self.tilts.append(result.tilt)
         if self.replay.terrain:
-            self.ground.append([*leading, *ground_values(result)])
-            self.stairs += [[*leading, *stairs_values(seen)] for seen in result.stairs]
+            self.ground.append([*leading, *tables.ground_values(result)])
+            self.stairs += [[*leading, *tables.stairs_values(seen)] for seen in result.stairs]
         if self.sequence.motion:
             self.trajectory.append((stamp, self.sequence.motion.pose))
 
@@ -187,14 +180,14 @@ class _Results:
         """Write what is of all frames."""
         folder, config, mapped = self.folder, self.config, self.sequence.map
         if self.replay.terrain:
-            write_table(folder / 'ground.csv', [*LEADING, *GROUND], self.ground)
-            write_table(folder / 'stairs.csv', [*LEADING, *STAIRS], self.stairs)
+            tables.write_table(folder / 'ground.csv', [*LEADING, *tables.GROUND], self.ground)
+            tables.write_table(folder / 'stairs.csv', [*LEADING, *tables.STAIRS], self.stairs)
         if config.odometry:
             write_trajectory(folder / 'trajectory.txt', self.trajectory)
         if config.map_frame:
             without = ('label',)
-            rows = [values(plane, without) for plane in mapped.planes]
-            write_table(folder / 'map.csv', columns(MapPlane, without), rows)
+            rows = [tables.values(plane, without) for plane in mapped.planes]
+            tables.write_table(folder / 'map.csv', tables.columns(MapPlane, without), rows)
             shades = colours([plane.id for plane in mapped.planes])
             write_mesh(folder / 'map.ply', mapped.planes, shades)
         damage = [source.damage, source.loss()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
@@ -221,6 +222,13 @@ def check_new(paths: Iterable[Path], inputs: Iterable[Path], overwrite: bool) ->
             raise NotReplacedError(path, 'is an input, not overwritten')
         if not overwrite and path.exists():
             raise NotReplacedError(path, 'exists already, not overwritten (see --overwrite)')
+
+
+def check_distinct(names: Iterable[str], what: str) -> None:
+    """Refuse inputs of one name, which results are called by."""
+    name, number = Counter(names).most_common(1)[0]
+    if number > 1:
+        raise click.UsageError(f'{number} {what} named {name} would write the same results')
 
 
 def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,9 +67,7 @@ def command(
     <stem>_stairs.csv. Nothing that is there already is replaced, unless --overwrite says so.
     """
     frames = [(file, depth_scale or scale_of(path)) for path in depth for file in files_in(path)]
-    name, count = Counter(path.stem for path, _ in frames).most_common(1)[0]
-    if count > 1:
-        raise click.UsageError(f'{count} images named {name} would write the same results')
+    options.check_distinct((path.stem for path, _ in frames), 'images')
     segmenter = Segmenter(config)
     files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,7 +62,8 @@ class DepthBag(Closing):
             self.camera_topic = camera_topic or self._find_camera_topic()
             self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
             self._first_camera = self._first(self.camera_topic, self._camera)
-            self._find_frame()
+            # There is a frame that can be read.
+            self._first(self.depth_topic, DepthFrame.range_image, self)
         except BaseException:
             self.close()
             raise
@@ -118,36 +119,23 @@ class DepthBag(Closing):
     def _camera(self, message: Any) -> Camera:
         return camera_from_message(message, True if self._raw else raw_by_name(self.depth_topic))
 
-    def _first(self, topic: str, made: Callable[[Any], T]) -> T:
-        """What is made of the first message on a topic of which it can be."""
+    def _first(self, topic: str, made: Callable[[Any], T], items: Iterable[Any] = ()) -> T:
+        """What is made of the first item, or message on a topic, of which it can be."""
         reason = f'no message on {topic}'
         try:
-            for _, _, message in self._recording.messages((topic,)):
-                if isinstance(message, Lost):
-                    reason = f'no readable message on {topic}: {message.reason}'
+            messages = (message for *_, message in self._recording.messages((topic,)))
+            for item in items or messages:
+                if isinstance(item, Lost):
+                    self.lose(item.reason)
                     continue
                 try:
-                    return made(message)
-                except CameraError as error:
+                    return made(item)
+                except ValueError as error:
                     reason = f'{topic}: {error}'
         except Exception as error:
             reason = f'no readable message on {topic}: {error}'
-        raise BagError(f'{self.path}: {reason}')
-
-    def _find_frame(self) -> None:
-        """Make sure that there is a frame that can be read."""
-        reason = f'no message on {self.depth_topic}'
-        try:
-            for frame in self:
-                try:
-                    frame.range_image()
-                    return
-                except ValueError as error:
-                    reason = f'{self.depth_topic}: {error}'
-        except DamagedBagError as error:
-            reason = f'no readable message on {self.depth_topic}: {error}'
         if self.lost:
-            reason = f'no readable message on {self.depth_topic}: {next(iter(self.lost))}'
+            reason = f'no readable message on {topic}: {next(iter(self.lost))}'
         raise BagError(f'{self.path}: {reason}')
 
     def _find_depth_topic(self) -> str:

@@ -18,15 +18,12 @@ from rangeseg_ros.io.images import read_mask
 
 def _load(read: Callable[[Path], Any], path: Path) -> Any:
     """What `read` makes of a file, kept as long as that does not change."""
-    try:
-        state = path.stat()
-    except OSError:
-        return read(path)  # which says what is wrong
-    return _kept(read, path, state.st_mtime_ns, state.st_size)
+    state = path.stat() if path.exists() else None
+    return _kept(read, path, state and (state.st_mtime_ns, state.st_size))
 
 
 @lru_cache(maxsize=8)
-def _kept(read: Callable[[Path], Any], path: Path, time: int, size: int) -> Any:
+def _kept(read: Callable[[Path], Any], path: Path, state: object) -> Any:
     return read(path)
 
 

@@ -34,10 +34,7 @@ def read_pcd(path: Path) -> dict[str, NDArray]:
         raise FileError(f'{path}: {error}') from None
     except (ValueError, TypeError, IndexError, OverflowError, MemoryError, struct.error):
         raise FileError(f'{path}: malformed or truncated') from None
-    return {
-        name: records[name].reshape(*shape, *dtype[name].shape).copy()
-        for name in dtype.names or ()
-    }
+    return {name: records.reshape(shape)[name].copy() for name in dtype.names or ()}
 
 
 def _split(data: bytes) -> tuple[dict[str, list[str]], bytes]:

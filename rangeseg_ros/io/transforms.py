@@ -11,7 +11,7 @@ from typing import Any
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
 from rangeseg_ros.io.recordings import EARLY_TRANSFORMS, BagError, Closing, Lost, Recording
 from rangeseg_ros.messages.make import TRANSFORMS
-from rangeseg_ros.messages.transforms import insert_transforms
+from rangeseg_ros.messages.motion import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'
 TYPES = (TRANSFORMS, EARLY_TRANSFORMS)

@@ -56,7 +56,7 @@ class DepthInput:
         self._node = node
         self._accept = accept
         self._waiting: tuple[Any, int] | None = None
-        self._cameras: StampPairing[CameraInfo] = StampPairing()
+        self._cameras = StampPairing()
         self._largest = 0
         self.pairing = ''
         self.problem = ''
@@ -67,19 +67,13 @@ class DepthInput:
             MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info)
             for info_topic in info_topics
         ]
-        take = self._on_image if info_topics else self._on_cloud
-        self._subscription = MatchedSubscription(node, _KINDS[source], topic, take, losses)
+        kind = _KINDS[source]
+        self.subscription = MatchedSubscription(node, kind, topic, self._on_message, losses)
 
     @property
     def topic(self) -> str:
         """Topic of the depth messages."""
-        return self._subscription.topic
-
-    def publishers(self) -> str:
-        """How many publishers the topic has, and which of their types are not what is read."""
-        others = self._subscription.other_types
-        of = f' of {", ".join(others)}' if others else ''
-        return f'{self._subscription.publishers} publishers{of}'
+        return self.subscription.topic
 
     def loss_hint(self) -> str:
         """What may help against lost depth messages; empty when nothing is known to."""
@@ -95,29 +89,26 @@ class DepthInput:
 
     def follow_publishers(self) -> None:
         """Keep the quality of service at what the publishers offer."""
-        for subscription in (self._subscription, *self._infos):
+        for subscription in (self.subscription, *self._infos):
             subscription.follow_publishers()
 
     def destroy(self) -> None:
         """Unsubscribe."""
-        for subscription in (self._subscription, *self._infos):
+        for subscription in (self.subscription, *self._infos):
             subscription.destroy()
 
-    def _on_cloud(self, message: PointCloud2) -> None:
-        self._arrived(message)
-        self._accept(DepthFrame(message, None, self._now()))
-
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        self._arrived(message)
+    def _on_message(self, message: Image | CompressedImage | PointCloud2) -> None:
+        self.last_arrival = time.monotonic()
+        self._largest = max(self._largest, len(message.data))
+        arrival = int(self._node.get_clock().now().nanoseconds)
+        if not self._infos:
+            self._accept(DepthFrame(message, None, arrival))
+            return
         if self._waiting:
             self._cameras.give_up()
             self._hand_on()
-        self._waiting = message, self._now()
+        self._waiting = message, arrival
         self._hand_on()
-
-    def _arrived(self, message: Any) -> None:
-        self.last_arrival = time.monotonic()
-        self._largest = max(self._largest, len(message.data))
 
     def _on_camera_info(self, info: CameraInfo) -> None:
         self._cameras.add(nanoseconds(info.header.stamp), info)
@@ -160,9 +151,6 @@ class DepthInput:
     def _warn(self, problem: str) -> None:
         self.problem = problem
         self._node.get_logger().warning(problem, throttle_duration_sec=5.0)
-
-    def _now(self) -> int:
-        return int(self._node.get_clock().now().nanoseconds)
 
 
 def input_topics(node: Node, source: str) -> list[str]:

@@ -165,7 +165,8 @@ class FrameStatistics:
         silence = time.monotonic() - source.last_arrival
         if silence <= stall_timeout:
             return ''
-        return f'no depth message on {source.topic} for {silence:.1f} s ({source.publishers()})'
+        publishers = source.subscription.publishers()
+        return f'no depth message on {source.topic} for {silence:.1f} s ({publishers})'
 
     def lost(self, source: DepthInput) -> str:
         """What share of the messages of `source` is lost, and what may help; empty when none."""

@@ -19,7 +19,7 @@ from rangeseg_ros.core.mapping.placement import Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer, TransformError
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import TRANSFORMS, message_class, nanoseconds
-from rangeseg_ros.messages.transforms import insert_transforms
+from rangeseg_ros.messages.motion import insert_transforms
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.ros.qos import MatchedSubscription
 

@@ -49,18 +49,13 @@ class MatchedSubscription:
         """Name of the topic, remapped."""
         return str(self._subscription.topic_name)
 
-    @property
-    def publishers(self) -> int:
-        """Number of publishers, whether their quality of service fits or not."""
-        return int(self._node.count_publishers(self.topic))
-
-    @property
-    def other_types(self) -> list[str]:
-        """Types that are published on the topic and are not that of the subscription."""
+    def publishers(self) -> str:
+        """How many publishers the topic has, and which of their types are not what is read."""
         kind = self._arguments[0]
         own = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
         offers = self._node.get_publishers_info_by_topic(self.topic)
-        return sorted({info.topic_type for info in offers} - {own})
+        others = sorted({info.topic_type for info in offers} - {own})
+        return f'{len(offers)} publishers' + (f' of {", ".join(others)}' if others else '')
 
     def follow_publishers(self) -> None:
         """Subscribe anew where the publishers there are now offer something else.
@@ -68,7 +63,7 @@ class MatchedSubscription:
         Called by the middleware's events, and to be called now and then: the event of a
         publisher that leaves may come before the list of publishers is without it.
         """
-        self._single = self.publishers == 1
+        self._single = self._node.count_publishers(self.topic) == 1
         # A topic that has lost its last publisher keeps its policies for when that comes back.
         best = self._best_offered(self.topic)
         if best and best != self._offered and not self._overridden:
