@@ -23,7 +23,7 @@ from rangeseg_ros.io.images import (
 )
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.recordings import message_types
-from rangeseg_ros.io.tables import columns, values, write_table
+from rangeseg_ros.io.tables import columns, open_table, values
 
 
 def test_depth_of_16_bits_and_floats(tmp_path):
@@ -221,12 +221,13 @@ def _plane(**changes):
 
 def test_plane_table(tmp_path):
     path = tmp_path / 'planes.csv'
-    planes = {0: _plane(), 1: _plane(label=2), 2: _plane(distance=1 / 3)}
-    write_table(path, ['frame', *columns()], [[n // 2 * 2, *values(p)] for n, p in planes.items()])
-    with path.open() as file:
-        assert file.readline() == ','.join(['frame', *columns()]) + '\n'
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
+    with open_table(path, ['frame', *columns()]) as append:
+        assert path.read_text() == ','.join(['frame', *columns()]) + '\n'
+        append([0, *values(plane)] for plane in (_plane(), _plane(label=2)))
+        append([])
+        append([[2, *values(_plane(distance=1 / 3))]])
+        with path.open() as file:  # on disk before the table is closed
+            rows = list(csv.DictReader(file))
     assert [(row['frame'], row['label']) for row in rows] == [('0', '1'), ('0', '2'), ('2', '1')]
     assert [float(rows[0][f'normal_{axis}']) for axis in 'xyz'] == [0.0, 0.6, -0.8]
     assert float(rows[0]['covariance_yd']) == 7.0  # normal_y with distance

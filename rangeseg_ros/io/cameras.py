@@ -22,10 +22,8 @@ def read_camera(path: Path, raw: bool = False) -> Camera:
     that cannot be read, or without valid intrinsics.
     """
     calibration = read_yaml(path)
-    if not isinstance(calibration, dict):
-        raise CameraError(f'{path}: not a camera calibration')
     # JSON is YAML. Open3D writes K by columns, with the poses of cameras inside `intrinsic`.
-    inner = calibration.get('intrinsic', calibration)
+    inner = calibration.get('intrinsic', calibration) if isinstance(calibration, dict) else None
     if isinstance(inner, dict) and 'intrinsic_matrix' in inner:
         try:
             k = np.array(inner['intrinsic_matrix'], float).reshape(3, 3).T
@@ -53,7 +51,7 @@ def camera_from_calibration(calibration: Mapping[str, Any], raw: bool | None = N
         A missing or malformed key, named in the message.
     """
     if not isinstance(calibration, Mapping):
-        raise CameraError('malformed camera calibration: no mapping')
+        raise CameraError('not a camera calibration: no mapping')
     for key in ('image_width', 'image_height', 'camera_matrix'):
         if calibration.get(key) is None:
             raise CameraError(f'camera calibration lacks {key!r}')

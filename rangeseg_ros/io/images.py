@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from rangeseg_ros.io.files import FileError, read_bytes, replacing
-from rangeseg_ros.messages.images import png_shape
+from rangeseg_ros.messages.images import shape_and_pages
 
 
 def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
@@ -65,9 +63,9 @@ def write_image(path: Path, image: NDArray) -> None:
 
 def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     data = read_bytes(path)
-    size, pages = png_shape(data), 1
+    size, pages = shape_and_pages(data, 'PNG')
     if size is None:
-        size, pages = _tiff_shape(data)
+        size, pages = shape_and_pages(data, 'TIFF')
     if size and shape and size != shape:
         raise FileError(
             f'{path}: depth image is {size[1]}x{size[0]}, its camera {shape[1]}x{shape[0]}'
@@ -82,13 +80,3 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     if pages > 1:
         warnings.warn(f'{path}: only the first of {pages} pages is read', stacklevel=3)
     return image
-
-
-def _tiff_shape(data: bytes) -> tuple[tuple[int, int] | None, int]:
-    """(H, W) of the first page of a TIFF, and the number of pages; None for others."""
-    try:
-        with Image.open(io.BytesIO(data), formats=['TIFF']) as file:
-            return file.size[::-1], getattr(file, 'n_frames', 1)
-    # Damaged bytes are met with exceptions of every kind.
-    except Exception:
-        return None, 0

@@ -63,7 +63,7 @@ def _compressed(
         raise MessageError(f'compressed depth image of {raw.size} bytes has no PNG')
     _, a, b = _HEADER.unpack(raw[: _HEADER.size].tobytes())
     png = raw[_HEADER.size :]
-    size = png_shape(png.tobytes())
+    size, _ = shape_and_pages(png.tobytes(), 'PNG')
     if size and shape and size != shape:
         raise MessageError(
             f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
@@ -87,20 +87,21 @@ def _compressed(
     return depth
 
 
-def png_shape(data: bytes) -> tuple[int, int] | None:
-    """(H, W) of a PNG; None when it is none, or its checksums say that it is damaged.
+def shape_and_pages(data: bytes, kind: str) -> tuple[tuple[int, int] | None, int]:
+    """(H, W) of a PNG or of the first page of a TIFF, and the number of pages.
 
-    Found before decoding: OpenCV would take gigabytes for a damaged length, and libpng complain on
-    stderr.
+    None for others, and for a PNG whose checksums say that it is damaged. Found before decoding:
+    OpenCV would take gigabytes for a damaged length, and libpng complain on stderr.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=['PNG']) as file:
-            width, height = file.size
-            file.verify()
+        with Image.open(io.BytesIO(data), formats=[kind]) as file:
+            found = file.size[::-1], getattr(file, 'n_frames', 1)
+            if kind == 'PNG':
+                file.verify()
+            return found
     # Damaged bytes are met with exceptions of every kind.
     except Exception:
-        return None
-    return height, width
+        return None, 0
 
 
 def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:

@@ -89,11 +89,11 @@ class FrameStatistics:
         self.times: FrameTimes | None = None
         self._unanswered: float | None = None
 
-    def accepted(self, replaced: bool) -> None:
-        """Count a frame that arrived, and the one that it replaced."""
+    def accepted(self, replaced: int) -> None:
+        """Count a frame that arrived, and those that it replaced."""
         self.received.add()
         if replaced:
-            self.dropped.add()
+            self.dropped.add(replaced)
         if self._unanswered is None:
             self._unanswered = time.monotonic()
 

@@ -82,10 +82,7 @@ class Pipeline:
 
     def put(self, frame: DepthFrame) -> None:
         """Take a frame in place of one that waits."""
-        dropped = self._frames.put(frame)
-        self._statistics.accepted(replaced=dropped > 0)
-        if dropped > 1:
-            self._statistics.dropped.add(dropped - 1)
+        self._statistics.accepted(replaced=self._frames.put(frame))
 
     def stop(self, patience: float) -> bool:
         """Let the frames in hand be finished; False when it takes more seconds than that."""
