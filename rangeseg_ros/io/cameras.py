@@ -51,7 +51,7 @@ def camera_from_calibration(calibration: Mapping[str, Any], raw: bool | None = N
         A missing or malformed key, named in the message.
     """
     if not isinstance(calibration, Mapping):
-        raise CameraError('not a camera calibration: no mapping')
+        raise CameraError('not a camera calibration, or a malformed one: no mapping')
     for key in ('image_width', 'image_height', 'camera_matrix'):
         if calibration.get(key) is None:
             raise CameraError(f'camera calibration lacks {key!r}')
