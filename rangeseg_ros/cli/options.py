@@ -56,6 +56,12 @@ def together(*options: Decorator) -> Decorator:
     return decorate
 
 
+def positive(name: str, default: float, text: str, most: float | None = None) -> Decorator:
+    """A number above 0."""
+    kind = Finite(min=0, min_open=True, max=most)
+    return click.option(name, type=kind, default=default, show_default=True, help=text)
+
+
 def choice(name: str, choices: Sequence[str], text: str) -> Decorator:
     """One of `choices`, by default the first."""
     kind = click.Choice(list(choices))

@@ -23,13 +23,7 @@ from rangeseg_ros.io.recordings import BagError
 @options.camera(required=True)
 @options.raw
 @options.output_folder('Recording to make: a rosbag2 folder (mcap).')
-@click.option(
-    '--rate',
-    type=options.Finite(min=0, min_open=True, max=1e9),
-    default=30.0,
-    show_default=True,
-    help='Images per second.',
-)
+@options.positive('--rate', 30.0, 'Images per second.', most=1e9)
 @options.depth_scale
 @click.option(
     '--poses',

@@ -22,13 +22,7 @@ CLOCK_PERIOD = 0.025
 
 @click.command()
 @click.argument('bag', type=options.EXISTING)
-@click.option(
-    '--rate',
-    type=options.Finite(min=0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help='Speed: 2 plays twice as fast as recorded.',
-)
+@options.positive('--rate', 1.0, 'Speed: 2 plays twice as fast as recorded.')
 @click.option('--loop', is_flag=True, help='Start again at the end, until interrupted.')
 @click.option('--wait', is_flag=True, help='Start only when every topic has a subscriber.')
 @click.option('--clock', is_flag=True, help='Publish the time of the recording on /clock.')

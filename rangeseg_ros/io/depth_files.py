@@ -121,8 +121,7 @@ def _read_numpy(path: Path) -> NDArray:
             return content
         with content:
             name = 'depth' if 'depth' in content.files else content.files[0]
-            array: NDArray = content[name]
-            return array
+            return np.asarray(content[name])
     except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
         raise FileError(f'{path}: not a readable file of NumPy') from None
 

@@ -35,8 +35,7 @@ class DepthFrame:
     @property
     def frame_id(self) -> str:
         """Frame of the image or cloud."""
-        frame_id: str = self.message.header.frame_id
-        return frame_id
+        return str(self.message.header.frame_id)
 
     @property
     def depth(self) -> NDArray[np.uint16] | NDArray[np.float32]:

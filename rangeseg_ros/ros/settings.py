@@ -102,8 +102,8 @@ class Settings:
     def _prepare(self, config: NodeConfig, outputs: tuple[str, ...]) -> None:
         # What cannot be compiled will be reported by the frame that needs it.
         try:
-            *_, kind = _needs(config)
-            prepare(_of_core(config), (str(kind),), self._report, outputs)
+            core, kind = _rehearsed(config)
+            prepare(core, (kind,), self._report, outputs)
         except Exception as error:
             self._report(f'not compiled ahead: {error}')
         with self._came:
@@ -112,10 +112,15 @@ class Settings:
 
 
 def _needs(config: NodeConfig) -> tuple[object, ...]:
-    """What decides which kernels run, the last one of `rehearsal.KINDS`."""
-    return *needs(_of_core(config)), 'points' if config.input == 'points' else 'image'
+    """What decides which kernels run."""
+    core, kind = _rehearsed(config)
+    return *needs(core), kind
 
 
-def _of_core(config: NodeConfig) -> Config:
-    """Without what only the node knows, which the compiling processes need not import."""
-    return Config(**{field.name: getattr(config, field.name) for field in fields(Config)})
+def _rehearsed(config: NodeConfig) -> tuple[Config, str]:
+    """What kernels are compiled for: parameters and kind of the input, see `rehearse`.
+
+    Without what only the node knows, which the compiling processes need not import.
+    """
+    core = Config(**{field.name: getattr(config, field.name) for field in fields(Config)})
+    return core, 'points' if config.input == 'points' else 'image'
