@@ -60,6 +60,8 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
                 break
         for publisher in publishers.values():
             publisher.wait_for_all_acked(import_extra('rclpy.duration').Duration(seconds=2))
+    except BagError as error:
+        raise click.ClickException(f'{bag}: {error}') from None
     finally:
         recording.close()
         node.destroy_node()
@@ -113,7 +115,7 @@ def _timed(
     start, first = time.monotonic(), None
     for record in recording.records(topics):
         if isinstance(record, Lost):
-            raise BagError(f'{recording.path}: {record.reason}')
+            raise BagError(record.reason)
         stamp = record.time
         first = stamp if first is None else first
         due = start + (stamp - first) / 1e9 / rate

@@ -49,11 +49,6 @@ class DepthBagWriter:
     pinhole go to image_raw. The intrinsics are written with every image; `frame_id` is the optical
     frame of the camera. The recording, a directory, appears under its name once it is complete;
     BagError where something is there.
-
-    Examples
-    --------
-    >>> with DepthBagWriter(path, camera) as bag:
-    ...     bag.write(depth, stamp)
     """
 
     def __init__(
