@@ -1,8 +1,9 @@
-"""Digest of the package's sources: what caches of results are valid for."""
+"""Digests that tell whether results are those of this code, these parameters and files."""
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -17,3 +18,14 @@ def code_digest() -> bytes:
         digest.update(str(path.relative_to(package)).encode() + b'\0')
         digest.update(path.read_bytes() + b'\0')
     return digest.digest()
+
+
+def result_key(settings: object, read: Iterable[Path], recorded: Iterable[Path]) -> str:
+    """Digest of the code, of settings, of the content of files, and of the state of large ones."""
+    digest = hashlib.sha256(code_digest() + repr(settings).encode())
+    for path in read:
+        digest.update(path.read_bytes())
+    for path in sorted(recorded):
+        state = path.stat()
+        digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())
+    return digest.hexdigest()[:16]

@@ -13,6 +13,7 @@ EXTRAS = {
     'trimesh': 'notebook',
     'open3d': 'open3d',
     'OpenEXR': 'exr',
+    'distributed': 'dask',
     'rclpy': 'jazzy',
 }
 """Package that is imported -> extra of setup.py."""

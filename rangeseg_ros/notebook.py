@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from rangeseg_ros.core.sequence import with_roles
 from rangeseg_ros.drawing import colours, overlay
 from rangeseg_ros.extras import import_extra
 from rangeseg_ros.io.corrections import corrected
-from rangeseg_ros.io.planes import columns, values
+from rangeseg_ros.io.tables import columns, values
 
 
 def segment(
@@ -85,7 +85,7 @@ def to_html(result: Segmentation) -> str:
     _, png = cv2.imencode('.png', cv2.cvtColor(picture(result), cv2.COLOR_RGB2BGR))
     names = ('plane', 'role', 'area (m²)', 'normal', 'distance (m)', 'rms (mm)', 'pixels')
     rows = [''.join(f'<th>{name}</th>' for name in names)]
-    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+    for plane, colour in _coloured(result):
         normal = ' '.join(f'{x:.3f}' for x in plane.normal)
         cells = (
             f'<span style="color:rgb{tuple(colour.tolist())}">&#9632;</span> {plane.id}',
@@ -115,7 +115,7 @@ def to_trimesh(result: Segmentation) -> Any:
     """trimesh.Scene with a coloured mesh for each plane, in the frame of the image."""
     trimesh = import_extra('trimesh')
     scene = trimesh.Scene()
-    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+    for plane, colour in _coloured(result):
         mesh = trimesh.Trimesh(*plane.mesh(), face_colors=[*colour, 255], process=False)
         scene.add_geometry(mesh, geom_name=f'plane {plane.id}')
     return scene
@@ -125,7 +125,7 @@ def to_open3d(result: Segmentation) -> list[Any]:
     """Coloured open3d.geometry.TriangleMesh of each plane, in the frame of the image."""
     open3d = import_extra('open3d')
     meshes = []
-    for plane, colour in zip(result.planes, _colours(result.planes), strict=True):
+    for plane, colour in _coloured(result):
         vertices, triangles = plane.mesh()
         mesh = open3d.geometry.TriangleMesh(
             open3d.utility.Vector3dVector(vertices),
@@ -135,5 +135,6 @@ def to_open3d(result: Segmentation) -> list[Any]:
     return meshes
 
 
-def _colours(planes: Sequence[Plane]) -> NDArray[np.uint8]:
-    return colours([plane.id for plane in planes])
+def _coloured(result: Segmentation) -> Iterator[tuple[Plane, NDArray[np.uint8]]]:
+    """Planes and their colours."""
+    return zip(result.planes, colours([plane.id for plane in result.planes]), strict=True)

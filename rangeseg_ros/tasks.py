@@ -44,13 +44,7 @@ class Task(Protocol[R_co]):
 
 @dataclass(frozen=True)
 class Failure:
-    """What came of a task in place of its result.
-
-    Attributes
-    ----------
-    error : Exception
-        A ValueError, an OSError or a MemoryError.
-    """
+    """What came of a task in place of its result: one of the errors `EXPECTED`."""
 
     error: Exception
 
@@ -62,10 +56,7 @@ class SchedulerError(ValueError):
 def run_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R]:
     """Run tasks on all cores (or `jobs` processes); yields their results in order.
 
-    Raises
-    ------
-    ValueError, OSError, MemoryError
-        The first task's that fails; those that have not begun are dropped.
+    Raises what the first task does that fails; those that have not begun are dropped.
     """
     for result in attempt_all(tasks, jobs):
         if isinstance(result, Failure):
@@ -83,10 +74,19 @@ def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R
     if jobs <= 1:
         yield from map(_attempted, tasks)
         return
-    waiting = deque(range(len(tasks)))
     results: dict[int, R | Failure] = {}
     given = 0
-    while given < len(tasks):
+    for number, result in _completed(tasks, jobs):
+        results[number] = result
+        while given in results:
+            yield results.pop(given)
+            given += 1
+
+
+def _completed(tasks: Sequence[Task[R]], jobs: int) -> Iterator[tuple[int, R | Failure]]:
+    """Numbers of tasks and what came of them, in the order in which they end."""
+    waiting = deque(range(len(tasks)))
+    while waiting:
         running: dict[Future[R | Failure], int] = {}
         with _workers(jobs) as pool, suppress(BrokenProcessPool):
             while waiting or running:
@@ -95,16 +95,10 @@ def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R
                     future = pool.submit(_attempted, tasks[waiting[0]])
                     running[future] = waiting.popleft()
                 for future in wait_for(running, return_when=FIRST_COMPLETED).done:
-                    results[running[future]] = future.result()
-                    del running[future]
-                while given in results:
-                    yield results.pop(given)
-                    given += 1
+                    result = future.result()
+                    yield running.pop(future), result
         for number in sorted(running.values()):
-            results[number] = _attempted_alone(tasks[number])
-        while given in results:
-            yield results.pop(given)
-            given += 1
+            yield number, _attempted_alone(tasks[number])
 
 
 def _attempted(task: Task[R]) -> R | Failure:
@@ -190,21 +184,7 @@ def attempt_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R |
     A task whose worker is lost is run again on another one, up to as many times as Dask's
     `distributed.scheduler.allowed-failures` says. Workers and scheduler need this package, workers
     the same files under the same names. Whoever reaches a scheduler runs code on its workers.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    scheduler : str
-        Address of the scheduler, e.g. 'tcp://host:8786'.
-
-    Raises
-    ------
-    ImportError
-        `distributed` is not installed.
-    SchedulerError
-        Not an address.
-    OSError
-        No scheduler at that address, or no longer.
+    OSError: no scheduler at that address, or no longer; SchedulerError: not an address.
     """
     check_scheduler(scheduler)
     from distributed import Client, KilledWorker

@@ -11,9 +11,23 @@ import pytest
 from rangeseg_ros import Camera, Config, ConfigError
 from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.images import ImageFileError, read_depth, write_image
+from rangeseg_ros.io.files import FileError
+from rangeseg_ros.io.images import read_depth, write_image
 from rangeseg_ros.io.params import read_config
-from rangeseg_ros.io.yaml_files import YamlError, read_yaml
+from rangeseg_ros.io.yaml_files import read_yaml
+
+
+def grown(part, whole):
+    """A small file whose aliases stand for millions of nodes."""
+    lines = [f'a{k}: &a{k} ' + whole.format(9 * part.format(f'*a{k - 1}')) for k in range(1, 9)]
+    return '\n'.join(['a0: &a0 {y: 1}', *lines])
+
+
+def test_aliases_are_read(tmp_path):
+    path = tmp_path / 'file.yaml'
+    path.write_text('a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]')
+    a = {'x': 1, 'y': 2}
+    assert read_yaml(path) == {'a': a, 'b': {'x': 1, 'y': 3}, 'c': [a, a]}
 
 
 @pytest.mark.parametrize(
@@ -23,12 +37,18 @@ from rangeseg_ros.io.yaml_files import YamlError, read_yaml
         ('a: ' + 'x' * 2**21, 'too large'),
         ('a: 2001-99-99', 'not a YAML file'),
         ('a: \x00', 'not a YAML file'),
+        (grown('{}, ', '{{x: [{}]}}'), 'too often'),
+        (grown('{}, ', '{{<<: [{}]}}'), 'too often'),
+        (
+            f'a: &a {{{"".join(f"{k}: 1, " for k in range(3000))}}}\nb: [{"*a, " * 9000}]',
+            'too often',
+        ),
     ],
 )
 def test_yaml_that_would_take_for_ever(tmp_path, content, message):
     path = tmp_path / 'file.yaml'
     path.write_text(content)
-    with pytest.raises(YamlError, match=message) as caught:
+    with pytest.raises(FileError, match=message) as caught:
         read_yaml(path)
     assert str(path) in str(caught.value) and '\n' not in str(caught.value)
 
@@ -76,7 +96,7 @@ def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):
     cv2.imwrite(str(tmp_path / 'large.tiff'), np.zeros((300, 400), np.uint16))
     monkeypatch.setattr(cv2, 'imdecode', None)
     for name, size in (('large.png', '9000x9000'), ('large.tiff', '400x300')):
-        with pytest.raises(ImageFileError, match=f'is {size}, its camera 64x48'):
+        with pytest.raises(FileError, match=f'is {size}, its camera 64x48'):
             read_depth(tmp_path / name, (48, 64))
 
 
@@ -92,7 +112,7 @@ def test_damaged_images_are_one_line(tmp_path, capfd):
         (tmp_path / 'b.png').write_bytes(
             data if number % 2 else data[: random.integers(len(data))]
         )
-        with pytest.raises(ImageFileError):
+        with pytest.raises(FileError):
             read_depth(tmp_path / 'b.png')
     assert capfd.readouterr().err == ''
 

@@ -15,7 +15,8 @@ from rangeseg_ros.io.bag_writer import BagWriter, DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.io.message_types import CLOUD, message_types
+from rangeseg_ros.io.recordings import message_types
+from rangeseg_ros.messages.make import CLOUD
 
 
 def run(*arguments):

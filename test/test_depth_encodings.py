@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rangeseg_ros.messages.images import EncodingError, depth_from_message
+from rangeseg_ros.messages.images import depth_from_message
+from rangeseg_ros.messages.make import MessageError
 
 
 def decode_image(*fields):
@@ -41,13 +42,13 @@ def test_every_encoding_byte_order_and_padding(encoding, bigendian, padding):
 
 
 def test_image_errors_name_what_is_wrong():
-    with pytest.raises(EncodingError, match="'rgb8'"):
+    with pytest.raises(MessageError, match="'rgb8'"):
         decode_image(1, 1, 'rgb8', False, 3, bytes(3))
-    with pytest.raises(EncodingError, match='empty'):
+    with pytest.raises(MessageError, match='empty'):
         decode_image(0, 1, '16UC1', False, 2, b'')
-    with pytest.raises(EncodingError, match='step of 3'):
+    with pytest.raises(MessageError, match='rows of 3'):
         decode_image(1, 2, '16UC1', False, 3, bytes(9))
-    with pytest.raises(EncodingError, match='7 bytes'):
+    with pytest.raises(MessageError, match='7 bytes'):
         decode_image(2, 2, '16UC1', False, 4, bytes(7))
 
 
@@ -64,7 +65,7 @@ def test_any_image_fields_decode_or_raise_the_declared_error(
 ):
     try:
         depth = decode_image(height, width, encoding, bigendian, step, data)
-    except EncodingError:
+    except MessageError:
         return
     assert depth.shape == (height, width)
 
@@ -113,7 +114,7 @@ def test_quantisation_without_a_depth_is_invalid():
     ],
 )
 def test_compressed_errors_name_what_is_wrong(format, data, message):
-    with pytest.raises(EncodingError, match=message):
+    with pytest.raises(MessageError, match=message):
         decode_compressed(format, data)
 
 
@@ -125,7 +126,7 @@ def test_lengths_that_promise_more_than_can_follow_are_refused_before_memory_is_
         good[: image + 4] + lie + good[image + 8 :],
         good[: data - 4] + lie + good[data:],
     ):
-        refused = pytest.raises(EncodingError, match='no readable PNG')
+        refused = pytest.raises(MessageError, match='no readable PNG')
         with mock.patch.object(cv2, 'imdecode') as decode, refused:
             decode_compressed('16UC1; compressedDepth png', damaged)
         assert not decode.called
@@ -142,6 +143,6 @@ def test_any_compressed_bytes_decode_or_raise_the_declared_error(noise, cut):
         for format in ('16UC1; compressedDepth png', '32FC1; compressedDepth png'):
             try:
                 depth = decode_compressed(format, data)
-            except EncodingError:
+            except MessageError:
                 continue
             assert depth.ndim == 2

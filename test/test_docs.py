@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
-from rangeseg_ros.io.planes import columns
+from rangeseg_ros.io.tables import columns
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room

@@ -24,17 +24,17 @@ def status(**found):
 
 
 def test_ground_and_stairs_are_told():
-    found = status(ground='ground 1.20 m below, confidence 0.98', stairs='up 4 x 0.17 / 0.28 m')
+    told = {'ground': 'ground 1.20 m below, confidence 0.98', 'stairs': ['up 4 x 0.17 / 0.28 m']}
+    found = status(found=result(**told))
     values = {value.key: value.value for value in found.values}
     assert values['ground'] == 'ground 1.20 m below, confidence 0.98'
     assert values['stairs'] == 'up 4 x 0.17 / 0.28 m'
     assert found.level == DiagnosticStatus.OK
 
 
-def result(tilt='', verdict=Verdict()):  # noqa: B008
-    return SimpleNamespace(
-        planes=[1, 2, 3], reason='', sensor='', work_budget=1.0, tilt=tilt, verdict=verdict
-    )
+def result(verdict=Verdict(), **worked_out):  # noqa: B008
+    known = {'reason': '', 'sensor': '', 'work_budget': 1.0, 'tilt': '', **worked_out}
+    return SimpleNamespace(planes=[1, 2, 3], verdict=verdict, **known)
 
 
 def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():

@@ -10,7 +10,8 @@ from message_classes import STORE, cloud, header, make_rosbags, needs_rclpy
 
 from rangeseg_ros import CameraError, RangeImage, planes_from_message
 from rangeseg_ros.messages.cameras import camera_from_message
-from rangeseg_ros.messages.clouds import _POINT_FIELD_TYPES, CloudError, points_from_message
+from rangeseg_ros.messages.clouds import _POINT_FIELD_TYPES, points_from_message
+from rangeseg_ros.messages.make import MessageError
 
 
 def camera_info(make=make_rosbags, **changes):
@@ -98,7 +99,7 @@ def test_numbers_of_fields_are_those_of_the_message():
 def test_damaged_cloud_is_refused_with_the_reason(changes, problem):
     names = changes.pop('names', 'xyz')
     message = cloud(np.ones((3, 4, 3), np.float32), names=names, **changes)
-    with pytest.raises(CloudError, match=problem):
+    with pytest.raises(MessageError, match=problem):
         points_from_message(message)
 
 
@@ -138,5 +139,5 @@ def test_any_bytes_are_a_cloud_or_a_named_error(data, height, width, point_step,
         is_dense=False,
     )
     for read in (points_from_message, planes_from_message):
-        with suppress(CloudError):
+        with suppress(MessageError):
             read(message)

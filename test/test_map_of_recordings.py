@@ -76,7 +76,7 @@ def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
     recording.write(path, storage)
     config = Config(fixed_frame='odom', gravity_frame='odom', min_pixels=300)
     outcome = Replay(path, tmp_path / 'out', config).run()
-    assert outcome.mapped == 2 and not outcome.unlocated
+    assert outcome.mapped == 2 and not outcome.notes
     check(tmp_path / 'out')
 
 

@@ -22,11 +22,11 @@ from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
-from rangeseg_ros.messages.marker_bytes import markers_bytes
 from rangeseg_ros.messages.markers import (
     ARROW_LENGTH,
     LINE_STRIP,
     Marker,
+    markers_bytes,
     of_planes,
 )
 from rangeseg_ros.messages.outputs import OUTPUTS

@@ -18,7 +18,7 @@ from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.messages.motion import ODOMETRY
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.ros.gravity import TIME_CONSTANT, Reading
+from rangeseg_ros.ros.locator import TIME_CONSTANT, Reading
 
 pytestmark = pytest.mark.ros
 

@@ -149,7 +149,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
     settings = {**FRAMES, 'target_frame': 'odom', 'tf_timeout': 60.0}
     topics = 'planes', 'markers'
     outcome = Replay(tmp_path / 'recording', tmp_path, Config(**settings), topics=topics).run()
-    assert outcome.mapped == 1 and not outcome.unlocated
+    assert outcome.mapped == 1 and not outcome.notes
     with rosbag2.Reader(tmp_path / 'bag') as bag:
         written = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
 

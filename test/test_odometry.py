@@ -17,7 +17,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.io.message_types import make_rosbags
+from rangeseg_ros.io.recordings import make_rosbags
 from rangeseg_ros.messages.motion import odometry_message
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
@@ -177,7 +177,7 @@ def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
         sequence.segment(RangeImage.from_depth(view.depth, camera), stamp)
     recording.write(tmp_path / 'recording')
     outcome = Replay(tmp_path / 'recording', tmp_path / 'out', config).run()
-    assert outcome.mapped == len(sequence.map) >= 1 and not outcome.unlocated
+    assert outcome.mapped == len(sequence.map) >= 1 and not outcome.notes
     assert (tmp_path / 'out' / 'map.csv').exists()
     rows = np.loadtxt(tmp_path / 'out' / 'trajectory.txt')
     np.testing.assert_allclose(rows[:, 0], np.array(stamps) * 1e-9, atol=1e-9)

@@ -13,7 +13,7 @@ from replays import record_walls, results
 
 from rangeseg_ros import Camera
 from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.files import NotReplacedError, replacing
+from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
 
@@ -42,7 +42,7 @@ def test_pipes_and_devices_stay(tmp_path):
     os.mkfifo(tmp_path / 'pipe')
     for path in (tmp_path / 'pipe', Path('/dev/null')):
         mode = path.stat().st_mode
-        with pytest.raises(NotReplacedError, match='not a regular file'):
+        with pytest.raises(FileError, match='not a regular file'):
             write(path)
         assert path.stat().st_mode == mode
     assert [path.name for path in tmp_path.iterdir()] == ['pipe']

@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.cli.pack import command
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
-from rangeseg_ros.io.poses import PoseFileError, match_poses, read_pose
+from rangeseg_ros.io.files import FileError
+from rangeseg_ros.io.poses import match_poses, read_pose
 from rangeseg_ros.io.transforms import RecordedTransforms
 
 CAMERA = """
@@ -90,9 +91,9 @@ def test_poses_are_found_by_stem_or_else_by_number(tmp_path):
         'frame3.depth.tiff': 'pose_0003.txt',
     }
     (tmp_path / 'other-3.txt').write_text('')
-    with pytest.raises(PoseFileError, match=r'may belong to other-3.txt or pose_0003.txt'):
+    with pytest.raises(FileError, match=r'may belong to other-3.txt or pose_0003.txt'):
         match_poses(images, tmp_path)
-    with pytest.raises(PoseFileError, match=r'no \.txt files'):
+    with pytest.raises(FileError, match=r'no \.txt files'):
         match_poses(images, tmp_path / 'nowhere')
 
 

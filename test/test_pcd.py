@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pcd_files import literal_lzf
 
-from rangeseg_ros.io.pcd import PcdError, lzf_decompress, read_pcd
+from rangeseg_ros.io.files import FileError
+from rangeseg_ros.io.pcd import lzf_decompress, read_pcd
 
 HEADER = """# .PCD v0.7
 VERSION 0.7
@@ -68,7 +69,7 @@ def test_lzf_by_hand():
 
 @given(st.binary(max_size=60))
 def test_damaged_lzf_is_refused(data):
-    with contextlib.suppress(PcdError):
+    with contextlib.suppress(FileError):
         assert len(lzf_decompress(data, 40)) == 40
 
 
@@ -93,7 +94,7 @@ def test_damaged_lzf_is_refused(data):
 def test_malformed(tmp_path, change, fault):
     path = tmp_path / 'bad.pcd'
     path.write_bytes(change(encoded('binary')))
-    with pytest.raises(PcdError, match=fault) as error:
+    with pytest.raises(FileError, match=fault) as error:
         read_pcd(path)
     assert str(path) in str(error.value) and '\n' not in str(error.value)
 
@@ -109,5 +110,5 @@ def test_malformed(tmp_path, change, fault):
 def test_truncated(tmp_path, kind, cut, fault):
     path = tmp_path / 'bad.pcd'
     path.write_bytes(encoded(kind)[:-cut])
-    with pytest.raises(PcdError, match=fault):
+    with pytest.raises(FileError, match=fault):
         read_pcd(path)

@@ -116,3 +116,11 @@ def test_topics_that_ros_refuses_are_left_out(tmp_path, run):
     code, output, _ = run('play', tmp_path / 'bag')
     assert code == 0 and "'/a b' is no topic of ROS 2, left out" in output
     assert run('play', tmp_path / 'bag', '--rate', 'nan')[0] == 2
+
+
+def test_a_recording_without_its_end_is_said_to_have_none(tmp_path, run):
+    record(tmp_path / 'bag', kinect_camera(640, 480), 10, 0.01)
+    (file,) = (tmp_path / 'bag').glob('*.mcap')
+    os.truncate(file, file.stat().st_size * 6 // 10)
+    code, _, error = run('play', tmp_path / 'bag')
+    assert code == 2 and error.count('\n') == 1 and 'bag: without its end' in error

@@ -134,7 +134,7 @@ def test_a_finished_recording_is_not_done_again(done, tmp_path):
     assert (first.frames, first.already_done) == (2, False)
     bag = (out / 'bag').stat().st_ino
     again = replay(path, out)
-    assert (again.frames, again.reasons, again.already_done) == (2, first.reasons, True)
+    assert (again.frames, again.notes, again.already_done) == (2, first.notes, True)
     assert (out / 'bag').stat().st_ino == bag
     # Other parameters, other topics and another recording are other results.
     assert not Replay(path, out, Config(min_pixels=499)).run().already_done
@@ -200,7 +200,7 @@ def test_a_recording_that_fails_costs_no_other(tmp_path, monkeypatch, run):
 def test_terrain_of_every_frame_is_that_of_the_messages(done):
     folder = done / 'terrain'
     outcome = replay(done / 'recording', folder, terrain=True, topics=('terrain', 'stairs'))
-    assert outcome.tilted == 0
+    assert not outcome.warnings
     messages = read(folder / 'bag')
     images = [m for _, topic, m, _ in messages if topic.endswith('/terrain')]
     pictures = sorted(folder.glob('*_terrain.png'))
@@ -230,4 +230,5 @@ def test_doubtful_images_are_counted(tmp_path):
         recording.add_image(stamp, noisy[::2, ::2].repeat(2, axis=0).repeat(2, axis=1))
     recording.write(tmp_path / 'enlarged')
     outcome = replay(tmp_path / 'enlarged', tmp_path / 'out')
-    assert [n for doubt, n in outcome.doubts.items() if 'fills 2 x 2 pixels' in doubt] == [2]
+    (warning,) = (told for told in outcome.warnings if 'fills 2 x 2 pixels' in told)
+    assert warning.startswith('2 frames: ')

@@ -101,8 +101,8 @@ def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypat
     used = Settings(NodeConfig(), lambda progress: None, lambda: None)
     assert used.in_use()
     names = ['labels', 'normals', 'drops']
-    assert used.in_order(names, ['drops']) == names
+    assert used.ready_first(names) == names
     compilation.release.set()
     assert used.ready_for('drops')
-    assert used.in_order(names, ['drops']) == ['drops', 'labels', 'normals']
+    assert used.ready_first(['drops', 'nothing', 'labels']) == ['drops', 'labels', 'nothing']
     used.close()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -15,19 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.calibration.calibrate import CalibrationError
-from rangeseg_ros.core.calibration.sightings import Sightings, find_sightings
+from rangeseg_ros.core.calibration.sightings import Sightings, concatenate, find_sightings
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
-from rangeseg_ros.digest import code_digest
-from rangeseg_ros.io.bags import CloudBag, DepthBag, open_frames
+from rangeseg_ros.digest import result_key
+from rangeseg_ros.io.bags import DepthBag, open_frames
 from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.files import natural_order, replacing
+from rangeseg_ros.io.depth_files import files_of
+from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import read_depth
 
-IMAGES = ('.png', '.tif', '.tiff')
 PART = 10
 """Frames that one process takes at a time: what an interruption costs it."""
 
@@ -36,20 +34,12 @@ PART = 10
 class Source:
     """Frames of a recording: a bag of images or clouds, or a folder of images of one camera.
 
-    Attributes
-    ----------
-    path : Path
-    camera : Camera or None
-        Of a folder; bags know theirs.
-    scale : float or None
-        Metres per unit of a folder's images.
-    depth_topic, camera_topic : str or None
-        Of a bag, see `open_frames`.
+    Of a folder, the camera and metres per unit are given, of a bag its topics, see `open_frames`.
     """
 
     path: Path
     camera: Camera | None = None
-    scale: float | None = None
+    depth_scale: float | None = None
     depth_topic: str | None = None
     camera_topic: str | None = None
 
@@ -60,8 +50,7 @@ class Source:
 
     def files(self) -> list[Path]:
         """Images of a folder in the order of their names."""
-        found = [path for path in self.path.iterdir() if path.suffix.lower() in IMAGES]
-        return sorted(found, key=natural_order)
+        return files_of(self.path)
 
     def __len__(self) -> int:
         if self.is_folder:
@@ -69,56 +58,35 @@ class Source:
         with self._bag() as bag:
             return len(bag)
 
-    def images(self, first: int, after: int, step: int = 1) -> Iterator[RangeImage]:
-        """Range images from number `first` to before `after`.
-
-        Raises
-        ------
-        ValueError
-            A frame that is no range image; the message names it.
-        """
+    def images(self, first: int, after: int) -> Iterator[RangeImage]:
+        """Range images from number `first` to before `after`; ValueError where one is none."""
         if self.is_folder:
             assert self.camera is not None
-            for path in self.files()[first:after:step]:
+            for path in self.files()[first:after]:
                 try:
-                    yield RangeImage.from_depth(read_depth(path), self.camera, self.scale)
+                    yield RangeImage.from_depth(read_depth(path), self.camera, self.depth_scale)
                 except RangeImageError as error:
                     raise RangeImageError(f'{path}: {error}') from None
             return
         with self._bag() as bag:
-            for frame in islice(bag, first, after, step):
+            for frame in islice(bag, first, after):
                 yield frame.range_image()
 
-    def state(self) -> str:
-        """What tells the content from another one."""
-        files = sorted(self.path.iterdir()) if self.path.is_dir() else [self.path]
-        return repr([(f.name, f.stat().st_size, f.stat().st_mtime_ns) for f in files])
-
-    def _bag(self) -> DepthBag | CloudBag:
+    def _bag(self) -> DepthBag:
         return open_frames(self.path, self.depth_topic, self.camera_topic)
 
 
 class Seen(NamedTuple):
     """Sightings of the frames of one part, and what they are of."""
 
-    frames: list[Sightings]
+    sightings: Sightings
     shape: tuple[int, int]
     camera: Camera | None
 
 
 @dataclass(frozen=True)
 class SightingsOfPart:
-    """Planes in some frames of a recording; what was found once is kept in a folder.
-
-    Attributes
-    ----------
-    source : Source
-    config : Config
-    first, after : int
-        Frames.
-    kept : Path
-        Folder.
-    """
+    """Planes in frames `first` to before `after`; what was found is kept in the folder `kept`."""
 
     source: Source
     config: Config
@@ -128,7 +96,11 @@ class SightingsOfPart:
 
     def run(self) -> Seen:
         """Segment the frames, or read what is kept."""
-        path = self.kept / f'{self._key()}.npz'
+        where = self.source.path
+        settings = where.absolute(), self.source, asdict(self.config), self.first, self.after
+        recorded = where.iterdir() if where.is_dir() else [where]
+        key = result_key(settings, correction_files(self.config), recorded)
+        path = self.kept / f'{key}.npz'
         if path.exists():
             return _read(path)
         segmenter = Segmenter(self.config)
@@ -141,28 +113,25 @@ class SightingsOfPart:
             frames.append(find_sightings(segmenter.segment(image).labels, image))
         if shape is None:
             raise CalibrationError(f'{self.source.path}: no frames')
-        seen = Seen(frames, shape, camera)
-        _write(path, seen)
-        return seen
+        sightings = concatenate(frames)
+        told = json.dumps(camera and asdict(camera))
+        with replacing(path) as partial:
+            np.savez(partial, shape=shape, camera=told, **sightings._asdict())
+        return Seen(sightings, shape, camera)
 
-    def _key(self) -> str:
-        digest = hashlib.sha256(code_digest())
-        settings = self.source.path.absolute(), self.source, asdict(self.config)
-        digest.update(repr((settings, self.first, self.after, self.source.state())).encode())
-        for path in correction_files(self.config):
-            digest.update(path.read_bytes())
-        return digest.hexdigest()[:16]
+
+def _read(path: Path) -> Seen:
+    with np.load(path) as stored:
+        sightings = Sightings(*(stored[name] for name in Sightings._fields))
+        camera = json.loads(str(stored['camera']))
+        height, width = stored['shape'].tolist()
+    return Seen(sightings, (height, width), camera and Camera(**camera))
 
 
 class Residuals(NamedTuple):
     """What planes leave of one frame, before and after the correction.
 
-    Attributes
-    ----------
-    images : (2, H, W) float32
-        Residuals, 1/m, NaN where there is no plane.
-    planes : (int, int)
-        Number of planes.
+    Residuals (2, H, W), 1/m, NaN where there is no plane; and the numbers of planes.
     """
 
     images: NDArray[np.float32]
@@ -171,15 +140,7 @@ class Residuals(NamedTuple):
 
 @dataclass(frozen=True)
 class ResidualsOfFrame:
-    """Residuals of one frame of a recording.
-
-    Attributes
-    ----------
-    source : Source
-    config : Config
-    frame : int
-    distortion : DistortionMap
-    """
+    """Residuals of one frame of a recording, the correction being that of `distortion`."""
 
     source: Source
     config: Config
@@ -213,27 +174,3 @@ def parts(sources: list[Source], config: Config, kept: Path) -> list[SightingsOf
         for count in [len(source)]
         for first in range(0, count, PART)
     ]
-
-
-def _write(path: Path, seen: Seen) -> None:
-    arrays = {
-        f'{number}_{name}': value
-        for number, frame in enumerate(seen.frames)
-        for name, value in frame._asdict().items()
-    }
-    camera = json.dumps(None if seen.camera is None else asdict(seen.camera))
-    buffer = io.BytesIO()
-    np.savez(buffer, shape=seen.shape, camera=camera, count=len(seen.frames), **arrays)
-    with replacing(path) as partial:
-        partial.write_bytes(buffer.getvalue())
-
-
-def _read(path: Path) -> Seen:
-    with np.load(path) as stored:
-        frames = [
-            Sightings(*(stored[f'{number}_{name}'] for name in Sightings._fields))
-            for number in range(int(stored['count']))
-        ]
-        height, width = stored['shape']
-        camera = json.loads(str(stored['camera']))
-        return Seen(frames, (int(height), int(width)), camera and Camera(**camera))

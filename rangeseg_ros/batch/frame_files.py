@@ -3,31 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.io.meaning import STAIRS, stairs_row, write_table
-from rangeseg_ros.io.planes import PlaneTable
+from rangeseg_ros.io.tables import STAIRS, columns, stairs_values, values, write_table
 
 
-@dataclass(frozen=True)
-class FrameFile:
-    """A kind of file.
-
-    Attributes
-    ----------
-    ending : str
-        What follows the stem of the image in its name.
-    write : callable
-        (path, image, result) -> None.
-    """
+class FrameFile(NamedTuple):
+    """A kind of file: what follows the stem of the image in its name, and what writes it."""
 
     ending: str
     write: Callable[[Path, RangeImage, Segmentation], None]
@@ -38,12 +27,11 @@ def _image(ending: str, pick: Callable[[RangeImage, Segmentation], NDArray]) -> 
 
 
 def _planes(path: Path, image: RangeImage, result: Segmentation) -> None:
-    with replacing(path) as partial, PlaneTable(partial) as table:
-        table.write(result.planes)
+    write_table(path, columns(), map(values, result.planes))
 
 
 def _stairs(path: Path, image: RangeImage, result: Segmentation) -> None:
-    write_table(path, STAIRS, [stairs_row(stairs) for stairs in result.stairs])
+    write_table(path, STAIRS, map(stairs_values, result.stairs))
 
 
 FRAME_FILES = {

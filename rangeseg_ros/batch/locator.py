@@ -12,34 +12,24 @@ from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.messages.frames import DepthFrame
 
 
-class Locator:
+class Locator(RecordedTransforms):
     """What tf told of the camera at each frame of a recording.
 
-    Attributes
-    ----------
-    problems : Counter
-        Which frame of the parameters is not known, and why -> number of images.
-    last : Placement
-        Of the last frame.
+    `last` is the placement of the last frame; `problems` counts which frame of the parameters is
+    not known, and why.
     """
 
     def __init__(self, recording: Path, config: Config) -> None:
+        super().__init__(recording, config.tf_timeout)
         self._config = config
-        self._recorded = RecordedTransforms(recording, config.tf_timeout)
         self.problems: Counter[str] = Counter()
         self.last = Placement()
-
-    def __enter__(self) -> Locator:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._recorded.close()
 
     def place(self, frame: DepthFrame) -> Placement:
         """Where the camera was."""
 
         def lookup(target: str, source: str) -> Transform:
-            return self._recorded.lookup(target, source, frame.stamp, frame.time)
+            return self.lookup(target, source, frame.stamp, frame.time)
 
         self.last = found = find_placement(self._config, frame.frame_id, lookup)
         self.problems.update(f'{what} {why}' for what, why in found.missing.items())

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.batch.locator import Locator
@@ -16,18 +16,18 @@ from rangeseg_ros.batch.result_folder import LEADING, PICTURES, TERRAIN, ResultF
 from rangeseg_ros.compilation.preparation import prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.roles import Tilt
+from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.digest import code_digest
+from rangeseg_ros.digest import result_key
 from rangeseg_ros.drawing import colours
+from rangeseg_ros.io import tables
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
 from rangeseg_ros.io.corrections import corrected, correction_files
-from rangeseg_ros.io.meaning import GROUND, STAIRS, ground_row, stairs_row, write_table
 from rangeseg_ros.io.meshes import write_mesh
-from rangeseg_ros.io.planes import PlaneTable, write_map
 from rangeseg_ros.io.poses import write_trajectory
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.report.replay import ReplayReport
@@ -40,45 +40,20 @@ Progress = Callable[[Iterable[DepthFrame], int], Iterable[DepthFrame]]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a recording.
+    """What became of a recording: frames, those of them without planes, and planes in the map.
 
-    Attributes
-    ----------
-    frames : int
-        Number of frames segmented.
-    reasons : dict
-        Why frames have no planes -> number of these frames.
-    figures : dict
-        See `ReplayReport.figures`.
-    damage : str
-        What of the recording could not be read; empty when all of it was.
-    already_done : bool
-        The results were there already.
-    mapped : int
-        Number of planes in the map.
-    unlocated : dict
-        Which frame of tf was not known, and why -> number of images.
-    tilted : int
-        Number of frames whose planes say that up is elsewhere.
-    tilt : str
-        What is said of the one that is tilted most.
-    doubts : dict
-        What is doubtful about images -> number of these frames.
-    contradicted : list of str
-        What the planes say against the poses.
+    `figures` are those of `ReplayReport`; `notes` and `warnings` tell of frames, `damage` what of
+    the recording could not be read.
     """
 
     frames: int
-    reasons: dict[str, int]
+    empty: int
     figures: dict[str, float]
+    mapped: int = 0
+    notes: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     damage: str = ''
     already_done: bool = False
-    mapped: int = 0
-    unlocated: dict[str, int] = field(default_factory=dict)
-    tilted: int = 0
-    tilt: str = ''
-    doubts: dict[str, int] = field(default_factory=dict)
-    contradicted: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -90,23 +65,10 @@ class Replay:
     and the other results are the same; any other state is started anew, as ids depend on all
     frames before.
 
-    Attributes
-    ----------
-    recording, folder : Path
-        What to read, and where to leave the results.
-    config : Config
-    depth_topic, camera_topic : str or None
-        See `DepthBag`.
-    topics : tuple of str
-        Topics of the node to record, names of `OUTPUTS`.
-    copy : bool
-        Copy the topics of the recording into the bag.
-    raw : bool
-        See `DepthBag`.
-    terrain : bool
-        Also write terrain and height of every frame, and the tables of ground and stairs.
-    overwrite : bool
-        Also replace files with the names of results that no replay has written.
+    `topics` are names of `OUTPUTS` to record, and with `copy` those of the recording as well; see
+    `DepthBag` for where the images are. With `terrain` terrain and height of every frame are
+    written, and the tables of ground and stairs; with `overwrite` also files are replaced that
+    have the names of results and that no replay has written.
     """
 
     recording: Path
@@ -123,42 +85,36 @@ class Replay:
     def check(self) -> str:
         """Topics that will be read; BagError when the recording or the folder will not do."""
         ResultFolder(self.folder).check(self.recording, self.overwrite)
-        if self.copy:
-            open_source(self.recording).close()
         with self._open() as source:
+            if self.copy:
+                open_source(self.recording).close()
             return f'{source.depth_topic}, {source.camera_topic}'
 
     def run(self, progress: Progress | None = None) -> Outcome:
-        """Write the results, or find that they are there.
-
-        Raises
-        ------
-        ValueError
-            As `check`; a frame that is no range image.
-        """
+        """Write the results, or find that they are there; BagError as `check`."""
         key, results_folder = self._key(), ResultFolder(self.folder)
         record = read_record(results_folder.bag)
         if record.get('key') == key and results_folder.whole():
-            return Outcome(**record['outcome'], already_done=True)
+            return Outcome(**record['outcome'] | {'already_done': True})
         self.check()
         with (
             results_folder.replacing() as made,
             self._open() as source,
             Locator(self.recording, self.config) as located,
-            PlaneTable(made.path / 'planes.csv', LEADING) as table,
+            tables.open_table(
+                made.path / 'planes.csv', [*LEADING, *tables.columns()]
+            ) as add_planes,
             ResultBag(made.bag, self.topics, self.config.odometry) as bag,
             ExitStack() as stack,
         ):
-            results = _Results(self, made.path, table, bag, located)
+            results = _Results(self, made.path, add_planes, bag, located)
             streams = [results.messages(source, progress)]
             if self.copy:
-                originals = stack.enter_context(closing(open_source(self.recording)))
+                originals = stack.enter_context(open_source(self.recording))
                 streams.append(bag.copies(originals))
-            bag.write(*streams)
+            bag.write_merged(*streams)
             outcome = results.finish(source)
-            kept = asdict(outcome)
-            del kept['already_done']
-            bag.record({'key': key, 'outcome': kept, 'files': made.digest()})
+            bag.record({'key': key, 'outcome': asdict(outcome), 'files': made.digest()})
         return outcome
 
     def _open(self) -> DepthBag:
@@ -166,93 +122,96 @@ class Replay:
 
     def _key(self) -> str:
         """Digest of all that the results depend on: code, parameters, the recording's files."""
-        digest = hashlib.sha256(code_digest())
         settings = replace(self, recording=Path(), folder=Path(), overwrite=False)
-        digest.update(repr(settings).encode())
-        for path in correction_files(self.config):
-            digest.update(path.read_bytes())
         parts = [self.recording]
         if self.recording.is_dir():
             parts = [path for path in self.recording.iterdir() if path.suffix in _SUFFIXES]
-        for path in sorted(parts):
-            state = path.stat()
-            digest.update(repr((path.name, state.st_size, state.st_mtime_ns)).encode())
-        return digest.hexdigest()[:16]
+        return result_key(settings, correction_files(self.config), parts)
 
 
+@dataclass
 class _Results:
     """Writes what a replay leaves of every frame, and of all of them."""
 
-    def __init__(
-        self, replay: Replay, folder: Path, table: PlaneTable, bag: ResultBag, located: Locator
-    ) -> None:
-        self._terrain, self._config = replay.terrain, replay.config
-        self._folder, self._table, self._bag, self._located = folder, table, bag, located
-        self._report = ReplayReport(replay.recording.name, replay.config)
-        self._sequence = SequenceSegmenter(replay.config)
-        self._trajectory: list[tuple[int, Transform]] = []
-        self._ground: list[list[str]] = []
-        self._stairs: list[list[str]] = []
-        self._tilts: list[Tilt] = []
-        self._doubts: Counter[str] = Counter()
+    replay: Replay
+    folder: Path
+    add_planes: Callable[[Iterable[Iterable[Any]]], None]
+    bag: ResultBag
+    located: Locator
+    trajectory: list[tuple[int, Transform]] = field(default_factory=list)
+    ground: list[list[Any]] = field(default_factory=list)
+    stairs: list[list[Any]] = field(default_factory=list)
+    tilts: list[Tilt] = field(default_factory=list)
+    doubts: Counter[str] = field(default_factory=Counter)
+
+    def __post_init__(self) -> None:
+        self.config = self.replay.config
+        self.report = ReplayReport(self.replay.recording.name, self.config)
+        self.sequence = SequenceSegmenter(self.config)
 
     def messages(self, source: DepthBag, progress: Progress | None) -> Iterator[Timed]:
         """Segment the frames and write their files; the messages for the bag."""
-        sequence, target_frame = self._sequence, self._config.target_frame
+        sequence, target_frame = self.sequence, self.config.target_frame
         for index, frame, image, result in segment_frames(
-            source, sequence, self._located.place, progress
+            source, sequence, self.located.place, progress
         ):
             self._write(index, frame.stamp, image, result)
-            to_target = self._located.last.target
+            to_target = self.located.last.target
             target = (target_frame, to_target) if to_target else None
-            yield from self._bag.messages(frame, image, result, target, sequence.motion)
+            yield from self.bag.messages(frame, image, result, target, sequence.motion)
 
     def _write(self, index: int, stamp: int, image: RangeImage, result: Segmentation) -> None:
         leading = [str(index), '{}.{:09d}'.format(*divmod(stamp, 10**9))]
-        kinds = PICTURES + TERRAIN if self._terrain else PICTURES
+        kinds = PICTURES + TERRAIN if self.replay.terrain else PICTURES
         stem = f'{index:06d}_{leading[1]}'
-        files = write_frame(self._folder, stem, image, result, kinds)
-        self._table.write(result.planes, *leading)
-        self._report.add(stamp, result, files['overlay'])
-        self._doubts.update(result.verdict.details)
+        files = write_frame(self.folder, stem, image, result, kinds)
+        self.add_planes([*leading, *tables.values(plane)] for plane in result.planes)
+        self.report.add(stamp, result, files['overlay'])
+        self.doubts.update(result.verdict.details)
         if result.tilt:
-            self._tilts.append(result.tilt)
-        if self._terrain:
-            self._ground.append([*leading, *ground_row(result)])
-            self._stairs += [[*leading, *stairs_row(seen)] for seen in result.stairs]
-        if self._sequence.motion:
-            self._trajectory.append((stamp, self._sequence.motion.pose))
+            self.tilts.append(result.tilt)
+        if self.replay.terrain:
+            self.ground.append([*leading, *tables.ground_values(result)])
+            self.stairs += [[*leading, *tables.stairs_values(seen)] for seen in result.stairs]
+        if self.sequence.motion:
+            self.trajectory.append((stamp, self.sequence.motion.pose))
 
     def finish(self, source: DepthBag) -> Outcome:
         """Write what is of all frames."""
-        folder, config, mapped = self._folder, self._config, self._sequence.map
-        if self._terrain:
-            write_table(folder / 'ground.csv', [*LEADING, *GROUND], self._ground)
-            write_table(folder / 'stairs.csv', [*LEADING, *STAIRS], self._stairs)
+        folder, config, mapped = self.folder, self.config, self.sequence.map
+        if self.replay.terrain:
+            tables.write_table(folder / 'ground.csv', [*LEADING, *tables.GROUND], self.ground)
+            tables.write_table(folder / 'stairs.csv', [*LEADING, *tables.STAIRS], self.stairs)
         if config.odometry:
-            write_trajectory(folder / 'trajectory.txt', self._trajectory)
+            write_trajectory(folder / 'trajectory.txt', self.trajectory)
         if config.map_frame:
-            write_map(folder / 'map.csv', mapped.planes)
+            without = ('label',)
+            rows = [tables.values(plane, without) for plane in mapped.planes]
+            tables.write_table(folder / 'map.csv', tables.columns(MapPlane, without), rows)
             shades = colours([plane.id for plane in mapped.planes])
             write_mesh(folder / 'map.ply', mapped.planes, shades)
         damage = [source.damage, source.loss()]
-        if lost := self._bag.lost:
+        if lost := self.bag.lost:
             reason, count = lost.most_common(1)[0]
             damage.append(f'{lost.total()} messages not copied, {count} of {reason}')
-        tilts = self._tilts
+        report, contradicted = self.report, mapped.doubts if config.map_frame else []
+        notes = [f'{n} frames without a plane: {why}' for why, n in report.reasons.items()]
+        notes += [f'{n} frames without the {what}' for what, n in self.located.problems.items()]
+        warnings = [f'{n} frames: {doubt}' for doubt, n in self.doubts.items()]
+        if self.tilts:
+            worst = max(self.tilts, key=lambda tilt: tilt.degrees)
+            warnings.append(f'{len(self.tilts)} frames: {worst}')
+        warnings += [f'poses: {doubt}' for doubt in contradicted]
         outcome = Outcome(
-            self._report.frames,
-            dict(self._report.reasons),
-            self._report.figures(),
+            report.frames,
+            report.reasons.total(),
+            report.figures(),
+            len(mapped.planes),
+            notes,
+            warnings,
             '; '.join(filter(None, damage)),
-            mapped=len(mapped.planes),
-            unlocated=dict(self._located.problems),
-            tilted=len(tilts),
-            tilt=str(max(tilts, key=lambda tilt: tilt.degrees)) if tilts else '',
-            doubts=dict(self._doubts),
-            contradicted=mapped.doubts if config.map_frame else [],
         )
-        self._report.write(folder / 'report.html', outcome.damage, outcome.contradicted)
+        report.write(folder / 'report.html', outcome.damage, contradicted)
         return outcome
 
 

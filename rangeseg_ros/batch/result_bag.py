@@ -7,23 +7,21 @@ import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import yaml
 from rosbags.interfaces import Connection, MessageDefinitionFormat
-from rosbags.typesys import Stores
 
 from rangeseg_ros.core.mapping.odometry import Motion
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.io.bag_writer import BagWriter
-from rangeseg_ros.io.message_types import is_rosbag1, make_rosbags, message_types
-from rangeseg_ros.io.recordings import BagError, Lost, Recording
+from rangeseg_ros.io.recordings import BagError, Lost, Recording, is_rosbag1, make_rosbags
 from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.motion import ODOMETRY, odometry_message
-from rangeseg_ros.messages.outputs import IN_TARGET, OUTPUTS, in_target
+from rangeseg_ros.messages.make import ODOMETRY, header_of
+from rangeseg_ros.messages.motion import odometry_message
+from rangeseg_ros.messages.outputs import OUTPUTS, messages_of
 
 NAMESPACE = '/segment_planes'
 """Name of the node that publishes the topics."""
@@ -34,54 +32,31 @@ Timed = tuple[int, Connection, bytes]
 """When, where and what is written."""
 
 
-class ResultBag:
+class ResultBag(BagWriter):
     """Writes a rosbag2 (mcap) of results; see `messages.Make` for why it equals the node's.
 
-    Parameters
-    ----------
-    path : Path
-        Directory to make.
-    topics : iterable of str
-        Which of `OUTPUTS`, by name.
-    odometry : bool
-        Whether the motion of the camera is among them.
-
-    Attributes
-    ----------
-    lost : Counter of str
-        Topic and reason of messages that could not be copied -> how many.
+    In a directory to make; `topics` are names of `OUTPUTS`, and `odometry` says whether the motion
+    of the camera is among them. `lost` counts messages that could not be copied, by topic and
+    reason.
     """
 
     def __init__(self, path: Path, topics: Iterable[str], odometry: bool = False) -> None:
-        self._store = message_types(Stores.ROS2_JAZZY)
-        # Labels shrink to a hundredth.
-        self._writer = BagWriter(path, compressed=True)
-        self._names = tuple(topics)
-        self._kinds = {name: OUTPUTS[name].kind for name in self._names}
-        if odometry:
-            self._kinds['odometry'] = ODOMETRY
+        super().__init__(path, compressed=True)  # labels shrink to a hundredth
+        self._kinds = {name: OUTPUTS[name].kind for name in topics}
+        self._motion = {'odometry': ODOMETRY} if odometry else {}
         self.lost: Counter[str] = Counter()
-        self._topics: dict[str, Connection] = {}
 
     def __enter__(self) -> ResultBag:
-        self._writer.open()
-        for name, kind in self._kinds.items():
-            self._topics[name] = self._writer.add_connection(
-                f'{NAMESPACE}/{name}', kind, typestore=self._store
-            )
+        super().__enter__()
+        self._topics = {
+            name: self.topic(f'{NAMESPACE}/{name}', kind)
+            for name, kind in (self._kinds | self._motion).items()
+        }
         return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
 
     def record(self, facts: Mapping[str, Any]) -> None:
         """Put `facts` into the metadata, for `read_record`."""
-        self._writer.set_custom_data(_KEY, json.dumps(facts, sort_keys=True))
+        self.set_custom_data(_KEY, json.dumps(facts, sort_keys=True))
 
     def messages(
         self,
@@ -96,23 +71,13 @@ class ResultBag:
         `target` is the frame of planes and markers, and the motion to it; `motion` that of the
         camera, where it is followed.
         """
-        sec, nanosec = divmod(frame.stamp, 10**9)
-        stamp = make_rosbags('builtin_interfaces/msg/Time', sec=sec, nanosec=nanosec)
-        header = make_rosbags('std_msgs/msg/Header', stamp=stamp, frame_id=frame.frame_id)
-        here = header, result
-        there = in_target(make_rosbags, header, result, *target) if target else here
-        for name in self._names:
-            connection = self._topics[name]
-            head, shown = there if name in IN_TARGET else here
-            message = OUTPUTS[name].message(make_rosbags, head, image, shown)
-            if not isinstance(message, bytes):
-                message = bytes(self._store.serialize_cdr(message, connection.msgtype))
-            yield frame.time, connection, message
+        header = header_of(make_rosbags, frame.stamp, frame.frame_id)
+        made = list(messages_of(make_rosbags, header, image, result, target, self._kinds))
         if motion:
-            connection = self._topics['odometry']
-            message = odometry_message(make_rosbags, header, motion)
-            data = self._store.serialize_cdr(message, ODOMETRY)
-            yield frame.time, connection, bytes(data)
+            made.append(('odometry', odometry_message(make_rosbags, header, motion)))
+        for name, message in made:
+            topic = self._topics[name]
+            yield frame.time, topic, self.serialised(topic, message)
 
     def copies(self, source: Recording) -> Iterator[Timed]:
         """All messages of `source`, as they are, but those on the topics of results.
@@ -131,10 +96,10 @@ class ResultBag:
             elif (record.topic, record.type) in here:
                 yield record.time, here[record.topic, record.type], record.data
 
-    def write(self, *streams: Iterable[Timed]) -> None:
+    def write_merged(self, *streams: Iterable[Timed]) -> None:
         """Write messages of several sources, each ordered by time, in the order of all times."""
         for time, connection, data in heapq.merge(*streams, key=lambda timed: timed[0]):
-            self._writer.write(connection, time, data)
+            self.write(connection, time, data)
 
     def _like(self, connection: Connection) -> Connection:
         """A topic of this bag with the type and the quality of service of that one."""
@@ -144,14 +109,14 @@ class ResultBag:
         }
         # Recordings of ROS 2 before Iron do not define their types.
         if connection.msgdef.format == MessageDefinitionFormat.NONE or not connection.digest:
-            if connection.msgtype not in self._store.fielddefs:
+            if connection.msgtype not in self.types.fielddefs:
                 raise BagError(
                     f'{connection.topic} cannot be copied: '
                     f'the recording does not define {connection.msgtype}'
                 )
-            definition = {'typestore': self._store}
+            definition = {'typestore': self.types}
         ext: Any = connection.ext
-        return self._writer.add_connection(
+        return self.add_connection(
             connection.topic,
             connection.msgtype,
             serialization_format=ext.serialization_format,
@@ -162,16 +127,11 @@ class ResultBag:
 
 def open_source(path: Path) -> Recording:
     """Open a recording to copy from; BagError unless it is a whole rosbag2."""
-    try:
-        if is_rosbag1(path):
-            raise BagError('ROS 1')
-        source = Recording(path)
-        if source.cut:
-            raise BagError(source.cut)
-        return source
-    # Readers meet damaged bytes with exceptions of every kind.
-    except Exception as error:
-        raise BagError(f'{path}: not a whole rosbag2 to copy from: {error}') from None
+    source = Recording(path)
+    if damage := 'ROS 1' if is_rosbag1(path) else source.cut:
+        source.close()
+        raise BagError(f'{path}: not a whole rosbag2 to copy from: {damage}')
+    return source
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -7,7 +7,6 @@ import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from zlib import crc32
 
@@ -32,22 +31,11 @@ _OWN = re.compile(
 )
 
 
-@dataclass(frozen=True)
 class ResultFolder:
-    """Where a replay leaves its results.
+    """Where a replay leaves its results; it need not exist. The bag is there when all else is."""
 
-    Attributes
-    ----------
-    path : Path
-        Need not exist.
-    """
-
-    path: Path
-
-    @property
-    def bag(self) -> Path:
-        """The bag, which is there when all else is."""
-        return self.path / BAG
+    def __init__(self, path: Path) -> None:
+        self.path, self.bag = path, path / BAG
 
     def check(self, recording: Path, overwrite: bool) -> None:
         """Raise BagError when something is there that is no replay's, and may not be replaced."""

@@ -20,7 +20,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 @click.command()
 @click.argument('depth', nargs=-1, type=options.FILE)
-@options.camera
+@options.camera()
 @options.depth_scale
 @options.config('method')
 @options.count('--scenes', default=5, help='How many simulated rooms, where no DEPTH is given.')

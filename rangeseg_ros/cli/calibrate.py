@@ -30,15 +30,11 @@ _HEADER = '# Written by rangeseg calibrate.\n'
 
 @click.command()
 @click.argument(
-    'recordings',
-    metavar='RECORDING...',
-    nargs=-1,
-    required=True,
-    type=click.Path(exists=True, path_type=Path),
+    'recordings', metavar='RECORDING...', nargs=-1, required=True, type=options.EXISTING
 )
 @options.output_file('--output', 'Distortion map to write: TIFF.', required=True)
 @options.output_file('--params', 'Parameter file to write: with the map.')
-@options.camera
+@options.camera()
 @options.depth_scale
 @options.topics
 @click.option(
@@ -52,11 +48,9 @@ def command(
     output: Path,
     params: Path | None,
     camera_file: Path | None,
-    depth_scale: float | None,
-    depth_topic: str | None,
-    camera_topic: str | None,
     segment_with: Path | None,
     jobs: int | None,
+    **given: Any,
 ) -> None:
     """Learn the fixed distortion of a sensor from the planes in RECORDINGs of it.
 
@@ -69,15 +63,13 @@ def command(
     report = output.with_name(f'{output.stem}_report.html')
     _check_free(output, params)
     camera = read_camera(camera_file) if camera_file else None
-    sources = [Source(path, camera, depth_scale, depth_topic, camera_topic) for path in recordings]
+    sources = [Source(path, camera, **given) for path in recordings]
     for source in sources:
         if source.is_folder and not source.files():
             raise click.UsageError(f'{source.path}: neither a bag nor a folder of depth images')
         if source.is_folder and camera is None:
             raise click.UsageError(f'{source.path}: a folder of images needs --camera')
-    given: dict[str, Any] = read_params(segment_with) if segment_with else {}
     # What is learned is the whole distortion, not what another map leaves.
-    given.pop('distortion_map', None)
     config = read_config(segment_with, distortion_map='')
     kept = output.with_name(f'.{output.name}.parts')
     tasks = parts(sources, config, kept)
@@ -92,7 +84,8 @@ def command(
         for source, number in (numbered[n] for n in chosen)
     ]
     left = list(options.progress(run_all(frames, jobs), len(frames), 'frame'))
-    parameters: dict[str, Any] = {**given, 'distortion_map': str(output.absolute())}
+    parameters = read_params(segment_with) if segment_with else {}
+    parameters['distortion_map'] = str(output.absolute())
     Config.from_mapping(parameters)
     write_distortion(output, result.distortion)
     if params:
@@ -112,10 +105,8 @@ def _check_free(output: Path, params: Path | None) -> None:
             read_distortion(output)
         except DistortionError:
             raise click.UsageError(f'{output}: exists already, and is no distortion map') from None
-    if params and params.exists():
-        with params.open('rb') as file:
-            if file.readline() != _HEADER.encode():
-                raise click.UsageError(f'{params}: exists already, not overwritten')
+    if params:
+        options.check_replaceable(params, _HEADER.encode())
 
 
 def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
@@ -126,8 +117,8 @@ def _together(seen: list[Seen]) -> tuple[Sightings, tuple[int, int], Any]:
         raise click.UsageError(f'images of several sizes: {text}')
     if len({part.camera for part in seen}) > 1:
         raise click.UsageError('recordings of several cameras')
-    frames = [frame for part in seen for frame in part.frames]
-    return concatenate(frames), seen[0].shape, seen[0].camera
+    sightings = concatenate([part.sightings for part in seen])
+    return sightings, seen[0].shape, seen[0].camera
 
 
 def _report(result: Calibration) -> None:

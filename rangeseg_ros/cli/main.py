@@ -7,14 +7,19 @@ import os
 import sys
 import warnings
 from importlib import import_module
-from typing import Any, NoReturn
+from typing import Any
 
 import click
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli.errors import one_line
-from rangeseg_ros.extras import MissingExtraError, install_command
+from rangeseg_ros.extras import MissingExtraError
 
+# Of the input, of the machine or of the installation.
+_EXPECTED = (
+    *(click.ClickException, ValueError, OSError, MemoryError, RecursionError),
+    *(MissingExtraError, ModuleNotFoundError),
+)
 # A subcommand's module is imported when it runs: help need not wait for all of them.
 COMMANDS = {
     'segment': 'Segment depth images into planes.',
@@ -66,14 +71,6 @@ def _warn(message: Warning | str, *where: Any, **more: Any) -> None:
     print(f'rangeseg: warning: {text}', file=sys.stderr)
 
 
-def _fail(reason: str) -> NoReturn:
-    # What a signal raises libraries may take for an error of what they read.
-    if interrupts.exit_code():
-        interrupts.end()
-    print(f'rangeseg: {reason}', file=sys.stderr)
-    sys.exit(2)
-
-
 def main() -> None:
     """Run the command line; bad input ends with exit code 2 and one line that says why."""
     interrupts.watch()
@@ -83,21 +80,18 @@ def main() -> None:
     try:
         # Without its standalone mode click returns the code that a command exits with.
         sys.exit(rangeseg.main(prog_name='rangeseg', standalone_mode=False))
-    except click.ClickException as error:
-        _fail(error.format_message())
-    except MissingExtraError as error:
-        _fail(str(error))
-    except ModuleNotFoundError as error:
-        _fail(install_command(error) or f'{error}: is the installation complete?')
-    except (ValueError, OSError, MemoryError, RecursionError) as error:
-        _fail(one_line(error))
     except SystemExit as end:
         if end.code and end.code == interrupts.exit_code():
             interrupts.end()
         raise
-    except (KeyboardInterrupt, SystemError, click.Abort) as error:
+    except BaseException as error:
+        # What a signal raises libraries may take for an error of what they read.
         if interrupts.exit_code():
             interrupts.end()
-        if isinstance(error, SystemError):
+        if isinstance(error, (KeyboardInterrupt, click.Abort)):
+            sys.exit(130)
+        if not isinstance(error, _EXPECTED):
             raise
-        sys.exit(130)
+        told = error.format_message() if isinstance(error, click.ClickException) else None
+        print(f'rangeseg: {told or one_line(error)}', file=sys.stderr)
+        sys.exit(2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial, wraps
@@ -17,25 +18,10 @@ from rangeseg_ros import interrupts
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.depth_files import Intrinsics
-from rangeseg_ros.io.files import (
-    NotReplacedError,
-    check_regular,
-    replacing,
-    resolved,
-)
+from rangeseg_ros.io.files import NotReplacedError, check_regular, replacing, resolved
 from rangeseg_ros.io.params import read_config
 
 T = TypeVar('T')
-
-
-class _RegularFile(click.Path):
-    """A file that can be read to its end: no pipe, no device."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        path = Path(str(super().convert(value, param, ctx)))
-        if not path.is_file():
-            self.fail(f'{path} is not a regular file.', param, ctx)
-        return path
 
 
 class Finite(click.FloatRange):
@@ -52,7 +38,8 @@ class Finite(click.FloatRange):
         return '' if self.min is None and self.max is None else super()._describe_range()
 
 
-FILE = _RegularFile(exists=True, dir_okay=False, path_type=Path)
+FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
+EXISTING = click.Path(exists=True, path_type=Path)
 FOLDER = click.Path(exists=True, file_okay=False, path_type=Path)
 
 Decorator = Callable[..., Any]
@@ -69,6 +56,12 @@ def together(*options: Decorator) -> Decorator:
     return decorate
 
 
+def positive(name: str, default: float, text: str, most: float | None = None) -> Decorator:
+    """A number above 0."""
+    kind = Finite(min=0, min_open=True, max=most)
+    return click.option(name, type=kind, default=default, show_default=True, help=text)
+
+
 def choice(name: str, choices: Sequence[str], text: str) -> Decorator:
     """One of `choices`, by default the first."""
     kind = click.Choice(list(choices))
@@ -80,7 +73,8 @@ count = partial(click.option, type=click.IntRange(min=1), show_default=True)
 number = partial(click.option, type=click.IntRange(min=0), show_default=True)
 """An integer from 0 on."""
 
-camera: Decorator = click.option(
+camera = partial(
+    click.option,
     '--camera',
     'camera_file',
     type=FILE,
@@ -106,23 +100,19 @@ params: Decorator = click.option(
     type=FILE,
     help='Parameters of the segmenter: a YAML file of names and values, or of the ROS node.',
 )
-_PARAMETERS: dict[str, Decorator] = {
-    'method': click.option(
-        '--method',
-        type=click.Choice(Config.__dataclass_fields__['method'].metadata['choices']),
-        help='Method, in place of that of the parameters.',
-    ),
-    'exact': click.option(
-        '--exact',
-        is_flag=True,
-        help='Minimise with every label at full resolution instead of coarse to fine: slow.',
-    ),
-    'fixed_frame': click.option(
-        '--fixed-frame',
-        metavar='FRAME',
-        help='Frame in which planes stay put, such as odom.  [default: that of the parameters]',
-    ),
-}
+
+
+def _parameter(name: str) -> Decorator:
+    """An option for a parameter, by default that of --params."""
+    field = Config.__dataclass_fields__[name]
+    choices, flag = field.metadata['choices'], field.default is False
+    text = str(field.metadata['description'])
+    return click.option(
+        f'--{name.replace("_", "-")}',
+        type=click.Choice(choices) if choices else None,
+        is_flag=flag,
+        help=f'{text[0].upper()}{text[1:]}.' + ('' if flag else '  [default: as in --params]'),
+    )
 
 
 def config(*names: str) -> Decorator:
@@ -135,7 +125,7 @@ def config(*names: str) -> Decorator:
             chosen = {name: value for name, value in named.items() if value not in (None, False)}
             return command(*args, config=read_config(params_file, **chosen), **given)
 
-        return together(params, *(_PARAMETERS[name] for name in names))(with_config)
+        return together(params, *map(_parameter, names))(with_config)
 
     return decorate
 
@@ -158,7 +148,7 @@ def intrinsics(command: Callable[..., Any]) -> Any:
         return command(*args, intrinsics=known, **given)
 
     options = [click.option(name, type=Finite(), help=text) for name, text in _NUMBERS.items()]
-    return together(camera, *options, raw)(with_intrinsics)
+    return together(camera(), *options, raw)(with_intrinsics)
 
 
 depth_scale: Decorator = click.option(
@@ -193,6 +183,8 @@ def _checked_json(
 ) -> Path | None:
     # Before the work that the figures are of.
     if path:
+        if not path.parent.is_dir():
+            raise click.ClickException(f'{path}: no such folder')
         check_replaceable(path, b'{')
     return path
 
@@ -220,13 +212,8 @@ def _as_json(value: Any) -> Any:
 
 
 def check_replaceable(path: Path, beginning: bytes) -> None:
-    """Refuse to replace what is no earlier result: a file that does not begin like one.
-
-    Also what is no regular file, and a file in a folder that is not there.
-    """
+    """Refuse to replace what is no earlier result: a file that does not begin like one."""
     check_regular(path)
-    if not path.parent.is_dir():
-        raise click.ClickException(f'{path}: no such folder')
     if path.is_file() and path.stat().st_size:
         with path.open('rb') as file:
             if file.read(len(beginning)) != beginning:
@@ -241,6 +228,13 @@ def check_new(paths: Iterable[Path], inputs: Iterable[Path], overwrite: bool) ->
             raise NotReplacedError(path, 'is an input, not overwritten')
         if not overwrite and path.exists():
             raise NotReplacedError(path, 'exists already, not overwritten (see --overwrite)')
+
+
+def check_distinct(names: Iterable[str], what: str) -> None:
+    """Refuse inputs of one name, which results are called by."""
+    name, number = Counter(names).most_common(1)[0]
+    if number > 1:
+        raise click.UsageError(f'{number} {what} named {name} would write the same results')
 
 
 def progress(items: Iterable[T], total: int, unit: str) -> Iterable[T]:

@@ -11,37 +11,19 @@ from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.range_image import NOT_MEASURED
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.depth_files import IMAGES, files_of
+from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.images import read_depth
-from rangeseg_ros.io.poses import PoseFileError, match_poses, read_pose
+from rangeseg_ros.io.poses import match_poses, read_pose
 from rangeseg_ros.io.recordings import BagError
-
-SUFFIXES = ('.png', '.tif', '.tiff')
 
 
 @click.command()
 @click.argument('frames_dir', type=options.FOLDER)
-@click.option(
-    '--camera',
-    'camera_file',
-    type=options.FILE,
-    required=True,
-    help='Intrinsics: a ROS camera-calibration YAML file.',
-)
+@options.camera(required=True)
 @options.raw
-@click.option(
-    '--output',
-    type=click.Path(path_type=Path),
-    required=True,
-    help='Recording to make: a rosbag2 folder (mcap).',
-)
-@click.option(
-    '--rate',
-    type=options.Finite(min=0, min_open=True, max=1e9),
-    default=30.0,
-    show_default=True,
-    help='Images per second.',
-)
+@options.output_folder('Recording to make: a rosbag2 folder (mcap).')
+@options.positive('--rate', 30.0, 'Images per second.', most=1e9)
 @options.depth_scale
 @click.option(
     '--poses',
@@ -69,12 +51,9 @@ def command(
     become /tf, from the frame world to camera_depth_optical_frame, at the stamps of the images;
     an image whose pose is missing, not finite or not rigid has none.
     """
-    paths = sorted(
-        (path for path in frames_dir.iterdir() if path.suffix.lower() in SUFFIXES),
-        key=natural_order,
-    )
+    paths = files_of(frames_dir)
     if not paths:
-        raise click.ClickException(f'{frames_dir}: no {", ".join(SUFFIXES)} images')
+        raise click.ClickException(f'{frames_dir}: no {", ".join(IMAGES)} images')
     if (len(paths) - 1) / rate > 2**31 - 2:
         raise click.UsageError(f'--rate {rate:g} leads to stamps beyond the range of ROS')
     camera = read_camera(camera_file, raw)
@@ -97,9 +76,9 @@ def command(
             if poses_dir:
                 try:
                     if path not in poses:
-                        raise PoseFileError(f'no pose for {path.name}')
+                        raise FileError(f'no pose for {path.name}')
                     bag.write_pose(read_pose(poses[path]), stamp)
-                except PoseFileError as error:
+                except FileError as error:
                     without.append(str(error))
     click.echo(f'{output}: {len(paths)} images')
     if poses_dir:

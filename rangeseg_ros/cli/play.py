@@ -9,11 +9,11 @@ from typing import Any
 
 import click
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import Reader
 
 from rangeseg_ros import interrupts
 from rangeseg_ros.cli import options
 from rangeseg_ros.extras import import_extra
+from rangeseg_ros.io.recordings import BagError, Lost, Recording, is_rosbag1
 
 CLOCK = '/clock'
 CLOCK_PERIOD = 0.025
@@ -21,14 +21,8 @@ CLOCK_PERIOD = 0.025
 
 
 @click.command()
-@click.argument('bag', type=click.Path(exists=True, path_type=Path))
-@click.option(
-    '--rate',
-    type=options.Finite(min=0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help='Speed: 2 plays twice as fast as recorded.',
-)
+@click.argument('bag', type=options.EXISTING)
+@options.positive('--rate', 1.0, 'Speed: 2 plays twice as fast as recorded.')
 @click.option('--loop', is_flag=True, help='Start again at the end, until interrupted.')
 @click.option('--wait', is_flag=True, help='Start only when every topic has a subscriber.')
 @click.option('--clock', is_flag=True, help='Publish the time of the recording on /clock.')
@@ -40,34 +34,36 @@ def command(bag: Path, rate: float, loop: bool, wait: bool, clock: bool) -> None
     """
     rclpy = import_extra('rclpy')
     no_handlers = import_extra('rclpy.signals').SignalHandlerOptions.NO
-    try:
-        reader = Reader(bag)
-        reader.open()
-    # Readers meet damaged bytes with exceptions of every kind.
-    except Exception as error:
-        raise click.ClickException(f'{bag}: not a readable rosbag2: {error}') from None
+    recording = Recording(bag)
+    if is_rosbag1(bag):
+        raise click.ClickException(f'{bag}: a bag of ROS 1, not a rosbag2')
     rclpy.init(args=[], signal_handler_options=no_handlers)
     node = rclpy.create_node('rangeseg_play')
     try:
-        publishers = _publishers(node, reader.connections)
+        publishers = _publishers(node, recording.connections)
         if not publishers:
             raise click.ClickException(f'{bag}: no message of a known type')
-        times = _clock_publisher(node) if clock and CLOCK not in publishers else None
+        times = None
+        if clock and CLOCK not in publishers:
+            times = node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
         while wait and not all(p.get_subscription_count() for p in publishers.values()):
             interrupts.check()
             time.sleep(0.05)
         time.sleep(1.0)
         while True:
             interrupts.check()  # there may be no message
-            messages = _timed(reader, set(publishers), rate, times)
-            for topic, data in options.progress(messages, reader.message_count, 'message'):
+            messages = _timed(recording, set(publishers), rate, times)
+            count = sum(recording.counts[topic] for topic in publishers)
+            for topic, data in options.progress(messages, count, 'message'):
                 publishers[topic].publish(data)
             if not loop:
                 break
         for publisher in publishers.values():
             publisher.wait_for_all_acked(import_extra('rclpy.duration').Duration(seconds=2))
+    except BagError as error:
+        raise click.ClickException(f'{bag}: {error}') from None
     finally:
-        reader.close()
+        recording.close()
         node.destroy_node()
         rclpy.try_shutdown()
 
@@ -105,12 +101,8 @@ def _offered(connection: Connection) -> Any:
     return quality
 
 
-def _clock_publisher(node: Any) -> Any:
-    return node.create_publisher(import_extra('rosgraph_msgs.msg').Clock, CLOCK, 1)
-
-
 def _timed(
-    reader: Reader, topics: set[str], rate: float, times: Any
+    recording: Recording, topics: set[str], rate: float, times: Any
 ) -> Iterator[tuple[str, bytes]]:
     """Topics and contents of messages when they are due; `times` publishes the time meanwhile."""
 
@@ -120,14 +112,17 @@ def _timed(
             message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
             times.publish(message)
 
-    start = time.monotonic()
-    wanted = [connection for connection in reader.connections if connection.topic in topics]
-    for connection, stamp, data in reader.messages(wanted):
-        due = start + (stamp - reader.start_time) / 1e9 / rate
+    start, first = time.monotonic(), None
+    for record in recording.records(topics):
+        if isinstance(record, Lost):
+            raise BagError(record.reason)
+        stamp = record.time
+        first = stamp if first is None else first
+        due = start + (stamp - first) / 1e9 / rate
         while (left := due - time.monotonic()) > CLOCK_PERIOD:
             publish_time(stamp - round(left * rate * 1e9))
             interrupts.check()
             time.sleep(CLOCK_PERIOD)
         time.sleep(max(0.0, left))
         publish_time(stamp)
-        yield connection.topic, bytes(data)
+        yield record.topic, record.data

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -12,6 +10,7 @@ import click
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.extras import import_extra
 from rangeseg_ros.tasks import Failure, attempt_all, attempt_on_cluster, check_scheduler
 
 R_co = TypeVar('R_co', covariant=True)
@@ -46,17 +45,13 @@ def with_folders(
     if len(recordings) > 1:
         files = '.bag', '.mcap', '.db3'
         names = [path.stem if path.suffix in files else path.name for path in recordings]
-        name, count = Counter(names).most_common(1)[0]
-        if count > 1:
-            raise click.UsageError(f'{count} recordings named {name} would write the same results')
+        options.check_distinct(names, 'recordings')
         folders = [output / name for name in names]
-    pairs = list(zip(recordings, folders, strict=True))
-    if not scheduler:
-        return pairs
-    check_scheduler(scheduler)
-    if find_spec('distributed') is None:
-        raise click.ClickException('--scheduler needs distributed: install the extra dask')
-    return [(recording.absolute(), folder.absolute()) for recording, folder in pairs]
+    if scheduler:
+        check_scheduler(scheduler)
+        import_extra('distributed')
+        recordings, folders = ([p.absolute() for p in paths] for paths in (recordings, folders))
+    return list(zip(recordings, folders, strict=True))
 
 
 def outcomes(

@@ -11,7 +11,6 @@ import click
 from rangeseg_ros.batch.replay import Outcome, Replay
 from rangeseg_ros.cli import options, recordings
 from rangeseg_ros.cli.errors import one_line
-from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.report.page import page_kind
@@ -48,16 +47,11 @@ def command(
     ctx: click.Context,
     paths: tuple[Path, ...],
     output: Path,
-    depth_topic: str | None,
-    camera_topic: str | None,
-    raw: bool,
     overwrite: bool,
     topics: tuple[str, ...],
-    terrain: bool,
-    copy: bool,
     jobs: int | None,
     scheduler: str | None,
-    config: Config,
+    **settings: Any,
 ) -> None:
     """Segment the depth images of recordings: rosbag2 (mcap, sqlite3) and ROS 1 bags.
 
@@ -76,11 +70,9 @@ def command(
     recording is damaged is left out, and the exit code is 1; a recording that fails costs no
     other, and the exit code is 2.
     """
-    topics = tuple(name for name in OUTPUTS if name in topics)
+    settings |= {'topics': tuple(name for name in OUTPUTS if name in topics)}
     tasks = [
-        Replay(
-            bag, folder, config, depth_topic, camera_topic, topics, copy, raw, overwrite, terrain
-        )
+        Replay(bag, folder, overwrite=overwrite, **settings)
         for bag, folder in recordings.with_folders(paths, output, scheduler)
     ]
     # All are opened, and so checked, before anything is written.
@@ -88,10 +80,9 @@ def command(
     if len(tasks) > 1 and index.exists() and not overwrite and page_kind(index) != 'overview':
         raise NotReplacedError(index)
     found = [task.check() for task in tasks]
+    outcomes = recordings.outcomes(tasks, jobs, scheduler)
     rows, codes = [], []
-    for task, read, outcome in zip(
-        tasks, found, recordings.outcomes(tasks, jobs, scheduler), strict=True
-    ):
+    for task, read, outcome in zip(tasks, found, outcomes, strict=True):
         click.echo(f'{task.recording}: {read}')
         codes.append(_report(task, outcome))
         rows.append(_row(task, outcome))
@@ -103,12 +94,10 @@ def command(
 
 def _row(task: Replay, outcome: Outcome | Failure) -> dict[str, Any]:
     """Row of a recording in the overview."""
-    name = task.folder.name
+    row = {'name': task.folder.name, 'failed': isinstance(outcome, Failure)}
     if isinstance(outcome, Failure):
         nothing = dict.fromkeys(('frames', 'empty', 'duration', 'planes_per_frame', 'ids'), 0)
-        return {'name': name, 'failed': True, 'damage': one_line(outcome.error), **nothing}
-    empty = sum(outcome.reasons.values())
-    row = {'name': name, 'failed': False, 'empty': empty}
+        return {**row, **nothing, 'damage': one_line(outcome.error)}
     return {**row, **asdict(outcome), **outcome.figures}
 
 
@@ -116,16 +105,10 @@ def _report(task: Replay, outcome: Outcome | Failure) -> int:
     """Say what became of a recording; the exit code."""
     if isinstance(outcome, Failure):
         return recordings.report_failure(task, outcome)
-    for reason, count in outcome.reasons.items():
-        click.echo(f'{count} frames without a plane: {reason}')
-    for problem, count in outcome.unlocated.items():
-        click.echo(f'{count} frames without the {problem}')
-    for doubt, count in outcome.doubts.items():
-        click.echo(f'rangeseg: {count} frames: {doubt}', err=True)
-    if outcome.tilted:
-        click.echo(f'rangeseg: {outcome.tilted} frames: {outcome.tilt}', err=True)
-    for doubt in outcome.contradicted:
-        click.echo(f'rangeseg: poses: {doubt}', err=True)
+    for note in outcome.notes:
+        click.echo(note)
+    for warning in outcome.warnings:
+        click.echo(f'rangeseg: {warning}', err=True)
     mapped = f', {outcome.mapped} planes in the map' if task.config.map_frame else ''
     already = ', done before' if outcome.already_done else ''
     click.echo(f'{task.folder}: {outcome.frames} frames{mapped}{already}')

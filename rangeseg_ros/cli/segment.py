@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,7 +24,7 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
 
 
 @click.command()
-@click.argument('depth', nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.argument('depth', nargs=-1, required=True, type=options.EXISTING)
 @options.intrinsics
 @options.output_folder()
 @options.depth_scale
@@ -54,9 +53,8 @@ def command(
     depth_scale: float | None,
     config: Config,
     overwrite: bool,
-    normals: bool,
-    curved: bool,
     sensor: bool,
+    **asked: bool,
 ) -> None:
     """Segment DEPTH images or organised clouds into planes.
 
@@ -69,11 +67,8 @@ def command(
     <stem>_stairs.csv. Nothing that is there already is replaced, unless --overwrite says so.
     """
     frames = [(file, depth_scale or scale_of(path)) for path in depth for file in files_in(path)]
-    name, count = Counter(path.stem for path, _ in frames).most_common(1)[0]
-    if count > 1:
-        raise click.UsageError(f'{count} images named {name} would write the same results')
+    options.check_distinct((path.stem for path, _ in frames), 'images')
     segmenter = Segmenter(config)
-    asked = {'normals': normals, 'curved': curved}
     files = [name for name in FRAME_FILES if asked.get(name, True)]
     outputs = [frame_path(output, path.stem, kind) for path, _ in frames for kind in files]
     options.check_new(outputs, [path for path, _ in frames], overwrite)

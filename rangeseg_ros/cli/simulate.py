@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,11 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.cli import options
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.evaluation.terrain import write_table
+from rangeseg_ros.evaluation.terrain import write_terrains
 from rangeseg_ros.io.bag_writer import DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
+from rangeseg_ros.io.tables import write_table
 from rangeseg_ros.simulation.render import Frame, TruePlane, simulate
 from rangeseg_ros.simulation.scenes import Scene, curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
@@ -27,6 +27,7 @@ from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, stated, terrain_s
 from rangeseg_ros.simulation.terrain.scene import Terrain
 from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
 
+_PLANES = 'image', 'label', 'face', 'normal_x', 'normal_y', 'normal_z', 'distance', 'count'
 SCENES: dict[str, Callable[[int, int], Scene]] = {'room': kinect_room, 'curved': curved_scene}
 _size = click.IntRange(16, 4096)
 
@@ -40,12 +41,7 @@ _of_all_sets = options.together(
     options.number('--seed', default=0, help='Of the first scene; the others have the next ones.'),
     click.option('--width', type=_size, help="Columns; the sensor's own."),
     click.option('--height', type=_size, help="Rows; the sensor's own."),
-    click.option(
-        '--output',
-        type=click.Path(path_type=Path),
-        required=True,
-        help='Folder to make; it must not exist, or be empty.',
-    ),
+    options.output_folder('Folder to make; it must not exist, or be empty.'),
 )
 _of_rooms = options.together(
     options.choice('--scene', list(SCENES), 'Boxes alone, or with a ball and a cylinder.'),
@@ -129,7 +125,11 @@ def _write_rooms(
                 _write_depth(folder, name, image.depth, image.labels)
                 truth += [(name, plane) for plane in image.planes]
                 bag.write(image.depth, 10**9 + round(index * 1e9 / 30))
-        _write_planes(folder / 'planes.csv', truth)
+        rows = [
+            [name, plane.label, plane.face, *plane.normal, plane.distance, plane.count]
+            for name, plane in truth
+        ]
+        write_table(folder / 'planes.csv', _PLANES, rows)
     click.echo(f'{output}: {count} images')
 
 
@@ -140,14 +140,7 @@ def _write_rooms(
 @options.count('--scenes', default=len(KINDS), help='How many; the kinds take turns.')
 @_of_all_sets
 def terrain(
-    sensor: str,
-    kind: str | None,
-    hard: bool,
-    scenes: int,
-    seed: int,
-    width: int | None,
-    height: int | None,
-    output: Path,
+    sensor: str, kind: str | None, hard: bool, scenes: int, seed: int, **given: Any
 ) -> None:
     """Ground, drops, stairs, ramps, curbs, mirrors and obstacles, from a robot.
 
@@ -169,7 +162,7 @@ def terrain(
     names = [kind] if kind else list(HARD if hard else KINDS)
     numbers = range(seed, seed + scenes)
     made = [terrain_scene(names[number % len(names)], number) for number in numbers]
-    _write_terrains(made, sensor, seed, (width, height), output)
+    _write_terrains(made, sensor, seed, **given)
 
 
 @command.command()
@@ -183,15 +176,7 @@ def terrain(
     help='Height of the camera above the ground, metres; it is aimed 1.5 m ahead.',
 )
 @_of_all_sets
-def testpieces(
-    sensor: str,
-    scenes: int,
-    mount: float,
-    seed: int,
-    width: int | None,
-    height: int | None,
-    output: Path,
-) -> None:
+def testpieces(sensor: str, scenes: int, mount: float, seed: int, **given: Any) -> None:
     """Cylinders, boxes, kerbs, edges, gaps and ramps of known size at known distances.
 
     OUTPUT is as that of `simulate terrain`; `rangeseg evaluate OUTPUT` says which of the pieces
@@ -199,18 +184,19 @@ def testpieces(
     """
     numbers = range(seed, seed + scenes)
     made = [piece_scene(*piece, mount, number) for piece in all_pieces() for number in numbers]
-    _write_terrains(made, sensor, seed, (width, height), output)
+    _write_terrains(made, sensor, seed, **given)
 
 
 def _write_terrains(
     scenes: Sequence[Terrain],
     sensor: str,
     seed: int,
-    size: tuple[int | None, int | None],
+    width: int | None,
+    height: int | None,
     output: Path,
 ) -> None:
     """Write scenes with numbers from `seed` on, as images of so many columns and rows."""
-    camera = _camera(SENSORS[sensor](seed), *size)
+    camera = _camera(SENSORS[sensor](seed), width, height)
     table = []
     with options.new_folder(output) as folder:
         write_camera(folder / 'camera.yaml', camera)
@@ -221,7 +207,7 @@ def _write_terrains(
             for part in ('height', 'size', 'crossing'):
                 write_image(folder / part / f'{name}.tiff', getattr(frame, part))
             table.append((name, sensor, scene, stated(scene, number)))
-        write_table(folder / 'terrain.csv', table)
+        write_terrains(folder / 'terrain.csv', table)
     click.echo(f'{output}: {len(scenes)} images')
 
 
@@ -237,14 +223,3 @@ def _write_depth(folder: Path, name: str, depth: NDArray, truth: NDArray) -> Non
         depth = np.rint(1000 * depth).astype(np.uint16)
     write_image(folder / 'depth' / f'{name}.png', depth)
     write_image(folder / 'truth' / f'{name}.png', truth)
-
-
-def _write_planes(path: Path, truth: list[tuple[str, TruePlane]]) -> None:
-    """Table of the planes of all images."""
-    with path.open('w', newline='') as file:
-        rows = csv.writer(file, lineterminator='\n')
-        normal = ('normal_x', 'normal_y', 'normal_z')
-        rows.writerow(['image', 'label', 'face', *normal, 'distance', 'count'])
-        for image, plane in truth:
-            equation = (f'{value:.9g}' for value in (*plane.normal, plane.distance))
-            rows.writerow([image, plane.label, plane.face, *equation, plane.count])

@@ -42,17 +42,8 @@ def prepare(
 ) -> None:
     """Compile all kernels that `config` needs for frames of `kinds`, and load them.
 
-    Where they are compiled already, this takes as long as to load them.
-
-    Parameters
-    ----------
-    config : Config
-    kinds : tuple of str
-        Of `rehearsal.KINDS`.
-    report : callable
-        Gets the progress, 'compiling kernels, 12 of 35'; nothing when nothing is compiled.
-    outputs : collection of str
-        Of `OUTPUTS`: what is made of the frames.
+    Where they are compiled already, this takes as long as to load them, and `report` gets nothing;
+    else the progress, 'compiling kernels, 12 of 35'. `outputs` are made of the frames.
     """
     size = _EXACT_SIZE if config.exact else _SIZE
     with not_ahead():

@@ -83,8 +83,7 @@ def _room(noise: float, camera: Camera, size: int) -> NDArray[np.uint16]:
     depth[30 * size : 30 * size + 4, 40 * size : 40 * size + 4] = 0
     # A bar that parts the left wall without touching it.
     depth[10 * size : 13 * size, : 28 * size] = 0.7
-    millimetres: NDArray[np.uint16] = np.round(1000 * depth).astype(np.uint16)
-    return millimetres
+    return np.round(1000 * depth).astype(np.uint16)
 
 
 def _make(kind: str, **fields: Any) -> Any:

@@ -32,15 +32,7 @@ _MOST_PROCESSES = 4
 
 
 class Kernel(NamedTuple):
-    """A kernel to be compiled.
-
-    Attributes
-    ----------
-    module, name : str
-        Where its dispatcher is.
-    signature : tuple
-        Types of its arguments.
-    """
+    """A kernel to be compiled: where its dispatcher is, and the types of its arguments."""
 
     module: str
     name: str

@@ -26,9 +26,9 @@ from rangeseg_ros.evaluation.label_files import (
     read_label_image,
 )
 from rangeseg_ros.io.cameras import read_camera
-from rangeseg_ros.io.files import natural_order
+from rangeseg_ros.io.files import FileError, natural_order
 from rangeseg_ros.io.images import read_depth
-from rangeseg_ros.io.pcd import PcdError, read_pcd
+from rangeseg_ros.io.pcd import read_pcd
 from rangeseg_ros.segcomp import (
     FIRST_REGION,
     SegcompError,
@@ -107,7 +107,7 @@ def read_scan(image: Path, truth: Path) -> Sample:
     fields = read_pcd(image)
     missing = {'x', 'y', 'z', 'intensity'} - fields.keys()
     if missing:
-        raise PcdError(f'{image}: no field {", ".join(sorted(missing))}')
+        raise FileError(f'{image}: no field {", ".join(sorted(missing))}')
     # Such scans count their columns from right to left.
     x, y, z, label = (fields[name][:, ::-1] for name in ('x', 'y', 'z', 'intensity'))
     seen = RangeImage.from_points(np.stack([-y, -z, x], axis=2).astype(np.float64))

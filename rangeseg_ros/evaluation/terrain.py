@@ -27,6 +27,7 @@ from rangeseg_ros.evaluation.stairs import (
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image
+from rangeseg_ros.io.tables import write_table
 from rangeseg_ros.simulation.terrain.scene import Terrain
 
 REACH = {'realsense': 2.5}
@@ -42,17 +43,16 @@ _STAIRS = ('direction', 'count', 'rise', 'run')
 _DEPTHS = (('depth', 'png'), ('size', 'tiff'), ('crossing', 'tiff'), ('height', 'tiff'))
 
 
-def write_table(
+def write_terrains(
     path: Path, images: Iterable[tuple[str, str, Terrain, tuple[NDArray[np.float64], float]]]
 ) -> None:
     """Write the CSV of images: name, sensor, scene, and up and height as the robot knows them."""
-    with path.open('w', newline='') as file:
-        rows = csv.writer(file, lineterminator='\n')
-        rows.writerow([*_COLUMNS, *_STAIRS])
-        for name, sensor, scene, (up, height) in images:
-            known = [f'{value:.6f}' for value in (*up, height)]
-            stairs = (scene.stairs.get(column, '') for column in _STAIRS)
-            rows.writerow([name, scene.kind, sensor, *known, *stairs])
+    rows = []
+    for name, sensor, scene, (up, height) in images:
+        known = [f'{value:.6f}' for value in (*up, height)]
+        stairs = [scene.stairs.get(column, '') for column in _STAIRS]
+        rows.append([name, scene.kind, sensor, *known, *stairs])
+    write_table(path, (*_COLUMNS, *_STAIRS), rows)
 
 
 class Shares(NamedTuple):

@@ -4,51 +4,40 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
-from rangeseg_ros.io.message_types import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, IMAGE
-from rangeseg_ros.io.recordings import BagError, Lost, Recording, RecordingError
+from rangeseg_ros.io.recordings import BagError, Closing, Lost, Recording
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.images import PIXEL_TYPES
+from rangeseg_ros.messages.make import CAMERA_INFO, CLOUD, COMPRESSED_IMAGE, IMAGE
+
+T = TypeVar('T')
+
+IMAGES = (IMAGE, COMPRESSED_IMAGE)
 
 
 class DamagedBagError(BagError):
     """A recording that cannot be read further than here."""
 
 
-class DepthBag:
+class DepthBag(Closing):
     """Iterates over the depth frames of one recording, in the order of the recording.
 
-    Parameters
-    ----------
-    path : Path
-        Directory or .mcap or .db3 file of a rosbag2, or .bag file of ROS 1.
-    depth_topic, camera_topic : str, optional
-        Where to find images and intrinsics. By default the depth image is found by type and
-        name, or encoding; its camera_info is the sibling topic, or the only one there is.
-    raw : bool
-        The images are raw whatever the name of their topic says, see `raw_by_name`.
+    `path` is a directory or .mcap or .db3 file of a rosbag2, or a .bag file of ROS 1. By default
+    the depth image is found by type and name, or encoding; its camera_info is the sibling topic,
+    or the only one there is. `raw` says that the images are raw whatever the name of their topic
+    says, `clouds` that the frames are the clouds on `depth_topic`, which need no camera.
 
-    Attributes
-    ----------
-    depth_topic, camera_topic : str
-        The topics in use.
-    lost : Counter of str
-        Why frames were left out while iterating -> how many.
-    damage : str
-        For those who iterate to note what ended it.
+    `lost` counts why frames were left out while iterating; `damage` is for those who iterate to
+    note what ended it.
 
-    Raises
-    ------
-    BagError
-        Not a recording, or one without depth images or camera_info: the message lists its
-        topics. Also one without any image of a known encoding that its camera_info fits.
-    DamagedBagError
-        While iterating, after the last frame before the damage.
+    BagError: not a recording, or one without depth images or camera_info (the message lists its
+    topics), or without any image of a known encoding that its camera_info fits. DamagedBagError:
+    while iterating, after the last frame before the damage.
     """
 
     def __init__(
@@ -57,33 +46,27 @@ class DepthBag:
         depth_topic: str | None = None,
         camera_topic: str | None = None,
         raw: bool = False,
+        clouds: bool = False,
     ) -> None:
         self.path = path
-        self._raw = raw
         self.lost: Counter[str] = Counter()
         self.damage = ''
-        try:
-            self._recording = Recording(path)
-        except OSError as error:
-            raise BagError(f'{path}: {error.strerror}') from None
-        except RecordingError as error:
-            raise BagError(f'{path}: {error}') from None
+        self.depth_topic, self.camera_topic = depth_topic or '', camera_topic or ''
+        self._raw, self._first_camera = raw, None
+        self._recording = Recording(path)
+        if clouds:
+            return
         try:
             self.depth_topic = depth_topic or self._find_depth_topic()
-            self._require(self.depth_topic, 'depth image', (IMAGE, COMPRESSED_IMAGE))
+            self._require(self.depth_topic, 'depth image', IMAGES)
             self.camera_topic = camera_topic or self._find_camera_topic()
             self._require(self.camera_topic, 'camera_info', (CAMERA_INFO,))
-            self._first_camera = self._find_camera()
-            self._find_frame()
+            self._first_camera = self._first(self.camera_topic, self._camera)
+            # There is a frame that can be read.
+            self._first(self.depth_topic, DepthFrame.range_image, self)
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> DepthBag:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the files."""
@@ -95,9 +78,7 @@ class DepthBag:
 
     def __iter__(self) -> Iterator[DepthFrame]:
         self.lost.clear()
-        camera: Camera | None = self._first_camera
-        count = 0
-        reason = ''
+        camera, count, reason = self._first_camera, 0, ''
         try:
             topics = (self.depth_topic, self.camera_topic)
             for topic, time, message in self._recording.messages(topics):
@@ -105,12 +86,12 @@ class DepthBag:
                     if isinstance(message, Lost):
                         continue  # the last one may still be right
                     try:
-                        camera = self._camera(message)
+                        camera, reason = self._camera(message), ''
                     except CameraError as error:
-                        camera, reason = None, f'{self.camera_topic}: {error}'
+                        reason = f'{topic}: {error}'
                 elif isinstance(message, Lost):
                     self.lose(message.reason, message.messages)
-                elif camera is None:
+                elif reason:
                     self.lose(reason)
                 else:
                     yield DepthFrame(message, camera, time)
@@ -138,49 +119,28 @@ class DepthBag:
     def _camera(self, message: Any) -> Camera:
         return camera_from_message(message, True if self._raw else raw_by_name(self.depth_topic))
 
-    def _find_camera(self) -> Camera:
-        """The first camera that can be used."""
-        reason = f'no message on {self.camera_topic}'
+    def _first(self, topic: str, made: Callable[[Any], T], items: Iterable[Any] = ()) -> T:
+        """What is made of the first item, or message on a topic, of which it can be."""
+        reason = f'no message on {topic}'
         try:
-            for _, _, message in self._recording.messages((self.camera_topic,)):
-                if isinstance(message, Lost):
-                    reason = f'no readable message on {self.camera_topic}: {message.reason}'
+            messages = (message for *_, message in self._recording.messages((topic,)))
+            for item in items or messages:
+                if isinstance(item, Lost):
+                    self.lose(item.reason)
                     continue
                 try:
-                    return self._camera(message)
-                except CameraError as error:
-                    reason = f'{self.camera_topic}: {error}'
-        except Exception as error:
-            reason = f'no readable message on {self.camera_topic}: {error}'
-        raise BagError(f'{self.path}: {reason}')
-
-    def _find_frame(self) -> None:
-        """Make sure that there is a frame that can be read."""
-        reason = f'no message on {self.depth_topic}'
-        try:
-            for frame in self:
-                try:
-                    frame.range_image()
-                    return
+                    return made(item)
                 except ValueError as error:
-                    reason = f'{self.depth_topic}: {error}'
-        except DamagedBagError as error:
-            reason = f'no readable message on {self.depth_topic}: {error}'
+                    reason = f'{topic}: {error}'
+        except Exception as error:
+            reason = f'no readable message on {topic}: {error}'
         if self.lost:
-            reason = f'no readable message on {self.depth_topic}: {next(iter(self.lost))}'
+            reason = f'no readable message on {topic}: {next(iter(self.lost))}'
         raise BagError(f'{self.path}: {reason}')
-
-    def _first_message(self, topic: str) -> Any:
-        """The first message that can be read; None when there is none."""
-        try:
-            messages = self._recording.messages((topic,))
-            return next((m for _, _, m in messages if not isinstance(m, Lost)), None)
-        except Exception:
-            return None
 
     def _find_depth_topic(self) -> str:
         types = self._recording.types
-        images = [name for name, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE)]
+        images = [name for name, kind in types.items() if kind in IMAGES]
         found = [name for name in images if 'depth' in name.lower() and self._may_be_depth(name)]
         found = found or [name for name in images if self._may_be_depth(name)]
         if not found:
@@ -207,20 +167,19 @@ class DepthBag:
 
     def _encoding(self, topic: str) -> str:
         """Encoding of the images on a topic, or format of compressed ones; empty when unknown."""
-        message = self._first_message(topic)
-        encoding: str = getattr(message, 'format', '') or getattr(message, 'encoding', '')
-        return encoding
+        try:
+            return self._first(topic, lambda m: m.format if hasattr(m, 'format') else m.encoding)
+        except BagError:
+            return ''
 
     def _find_camera_topic(self) -> str:
         there = [name for name, kind in self._recording.types.items() if kind == CAMERA_INFO]
         sibling = _sibling_camera_info(self.depth_topic)
-        if sibling in there:
-            return sibling
-        if len(there) == 1:
-            return there[0]
-        raise BagError(
-            f'{self.path}: no camera_info for {self.depth_topic}; {self._topics_there_are()}'
-        )
+        if sibling not in there and len(there) != 1:
+            raise BagError(
+                f'{self.path}: no camera_info for {self.depth_topic}; {self._topics_there_are()}'
+            )
+        return sibling if sibling in there else there[0]
 
     def _require(self, topic: str, what: str, kinds: tuple[str, ...]) -> None:
         if self._recording.types.get(topic) not in kinds:
@@ -233,58 +192,18 @@ class DepthBag:
         return f'topics: {listed}' + (f' (damaged: {damage})' if damage else '')
 
 
-class CloudBag:
-    """Iterates over the point clouds of one recording, in the order of the recording.
-
-    Parameters
-    ----------
-    path : Path
-        As of `DepthBag`.
-    topic : str
-        Of the clouds.
-    """
-
-    def __init__(self, path: Path, topic: str) -> None:
-        self.path, self.topic = path, topic
-        self._recording = Recording(path)
-
-    def __enter__(self) -> CloudBag:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._recording.close()
-
-    def __len__(self) -> int:
-        return self._recording.counts[self.topic]
-
-    def __iter__(self) -> Iterator[DepthFrame]:
-        for _, time, message in self._recording.messages((self.topic,)):
-            if not isinstance(message, Lost):
-                yield DepthFrame(message, None, time)
-
-
-def open_frames(path: Path, topic: str | None, camera_topic: str | None) -> DepthBag | CloudBag:
-    """Frames of a recording: those on `topic`, else depth images, else the only point clouds.
-
-    Raises
-    ------
-    BagError
-        See `DepthBag`; also several topics of clouds, and no other.
-    """
-    try:
-        recording = Recording(path)
-    except (OSError, RecordingError):
-        return DepthBag(path, topic, camera_topic)  # which says what is wrong
-    kinds, counts = dict(recording.types), recording.counts
-    clouds = sorted(name for name, kind in kinds.items() if kind == CLOUD and counts[name])
-    recording.close()
+def open_frames(path: Path, topic: str | None, camera_topic: str | None) -> DepthBag:
+    """Frames of a recording: those on `topic`, else depth images, else the only point clouds."""
+    with Recording(path) as recording:
+        types, counts = recording.types, recording.counts
+    clouds = sorted(name for name, kind in types.items() if kind == CLOUD and counts[name])
     if topic in clouds:
-        return CloudBag(path, topic)
-    if topic or not clouds or {IMAGE, COMPRESSED_IMAGE} & set(kinds.values()):
+        return DepthBag(path, topic, clouds=True)
+    if topic or not clouds or set(IMAGES) & set(types.values()):
         return DepthBag(path, topic, camera_topic)
     if len(clouds) > 1:
         raise BagError(f'{path}: several topics of point clouds: {", ".join(clouds)}')
-    return CloudBag(path, clouds[0])
+    return DepthBag(path, clouds[0], clouds=True)
 
 
 def _sibling_camera_info(image_topic: str) -> str:

@@ -11,32 +11,19 @@ import yaml
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.yaml_files import YamlError, read_yaml
+from rangeseg_ros.io.yaml_files import read_yaml
 from rangeseg_ros.messages.cameras import camera_from_matrices
 
 
 def read_camera(path: Path, raw: bool = False) -> Camera:
     """Read the intrinsics of a ROS camera-calibration YAML file, or of the JSON of Open3D.
 
-    Parameters
-    ----------
-    path : Path
-    raw : bool
-        The images are raw though there is a P for rectified ones.
-
-    Raises
-    ------
-    CameraError
-        A missing or unreadable file, or one without valid intrinsics.
+    `raw`: the images are raw though there is a P for rectified ones. FileError or CameraError: one
+    that cannot be read, or without valid intrinsics.
     """
-    try:
-        calibration = read_yaml(path)
-    except YamlError as error:
-        raise CameraError(str(error)) from None
-    if not isinstance(calibration, dict):
-        raise CameraError(f'{path}: not a camera calibration')
+    calibration = read_yaml(path)
     # JSON is YAML. Open3D writes K by columns, with the poses of cameras inside `intrinsic`.
-    inner = calibration.get('intrinsic', calibration)
+    inner = calibration.get('intrinsic', calibration) if isinstance(calibration, dict) else None
     if isinstance(inner, dict) and 'intrinsic_matrix' in inner:
         try:
             k = np.array(inner['intrinsic_matrix'], float).reshape(3, 3).T
@@ -64,13 +51,13 @@ def camera_from_calibration(calibration: Mapping[str, Any], raw: bool | None = N
         A missing or malformed key, named in the message.
     """
     if not isinstance(calibration, Mapping):
-        raise CameraError('malformed camera calibration: no mapping')
-    width, height = _entry(calibration, 'image_width'), _entry(calibration, 'image_height')
-    k = _data(calibration, 'camera_matrix')
-    if k is None:
-        raise CameraError("camera calibration lacks 'camera_matrix'")
-    p = _data(calibration, 'projection_matrix')
-    d = _data(calibration, 'distortion_coefficients')
+        raise CameraError('not a camera calibration, or a malformed one: no mapping')
+    for key in ('image_width', 'image_height', 'camera_matrix'):
+        if calibration.get(key) is None:
+            raise CameraError(f'camera calibration lacks {key!r}')
+    width, height = calibration['image_width'], calibration['image_height']
+    matrices = ('camera_matrix', 'projection_matrix', 'distortion_coefficients')
+    k, p, d = (_data(calibration, key) for key in matrices)
     model = calibration.get('distortion_model') or ''
     if not isinstance(model, str):
         raise CameraError(f'malformed camera calibration: distortion_model {model!r}')
@@ -82,20 +69,14 @@ def camera_from_calibration(calibration: Mapping[str, Any], raw: bool | None = N
         raise CameraError(f'malformed camera calibration: {error}') from None
 
 
-def _entry(calibration: Mapping[str, Any], key: str) -> Any:
-    if key not in calibration:
-        raise CameraError(f'camera calibration lacks {key!r}')
-    return calibration[key]
-
-
 def _data(calibration: Mapping[str, Any], key: str) -> Any:
     """Values of a matrix of a calibration; None when it is not there."""
     entry = calibration.get(key)
     if entry is None:
         return None
-    if not isinstance(entry, Mapping):
+    if not isinstance(entry, Mapping) or 'data' not in entry:
         raise CameraError(f'malformed camera calibration: {key} has no data')
-    return _entry(entry, 'data')
+    return entry['data']
 
 
 def write_camera(path: Path, camera: Camera, name: str = 'depth') -> None:
@@ -108,11 +89,7 @@ def write_camera(path: Path, camera: Camera, name: str = 'depth') -> None:
         'camera_matrix': {'rows': 3, 'cols': 3, 'data': camera.matrix.ravel().tolist()},
         'distortion_model': camera.distortion_model or 'plumb_bob',
         'distortion_coefficients': {'rows': 1, 'cols': len(d), 'data': d},
-        'rectification_matrix': {
-            'rows': 3,
-            'cols': 3,
-            'data': [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
-        },
+        'rectification_matrix': {'rows': 3, 'cols': 3, 'data': np.eye(3).ravel().tolist()},
     }
     if camera.pinhole:
         p = np.pad(camera.matrix, ((0, 0), (0, 1))).ravel().tolist()

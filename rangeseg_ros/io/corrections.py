@@ -2,18 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.distortion import DistortionError
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.io.distortion import read_distortion
-from rangeseg_ros.io.files import cached_while_unchanged
-from rangeseg_ros.io.images import ImageFileError, read_mask
+from rangeseg_ros.io.files import FileError
+from rangeseg_ros.io.images import read_mask
 
-load_mask = cached_while_unchanged(read_mask)
-load_distortion = cached_while_unchanged(read_distortion)
+
+def _load(read: Callable[[Path], Any], path: Path) -> Any:
+    """What `read` makes of a file, kept as long as that does not change."""
+    state = path.stat() if path.exists() else None
+    return _kept(read, path, state and (state.st_mtime_ns, state.st_size))
+
+
+@lru_cache(maxsize=8)
+def _kept(read: Callable[[Path], Any], path: Path, state: object) -> Any:
+    return read(path)
+
+
+load_mask, load_distortion = partial(_load, read_mask), partial(_load, read_distortion)
 
 
 def corrected(image: RangeImage, config: Config) -> RangeImage:
@@ -25,7 +39,7 @@ def corrected(image: RangeImage, config: Config) -> RangeImage:
     ------
     DistortionError
         The map cannot be read, or is of another size or camera.
-    ImageFileError, RangeImageError
+    FileError, RangeImageError
         The mask cannot be read, or is of another size.
     """
     if config.mask:
@@ -42,19 +56,13 @@ def corrected(image: RangeImage, config: Config) -> RangeImage:
 def check_corrections(config: Config) -> None:
     """Read the files that `corrected` needs, so that none is missed only once a frame is there.
 
-    Raises
-    ------
-    ConfigError
-        One that cannot be read, and the parameter that names it.
+    ConfigError: one that cannot be read, and the parameter that names it.
     """
-    for parameter, file, read in (
-        ('mask', config.mask, load_mask),
-        ('distortion_map', config.distortion_map, load_distortion),
-    ):
+    for parameter, load in (('mask', load_mask), ('distortion_map', load_distortion)):
         try:
-            if file:
-                read(Path(file))
-        except (ImageFileError, DistortionError) as error:
+            if file := getattr(config, parameter):
+                load(Path(file))
+        except (FileError, DistortionError) as error:
             raise ConfigError(f'parameter {parameter}: {error}') from None
 
 

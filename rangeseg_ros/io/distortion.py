@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import warnings
 from dataclasses import asdict
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -28,13 +29,7 @@ _DESCRIPTION = 270
 
 
 def read_distortion(path: Path) -> DistortionMap:
-    """Read a distortion map.
-
-    Raises
-    ------
-    DistortionError
-        A missing or unreadable file; pages that are not float32 of one size, or not finite.
-    """
+    """Read a distortion map; DistortionError where it is none, or its values are not finite."""
     try:
         # Of damage the reader only warns.
         with warnings.catch_warnings():
@@ -42,6 +37,7 @@ def read_distortion(path: Path) -> DistortionMap:
             with Image.open(path, formats=['TIFF']) as file:
                 description = str(file.tag_v2.get(_DESCRIPTION, ''))  # type: ignore[attr-defined]
                 pages = [_page(page) for page in ImageSequence.Iterator(file)]
+        return _map_of(pages, _about(description))
     except DistortionError as error:
         raise DistortionError(f'{path}: {error}') from None
     except FileNotFoundError as error:
@@ -49,32 +45,28 @@ def read_distortion(path: Path) -> DistortionMap:
     # Damaged files are met with exceptions of every kind.
     except Exception:
         raise DistortionError(f'{path}: not a readable TIFF') from None
+
+
+def _map_of(pages: list[NDArray[np.float32]], about: dict[str, Any]) -> DistortionMap:
     if len(pages) > 4 or any(page.shape != pages[0].shape for page in pages):
-        raise DistortionError(f'{path}: not one to four pages of one size')
-    about = _about(description)
-    reference = 0.0
+        raise DistortionError('not one to four pages of one size')
     try:
         camera = Camera(**about['camera']) if about.get('camera') else None
-        if len(pages) == 4:
-            reference = float(about['reference'])
+        reference = float(about['reference']) if len(pages) == 4 else 0.0
     except (KeyError, TypeError, ValueError):
-        raise DistortionError(f'{path}: damaged description') from None
+        raise DistortionError('damaged description') from None
     if not np.isfinite(reference) or (len(pages) == 4 and pages.pop(2).any()):
-        raise DistortionError(f'{path}: a third page beside a reference')
-    offset, deviation, slope = [*pages, None, None][:3]
-    assert offset is not None
-    return DistortionMap(offset, deviation, slope, camera, reference)
+        raise DistortionError('a third page beside a reference')
+    maps: dict[str, Any] = dict(zip(('offset', 'deviation', 'slope'), pages, strict=False))
+    return DistortionMap(**maps, camera=camera, reference=reference)
 
 
 def write_distortion(path: Path, distortion: DistortionMap) -> None:
     """Write a distortion map, whole or not at all."""
-    pages = [distortion.offset]
-    if distortion.deviation is not None:
-        pages.append(distortion.deviation)
-        if distortion.slope is not None:
-            if distortion.reference:
-                pages.append(np.zeros_like(distortion.slope))
-            pages.append(distortion.slope)
+    parts = (distortion.offset, distortion.deviation, distortion.slope)
+    pages = list(takewhile(lambda page: page is not None, parts))
+    if distortion.reference and len(pages) == 3:
+        pages.insert(2, np.zeros_like(distortion.offset))
     about: dict[str, Any] = {'kind': KIND, 'unit': '1/m'}
     if distortion.reference:
         about['reference'] = distortion.reference

@@ -6,20 +6,20 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TypeVar
-
-T = TypeVar('T')
 
 TEMPORARY = '.rangeseg-'
 """How the names of temporary folders begin."""
 
 # A full disk, quota or largest file: Python does not say of which file.
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+class FileError(ValueError):
+    """A file that cannot be read, or is not of the kind asked for."""
 
 
 class NotReplacedError(OSError):
@@ -35,14 +35,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
     On success it is moved to `path`, or to what that links to; after an exception nothing is
     left. A file keeps its mode; other names (hard links) of one that is replaced stay with what it
-    was.
-
-    Raises
-    ------
-    NotReplacedError
-        `path` is a device, a pipe or the like.
-    OSError
-        It cannot be written; of a full disk, too, the error names the file.
+    was. FileError: `path` is a device, a pipe or the like. OSError: it cannot be written; of a
+    full disk, too, the error names the file.
     """
     path = resolved(path) if path.is_symlink() else path
     check_regular(path)
@@ -68,26 +62,23 @@ def resolved(path: Path) -> Path:
 
 
 def check_regular(path: Path) -> None:
-    """Raise NotReplacedError for devices, pipes and the like."""
+    """Raise FileError for devices, pipes and the like."""
     if path.exists() and not (path.is_file() or path.is_dir()):
-        raise NotReplacedError(path, 'not a regular file')
+        raise FileError(f'{path}: not a regular file')
 
 
-def cached_while_unchanged(read: Callable[[Path], T]) -> Callable[[Path], T]:
-    """Make a function that reads a file keep its results as long as the file does not change."""
+def read_bytes(path: Path, most: int | None = None) -> bytes:
+    """Content of a regular file of at most so many bytes; FileError says in one line what it is.
 
-    @lru_cache(maxsize=4)
-    def kept(path: Path, time: int, size: int) -> T:
-        return read(path)
-
-    def load(path: Path) -> T:
-        try:
-            state = path.stat()
-        except OSError:
-            return read(path)  # which says what is wrong
-        return kept(path, state.st_mtime_ns, state.st_size)
-
-    return load
+    Pipes and devices are refused, as they may not end.
+    """
+    try:
+        check_regular(path)
+        if most is not None and path.stat().st_size > most:
+            raise FileError(f'{path}: too large for such a file')
+        return path.read_bytes()
+    except OSError as error:
+        raise FileError(f'{path}: {error.strerror}') from None
 
 
 def natural_order(path: Path) -> list[str | int]:

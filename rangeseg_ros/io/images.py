@@ -2,73 +2,38 @@
 
 from __future__ import annotations
 
-import io
 import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from rangeseg_ros.io.files import replacing
-from rangeseg_ros.messages.images import png_shape
-
-
-class ImageFileError(ValueError):
-    """A file that is no image of the kind asked for."""
+from rangeseg_ros.io.files import FileError, read_bytes, replacing
+from rangeseg_ros.messages.images import shape_and_pages
 
 
 def read_depth(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
-    """Read a depth image: 16-bit PNG or TIFF, or floating-point TIFF.
+    """Depth image (H, W) of a 16-bit PNG or TIFF, or floating-point TIFF, in the unit of the file.
 
-    Parameters
-    ----------
-    path : Path
-    shape : (int, int), optional
-        (H, W) that the image must have; one of another size is not decoded.
-
-    Returns
-    -------
-    (H, W) uint16 or floating point, in the unit of the file.
-
-    Raises
-    ------
-    ImageFileError
-        A missing or unreadable file, several channels, another type such as 8 bits, or another
-        size.
-
-    Warns
-    -----
-    UserWarning
-        A TIFF of several pages, of which the first is read.
+    FileError: another kind of image or, before it is decoded, another size than `shape` (H, W).
     """
     image = _read(path, shape)
     if image.ndim != 2:
-        raise ImageFileError(
+        raise FileError(
             f'{path}: depth image must have one channel, not {image.shape[2]} (colour?)'
         )
     if image.dtype.kind != 'f' and image.dtype.itemsize < 2:
-        raise ImageFileError(f'{path}: depth image must be 16-bit or float, not {image.dtype}')
+        raise FileError(f'{path}: depth image must be 16-bit or float, not {image.dtype}')
     return image
 
 
 def read_labels(path: Path) -> NDArray[np.uint16]:
-    """Read a label image: PNG or TIFF of 8 or 16 bits and one channel.
-
-    Returns
-    -------
-    (H, W) uint16
-
-    Raises
-    ------
-    ImageFileError
-        A missing or unreadable file, several channels, or another type.
-    """
+    """Label image (H, W) of a PNG or TIFF of 8 or 16 bits and one channel; else FileError."""
     image = _read(path)
     if image.ndim != 2 or image.dtype not in (np.uint8, np.uint16):
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise ImageFileError(
+        raise FileError(
             f'{path}: label image must have one channel of 8 or 16 bits, '
             f'not {channels} of {image.dtype}'
         )
@@ -76,17 +41,9 @@ def read_labels(path: Path) -> NDArray[np.uint16]:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Read a mask: an image of any type and number of channels.
+    """Mask (H, W) of an image of any type: True where a channel is not 0.
 
-    Returns
-    -------
-    (H, W) bool
-        True where a channel is not 0; of four channels, the last one is opacity.
-
-    Raises
-    ------
-    ImageFileError
-        A missing or unreadable file.
+    Of four channels, the last one is opacity.
     """
     image = _read(path)
     if image.ndim == 2:
@@ -96,14 +53,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def write_image(path: Path, image: NDArray) -> None:
-    """Write a PNG or TIFF, by the suffix of `path`.
-
-    Parameters
-    ----------
-    path : Path
-    image : (H, W) uint8, uint16 or float32, or (H, W, 3) uint8 or float32
-        Three channels are R, G, B; floats are for TIFF.
-    """
+    """Write (H, W) uint8, uint16 or float32, or (H, W, 3) R, G, B: PNG, or TIFF by its suffix."""
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, data = cv2.imencode(path.suffix, image)
@@ -112,17 +62,12 @@ def write_image(path: Path, image: NDArray) -> None:
 
 
 def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
-    try:
-        if path.exists() and not (path.is_file() or path.is_dir()):
-            raise ImageFileError(f'{path}: not a regular file')
-        data = path.read_bytes()
-    except OSError as error:
-        raise ImageFileError(f'{path}: {error.strerror}') from None
-    size, pages = png_shape(data), 1
+    data = read_bytes(path)
+    size, pages = shape_and_pages(data, 'PNG')
     if size is None:
-        size, pages = _tiff_shape(data)
+        size, pages = shape_and_pages(data, 'TIFF')
     if size and shape and size != shape:
-        raise ImageFileError(
+        raise FileError(
             f'{path}: depth image is {size[1]}x{size[0]}, its camera {shape[1]}x{shape[0]}'
         )
     try:
@@ -131,17 +76,7 @@ def _read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
     except cv2.error:
         image = None
     if image is None:
-        raise ImageFileError(f'{path}: not a readable image (PNG or TIFF)')
+        raise FileError(f'{path}: not a readable image (PNG or TIFF)')
     if pages > 1:
         warnings.warn(f'{path}: only the first of {pages} pages is read', stacklevel=3)
     return image
-
-
-def _tiff_shape(data: bytes) -> tuple[tuple[int, int] | None, int]:
-    """(H, W) of the first page of a TIFF, and the number of pages; None for others."""
-    try:
-        with Image.open(io.BytesIO(data), formats=['TIFF']) as file:
-            return file.size[::-1], getattr(file, 'n_frames', 1)
-    # Damaged bytes are met with exceptions of every kind.
-    except Exception:
-        return None, 0

@@ -28,15 +28,7 @@ end_header
 
 
 def write_mesh(path: Path, planes: Sequence[MapPlane], colours: NDArray[np.uint8]) -> None:
-    """Write the outlines of planes, all parts with their holes, as triangles.
-
-    Parameters
-    ----------
-    path : Path
-    planes : sequence of MapPlane
-    colours : (N, 3) uint8
-        Of the planes.
-    """
+    """Write the outlines of planes, all parts with their holes, as triangles in colours (N, 3)."""
     vertices: list[str] = []
     faces: list[str] = []
     for plane, colour in zip(planes, colours.tolist(), strict=True):

@@ -10,7 +10,7 @@ from typing import Any
 from rangeseg_ros.core.config import Config, known_name
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.io.corrections import check_corrections
-from rangeseg_ros.io.yaml_files import YamlError, read_yaml
+from rangeseg_ros.io.yaml_files import read_yaml
 
 NODE = 'segment_planes'
 # Parameters that the node has beyond those of the segmenter; nested ones by their first part.
@@ -21,29 +21,14 @@ NODE_ONLY = frozenset(
 
 
 def read_params(path: Path) -> dict[str, Any]:
-    """Read the parameters of the segmenter from a YAML file.
+    """Read the parameters of the segmenter from a YAML file, without `NODE_ONLY`.
 
-    Parameters
-    ----------
-    path : Path
-        Names and values, or a ROS parameter file: of that, the sections of the node
-        `segment_planes` in any namespace and of the wildcards `/**` and `/*`, without `NODE_ONLY`.
-        A section of a wildcard may be for other nodes as well.
-
-    Raises
-    ------
-    ConfigError
-        A missing or unreadable file, or one without parameters.
-
-    Warns
-    -----
-    UserWarning
-        A section of a wildcard has names that are none of the segmenter's: they are left out.
+    It has names and values, or is a ROS parameter file: of that, the sections of the node
+    `segment_planes` in any namespace and of the wildcards `/**` and `/*` count. A section of a
+    wildcard may be for other nodes as well: what it has for them is left out with a UserWarning.
+    FileError or ConfigError: a file that cannot be read, or has no parameters.
     """
-    try:
-        content = read_yaml(path)
-    except YamlError as error:
-        raise ConfigError(str(error)) from None
+    content = read_yaml(path)
     if content is None:
         return {}
     if not isinstance(content, dict):
@@ -51,21 +36,16 @@ def read_params(path: Path) -> dict[str, Any]:
     content = _without_node_only(content)
     if not any(isinstance(part, dict) for part in content.values()):
         return content
-    merged: dict[str, Any] = {}
-    found = False
-    for node, section in _sections(path, content):
-        if node not in (NODE, '*', '**'):
-            continue
-        found = True
-        own = _without_node_only(section)
-        if node != NODE:
-            foreign = sorted(str(name) for name in own if not known_name(name))
-            if foreign:
-                warnings.warn(f'{path}: left out {", ".join(foreign)}', stacklevel=2)
-            own = {name: value for name, value in own.items() if known_name(name)}
-        merged.update(own)
-    if not found:
+    sections = [part for part in _sections(path, content) if part[0] in (NODE, '*', '**')]
+    if not sections:
         raise ConfigError(f'{path}: no ros__parameters of {NODE}')
+    merged: dict[str, Any] = {}
+    for node, section in sections:
+        own = _without_node_only(section)
+        foreign = [name for name in own if node != NODE and not known_name(name)]
+        if foreign:
+            warnings.warn(f'{path}: left out {", ".join(sorted(map(str, foreign)))}', stacklevel=2)
+        merged.update({name: value for name, value in own.items() if name not in foreign})
     return merged
 
 
@@ -94,11 +74,7 @@ def _without_node_only(section: dict[Any, Any]) -> dict[Any, Any]:
 def read_config(path: Path | None, **overrides: Any) -> Config:
     """Build the Config of a parameter file (the defaults without one) and of `overrides`.
 
-    Raises
-    ------
-    ConfigError
-        As `read_params`; an unknown parameter, a value out of range or a file that cannot be
-        read, named in the message.
+    Errors as `read_params`; ConfigError also names an unknown parameter or a wrong value.
     """
     params = {} if path is None else read_params(path)
     try:

@@ -9,29 +9,17 @@ import numpy as np
 from numpy.lib import recfunctions
 from numpy.typing import NDArray
 
-_SIZES = {'F': (4, 8), 'I': (1, 2, 4, 8), 'U': (1, 2, 4, 8)}
-
-
-class PcdError(ValueError):
-    """A file that is no readable PCD file."""
+from rangeseg_ros.io.files import FileError, read_bytes
 
 
 def read_pcd(path: Path) -> dict[str, NDArray]:
-    """Read the fields of a PCD file.
+    """Fields of a PCD file by their names, in the type of the file; FileError names a fault.
 
-    Returns
-    -------
-    dict
-        Field name -> (H, W) array in the type of the file, or (H, W, n) for a field of n values.
-        An unorganised cloud has H = 1.
-
-    Raises
-    ------
-    PcdError
-        A missing or truncated file, or a malformed header; the message names the fault.
+    Arrays (H, W), or (H, W, n) for a field of n values. An unorganised cloud has H = 1.
     """
+    data = read_bytes(path)
     try:
-        header, body = _split(path.read_bytes())
+        header, body = _split(data)
         kind, (shape, dtype) = header['DATA'][0].lower(), _layout(header)
         points = shape[0] * shape[1]
         if kind == 'ascii':
@@ -39,19 +27,14 @@ def read_pcd(path: Path) -> dict[str, NDArray]:
         elif kind == 'binary':
             records = np.frombuffer(_first(body, dtype.itemsize * points), dtype)
         elif kind == 'binary_compressed':
-            return _compressed(body, dtype, shape)
+            records = _compressed(body, dtype, points)
         else:
-            raise PcdError(f'unknown DATA {kind!r}')
-    except OSError as error:
-        raise PcdError(f'{path}: {error.strerror}') from None
-    except PcdError as error:
-        raise PcdError(f'{path}: {error}') from None
-    except (ValueError, KeyError, IndexError, OverflowError, MemoryError, struct.error):
-        raise PcdError(f'{path}: malformed or truncated') from None
-    return {
-        name: records[name].reshape(*shape, *dtype[name].shape).copy()
-        for name in dtype.names or ()
-    }
+            raise FileError(f'unknown DATA {kind!r}')
+    except FileError as error:
+        raise FileError(f'{path}: {error}') from None
+    except (ValueError, TypeError, IndexError, OverflowError, MemoryError, struct.error):
+        raise FileError(f'{path}: malformed or truncated') from None
+    return {name: records.reshape(shape)[name].copy() for name in dtype.names or ()}
 
 
 def _split(data: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -61,7 +44,7 @@ def _split(data: bytes) -> tuple[dict[str, list[str]], bytes]:
     while 'DATA' not in header:
         end = data.find(b'\n', start, start + 10000)
         if end < 0:
-            raise PcdError('not a PCD file (no DATA line)')
+            raise FileError('not a PCD file (no DATA line)')
         words = data[start:end].decode('latin-1').split()
         start = end + 1
         if words and not words[0].startswith('#'):
@@ -73,54 +56,51 @@ def _layout(header: dict[str, list[str]]) -> tuple[tuple[int, int], np.dtype]:
     """Height and width, and the type of a point."""
     for key in ('FIELDS', 'SIZE', 'TYPE', 'WIDTH', 'HEIGHT'):
         if not header.get(key):
-            raise PcdError(f'the header lacks {key}')
+            raise FileError(f'the header lacks {key}')
     names = header['FIELDS']
     entries = []
     for name, size, kind, count in zip(
         names, header['SIZE'], header['TYPE'], header.get('COUNT', ['1'] * len(names)), strict=True
     ):
-        if int(size) not in _SIZES[kind] or int(count) < 1:
-            raise PcdError(f'malformed field {name} in the header')
+        if kind not in tuple('FIU') or int(count) < 1:
+            raise FileError(f'malformed field {name} in the header')
         shape = () if int(count) == 1 else (int(count),)
         entries.append((name, f'<{kind.lower()}{size}', shape))
     height, width = int(header['HEIGHT'][0]), int(header['WIDTH'][0])
     if width < 1 or height < 1:
-        raise PcdError(f'empty cloud: {width}x{height}')
+        raise FileError(f'empty cloud: {width}x{height}')
     return (height, width), np.dtype(entries)
 
 
 def _first(data: bytes, size: int) -> bytes:
     if len(data) < size:
-        raise PcdError(f'truncated: {len(data)} of {size} bytes')
+        raise FileError(f'truncated: {len(data)} of {size} bytes')
     return data[:size]
 
 
 def _ascii(body: bytes, dtype: np.dtype, points: int) -> NDArray:
     rows = [[float(word) for word in line.split()] for line in body.split(b'\n')[:points]]
     if len(rows) < points:
-        raise PcdError(f'truncated: {len(rows)} of {points} points')
+        raise FileError(f'truncated: {len(rows)} of {points} points')
     with np.errstate(invalid='ignore'):
         return recfunctions.unstructured_to_structured(np.array(rows), dtype, casting='unsafe')
 
 
-def _compressed(body: bytes, dtype: np.dtype, shape: tuple[int, int]) -> dict[str, NDArray]:
-    """Fields of compressed points, which hold one field after the other."""
+def _compressed(body: bytes, dtype: np.dtype, points: int) -> NDArray:
+    """Compressed points, which hold one field after the other."""
     stored, size = struct.unpack_from('<II', body)
-    points = shape[0] * shape[1]
     if size != dtype.itemsize * points:
-        raise PcdError(f'{size} bytes of points where the header announces {points} points')
+        raise FileError(f'{size} bytes of points where the header announces {points} points')
     raw = lzf_decompress(_first(body[8:], stored), size)
-    fields, start = {}, 0
+    records, start = np.empty(points, dtype), 0
     for name in dtype.names or ():
-        part = dtype[name]
-        block = np.frombuffer(raw, part.base, points * int(np.prod(part.shape)), start)
-        fields[name] = block.reshape(*shape, *part.shape).copy()
-        start += part.itemsize * points
-    return fields
+        records[name] = np.frombuffer(raw, dtype[name], points, start)
+        start += dtype[name].itemsize * points
+    return records
 
 
 def lzf_decompress(data: bytes, size: int) -> bytes:
-    """Decompress LZF (Lehmann's LibLZF) into `size` bytes; PcdError on damaged data."""
+    """Decompress LZF (Lehmann's LibLZF) into `size` bytes; FileError on damaged data."""
     out = bytearray()
     position = 0
     try:
@@ -145,7 +125,7 @@ def lzf_decompress(data: bytes, size: int) -> bytes:
                 copied += copied[: length - len(copied)]
             out += copied
     except IndexError:
-        raise PcdError('damaged LZF data') from None
+        raise FileError('damaged LZF data') from None
     if len(out) != size:
-        raise PcdError(f'damaged LZF data: {len(out)} bytes, not {size}')
+        raise FileError(f'damaged LZF data: {len(out)} bytes, not {size}')
     return bytes(out)

@@ -9,33 +9,65 @@ from __future__ import annotations
 import heapq
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
+from functools import cache
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO, NamedTuple, TypeVar
 
 from rosbags import rosbag1, rosbag2
 from rosbags.interfaces import Connection
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_mcap import MAXSIZE, McapReader, msgsrc
-from rosbags.typesys import Stores
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
-from rangeseg_ros.io.files import natural_order
-from rangeseg_ros.io.message_types import is_rosbag1, message_types
+from rangeseg_ros.io.files import FileError, check_regular, natural_order
+from rangeseg_ros.messages.make import TRANSFORMS
 
+Own = TypeVar('Own', bound='Closing')
+
+EARLY_TRANSFORMS = 'tf/msg/tfMessage'
+"""Of ROS 1, until its nodes used tf2."""
 # Of mcap: the records that end the data, and the bytes of a record before its content.
 _FOOTER, _DATA_END, _HEAD = 2, 15, 9
 
 
-class BagError(ValueError):
+class BagError(FileError):
     """A recording that cannot be read or written, or that lacks depth images or their camera."""
 
 
-class RecordingError(ValueError):
-    """A file that is no recording, or of which nothing can be read."""
+@cache
+def message_types(distribution: Stores) -> Typestore:
+    """Message types of a ROS distribution; compiled once, at their first use."""
+    store = get_typestore(distribution)
+    if distribution is Stores.ROS1_NOETIC:
+        # `rosbags` has them for ROS 2 only.
+        for kind in (TRANSFORMS, EARLY_TRANSFORMS):
+            store.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', kind))
+    return store
 
 
-class DamageError(ValueError):
-    """The end of what can be read of a recording that does not say how much there was."""
+def make_rosbags(kind: str, **fields: Any) -> Any:
+    """Make a message of `rosbags`' Jazzy types, see `messages.Make`."""
+    return message_types(Stores.ROS2_JAZZY).types[kind](**fields)
+
+
+def is_rosbag1(path: Path) -> bool:
+    """Whether it is a bag of ROS 1, and no folder of a rosbag2 that is called *.bag."""
+    return path.suffix == '.bag' and not path.is_dir()
+
+
+class Closing:
+    """What is closed at the end of a with statement."""
+
+    def close(self) -> None:
+        """Close the files."""
+
+    def __enter__(self: Own) -> Own:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
 
 
 class Record(NamedTuple):
@@ -125,30 +157,12 @@ class _Reader(rosbag2.Reader):
     }
 
 
-class Recording:
-    """A rosbag2 (directory, .mcap or .db3 file) or a ROS 1 .bag.
+class Recording(Closing):
+    """A rosbag2 (directory, .mcap or .db3 file) or a ROS 1 .bag; BagError where it is neither.
 
-    Parameters
-    ----------
-    path : Path
-
-    Attributes
-    ----------
-    types : dict of str
-        Message type of each topic, in the ROS 2 form.
-    counts : Counter of str
-        Messages of each topic, of a file without its end those that can be read.
-    connections : list of rosbags.interfaces.Connection
-        The topics with all that is recorded of them.
-    cut : str
-        Why a file has no end; empty when all have.
-
-    Raises
-    ------
-    RecordingError
-        Nothing can be read.
-    OSError
-        The file is missing or may not be read.
+    `types` are the message types of the topics, in the ROS 2 form; `counts` the numbers of their
+    messages, of a file without its end those that can be read; `connections` all that is recorded
+    of them. `cut` says why a file has no end; empty when all have.
     """
 
     def __init__(self, path: Path) -> None:
@@ -156,21 +170,20 @@ class Recording:
         self.types: dict[str, str] = {}
         self.counts: Counter[str] = Counter()
         self._readers: list[Any] = []
-        path.stat()
         for part in path.iterdir() if path.is_dir() else [path]:
-            if part.exists() and not (part.is_file() or part.is_dir()):
-                raise RecordingError(f'{part.name}: not a regular file')
+            check_regular(part)
         try:
+            path.stat()
             for reader in _readers(path):
                 reader.open()
                 self._readers.append(reader)
-        except PermissionError:
+        except (FileNotFoundError, PermissionError) as error:
             self.close()
-            raise
+            raise BagError(f'{path}: {error.strerror}') from None
         # Readers meet damaged bytes with exceptions of every kind.
         except Exception as error:
             self.close()
-            raise RecordingError(f'not a readable bag: {error}') from None
+            raise BagError(f'{path}: not a readable bag: {error}') from None
         self.cut = next((storage.cut for storage in self._storages() if storage.cut), '')
         # Where a file is cut off, the metadata of its folder count what is gone.
         readers = self._storages() if self.cut else self._readers
@@ -182,13 +195,8 @@ class Recording:
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time and content of the messages on `topics`, in the order of their times.
 
-        A bag's own definitions are not used, so that odd ones elsewhere in it do no harm.
-
-        Raises
-        ------
-        DamageError
-            At the end of a recording without its end. `Lost` is the content of what cannot be
-            read of others.
+        A bag's own definitions are not used, so that odd ones elsewhere in it do no harm. `Lost`
+        is the content of what cannot be read; at the end of a recording without its end, BagError.
         """
         ros1 = is_rosbag1(self.path)
         store = message_types(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_JAZZY)
@@ -216,7 +224,7 @@ class Recording:
                 damage = str(error) or type(error).__name__
         damage = damage or next((s.damage for s in self._storages() if s.damage), '')
         if self.cut:
-            raise DamageError(damage)
+            raise BagError(damage)
         for topic, count in (+missing).items() if damage else ():
             yield Lost(topic, time, count, damage)
 
@@ -239,5 +247,5 @@ def _readers(path: Path) -> list[Any]:
         return [_Reader(path)]
     parts = sorted([*path.glob('*.mcap'), *path.glob('*.db3')], key=natural_order)
     if not parts:
-        raise RecordingError('the folder has no metadata.yaml')
+        raise ValueError('the folder has no metadata.yaml')
     return [_Reader(part) for part in parts]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer
-from rangeseg_ros.io.message_types import EARLY_TRANSFORMS, TRANSFORMS
-from rangeseg_ros.io.recordings import Lost, Recording
-from rangeseg_ros.messages.transforms import insert_transforms
+from rangeseg_ros.io.recordings import EARLY_TRANSFORMS, BagError, Closing, Lost, Recording
+from rangeseg_ros.messages.make import TRANSFORMS
+from rangeseg_ros.messages.motion import insert_transforms
 
 MOVING, STATIC = '/tf', '/tf_static'
 TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
@@ -19,32 +19,19 @@ TYPES = (TRANSFORMS, EARLY_TRANSFORMS)
 _LOOKED_AT = 10_000
 
 
-class RecordedTransforms:
+class RecordedTransforms(Closing):
     """What the node would know of frames when an image has waited for them.
 
     All static transforms count from the beginning. Of the others, what was recorded up to
-    `timeout` after an image is known to it, as the node waits that long.
-
-    Parameters
-    ----------
-    path : Path
-        Of the recording.
-    timeout : float
-        Seconds; the parameter `tf_timeout`.
+    `timeout` seconds (the parameter `tf_timeout`) after an image is known to it.
     """
 
     def __init__(self, path: Path, timeout: float) -> None:
         self._recording = Recording(path)
         self._timeout = round(timeout * 1e9)
         self._buffer = TransformBuffer()
-        self._messages = self._read()
-        self._next = next(self._messages, None)
-
-    def __enter__(self) -> RecordedTransforms:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
+        self._moving = self._read()
+        self._next = next(self._moving, None)
 
     def close(self) -> None:
         """Close the files."""
@@ -52,30 +39,28 @@ class RecordedTransforms:
 
     def lookup(self, target: str, source: str, stamp: int, time: int) -> Transform:
         """As `TransformBuffer.lookup`, for an image recorded at `time`, nanoseconds."""
-        self._advance(time + self._timeout)
+        while self._next and self._next[0] <= time + self._timeout:
+            insert_transforms(self._buffer, self._next[1], static=False)
+            self._next = next(self._moving, None)
         return self._buffer.lookup(target, source, stamp)
 
-    def _advance(self, time: int) -> None:
-        """Take in what was recorded up to a time."""
-        while self._next and self._next[0] <= time:
-            insert_transforms(self._buffer, self._next[1], static=False)
-            self._next = next(self._messages, None)
-
     def _read(self) -> Iterator[tuple[int, Any]]:
+        """Take in what is static; times and messages of what moves."""
         try:
-            for _, _, message in self._messages_on(STATIC):
+            for _, message in _messages(self._recording, STATIC):
                 insert_transforms(self._buffer, message, static=True)
-            for _, time, message in self._messages_on(MOVING):
-                yield time, message
+            yield from _messages(self._recording, MOVING)
         # The damage is told by whoever reads the images. Up to it all is used.
         except Exception:
             return
 
-    def _messages_on(self, topic: str) -> Iterator[tuple[str, int, Any]]:
-        if self._recording.types.get(topic) in TYPES:
-            for name, time, message in self._recording.messages([topic]):
-                if not isinstance(message, Lost):
-                    yield name, time, message
+
+def _messages(recording: Recording, topic: str) -> Iterator[tuple[int, Any]]:
+    """Times and contents of the messages on a topic of transforms that can be read."""
+    if recording.types.get(topic) in TYPES:
+        for _, time, message in recording.messages([topic]):
+            if not isinstance(message, Lost):
+                yield time, message
 
 
 def fixed_frame_of(path: Path) -> str:
@@ -85,13 +70,14 @@ def fixed_frame_of(path: Path) -> str:
     """
     parents: dict[str, str] = {}
     moving: set[str] = set()
-    with closing(Recording(path)) as recording:
-        topics = [t for t in (MOVING, STATIC) if recording.types.get(t) in TYPES]
-        for topic, _, message in islice(recording.messages(topics) if topics else (), _LOOKED_AT):
-            for one in getattr(message, 'transforms', ()):
-                child = one.child_frame_id.removeprefix('/')
-                parents[child] = one.header.frame_id.removeprefix('/')
-                moving |= {child} if topic == MOVING else set()
+    # What a recording lacks that is cut off is told by whoever reads the images.
+    with Recording(path) as recording, suppress(BagError):
+        for topic in (STATIC, MOVING):
+            for _, message in islice(_messages(recording, topic), _LOOKED_AT):
+                for one in message.transforms:
+                    child = one.child_frame_id.removeprefix('/')
+                    parents[child] = one.header.frame_id.removeprefix('/')
+                    moving |= {child} if topic == MOVING else set()
     found = set()
     for frame in moving:
         above = [frame]

@@ -8,38 +8,37 @@ from typing import Any
 
 import yaml
 
-LARGEST = 2**20
-"""Bytes; of calibrations and parameters a thousand times what they have."""
+from rangeseg_ros.io.files import FileError, read_bytes
+
+LARGEST = 2**17
+"""Bytes; of calibrations and parameters a hundred times what they have."""
 
 
-class YamlError(ValueError):
-    """A file that cannot be read as YAML."""
+class _Loader(yaml.SafeLoader):
+    """Refuses content that aliases make larger than the largest file."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> Any:
+        node: Any = super().compose_node(parent, index)
+        if not hasattr(node, 'size'):
+            parts: list[Any] = node.value if isinstance(node, yaml.CollectionNode) else []
+            pairs = [part if isinstance(part, tuple) else (part,) for part in parts]
+            node.size = 1 + sum(each.size for pair in pairs for each in pair)
+            if node.size > LARGEST:
+                raise RecursionError
+        return node
 
 
 def read_yaml(path: Path) -> Any:
     """Content of a YAML file, or of a JSON file that is called *.json.
 
-    Raises
-    ------
-    YamlError
-        A missing file or one that cannot be read; no YAML; one that is too large or too deep.
+    FileError: it cannot be read, is no YAML, too large or too deep.
     """
-    # JSON may be indented by tabs, YAML may not.
-    parse, kind = (json.loads, 'JSON') if path.suffix == '.json' else (yaml.safe_load, 'YAML')
+    data, json_file = read_bytes(path, LARGEST), path.suffix == '.json'
     try:
-        size = path.stat().st_size
-        if not path.is_file():
-            raise YamlError(f'{path}: not a regular file')
-        if size > LARGEST:
-            raise YamlError(f'{path}: too large for such a file')
-        content = parse(path.read_text())
-    except OSError as error:
-        raise YamlError(f'{path}: {error.strerror}') from None
+        # JSON may be indented by tabs, YAML may not.
+        return json.loads(data) if json_file else yaml.load(data, _Loader)
     except RecursionError:
-        raise YamlError(f'{path}: nested too deeply') from None
-    except YamlError:
-        raise
+        raise FileError(f'{path}: nested too deeply or too often') from None
     # Not of YAML alone: dates and numbers raise errors of Python.
     except (ValueError, OverflowError, yaml.YAMLError):
-        raise YamlError(f'{path}: not a {kind} file') from None
-    return content
+        raise FileError(f'{path}: not a {"JSON" if json_file else "YAML"} file') from None

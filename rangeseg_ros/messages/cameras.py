@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera, CameraError, CameraWarning, positive_integer
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import CAMERA_INFO, Make
 
 
 def raw_by_name(topic: str) -> bool | None:
@@ -29,35 +29,16 @@ def raw_by_name(topic: str) -> bool | None:
 def camera_from_message(info: Any, raw: bool | None = None) -> Camera:
     """Camera of a sensor_msgs/CameraInfo; the same object, with its rays, while nothing changes.
 
-    Parameters
-    ----------
-    info : sensor_msgs/CameraInfo
-        Of rclpy, rosbags or ROS 1.
-    raw : bool, optional
-        Whether the images are raw, see `camera_from_matrices`.
-
-    Raises
-    ------
-    CameraError
-        Intrinsics that no camera has, or a lens of an unknown model.
+    `info` is of rclpy, rosbags or ROS 1; `raw` and errors are those of `camera_from_matrices`.
     """
     # ROS 1 has capitals.
     k, p, d = (
         tuple(map(float, getattr(info, name if hasattr(info, name) else name.upper())))
         for name in 'kpd'
     )
-    roi = info.roi
-    return _camera(
-        info.width,
-        info.height,
-        k,
-        p,
-        (info.binning_x, info.binning_y),
-        (roi.x_offset, roi.y_offset, roi.width, roi.height),
-        info.distortion_model,
-        d,
-        raw,
-    )
+    binning = info.binning_x, info.binning_y
+    roi = info.roi.x_offset, info.roi.y_offset, info.roi.width, info.roi.height
+    return _camera(info.width, info.height, k, p, binning, roi, info.distortion_model, d, raw)
 
 
 @lru_cache(maxsize=1)
@@ -106,22 +87,8 @@ def camera_from_matrices(
         a lens that distorts.
     """
     width, height = positive_integer('width', width), positive_integer('height', height)
-    matrix = _matrix('camera matrix K', k, 3)
-    projection = None if p is None or raw else _matrix('projection matrix P', p, 4)
-    if projection is not None and not projection.any():
-        projection = None
     d = _numbers('lens distortion D', d).tolist()
-    if projection is not None:
-        matrix = projection[:, :3]
-        if any(d):
-            warnings.warn(
-                'the image is taken as rectified: the lens distortion D beside P is left out',
-                CameraWarning,
-                stacklevel=2,
-            )
-    elif raw is False and any(d):
-        raise CameraError('the image is rectified by its name, but its calibration has no P')
-    lens = (distortion_model, d) if projection is None and raw is not False else ('', ())
+    matrix, raw = _matrix_in_use(k, p, any(d), raw)
     bin_x, bin_y = max(int(binning[0]), 1), max(int(binning[1]), 1)
     x0, y0, roi_width, roi_height = (int(v) for v in roi)
     if roi_width == 0 or roi_height == 0:
@@ -135,9 +102,25 @@ def camera_from_matrices(
         (float(matrix[0, 2]) - x0 + 0.5) / bin_x - 0.5,
         (float(matrix[1, 2]) - y0 + 0.5) / bin_y - 0.5,
         float(matrix[0, 1]) / bin_x,
-        distortion_model=lens[0],
-        d=tuple(lens[1]),
+        distortion_model=distortion_model if raw else '',
+        d=tuple(d) if raw else (),
     )
+
+
+def _matrix_in_use(
+    k: ArrayLike, p: ArrayLike | None, distorts: bool, raw: bool | None
+) -> tuple[NDArray[np.float64], bool]:
+    """P of rectified images or K of raw ones, and whether the image is raw."""
+    matrix = _matrix('camera matrix K', k, 3)
+    projection = None if p is None or raw else _matrix('projection matrix P', p, 4)
+    if projection is None or not projection.any():
+        if raw is False and distorts:
+            raise CameraError('the image is rectified by its name, but its calibration has no P')
+        return matrix, raw is not False
+    if distorts:
+        left_out = 'the image is taken as rectified: the lens distortion D beside P is left out'
+        warnings.warn(left_out, CameraWarning, stacklevel=3)
+    return projection, False
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> NDArray[np.float64]:
@@ -165,7 +148,7 @@ def camera_info_message(make: Make, header: Any, camera: Camera) -> Any:
         p[:, :3] = camera.matrix
     roi = {'x_offset': 0, 'y_offset': 0, 'height': 0, 'width': 0, 'do_rectify': False}
     return make(
-        'sensor_msgs/msg/CameraInfo',
+        CAMERA_INFO,
         header=header,
         height=camera.height,
         width=camera.width,

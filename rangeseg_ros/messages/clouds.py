@@ -8,12 +8,13 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
+from numpy.lib.recfunctions import unstructured_to_structured
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.ground.stairs import Stairs
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import CLOUD, Make, MessageError, elements
 
 # One row of `~/planes`: the fields of a Plane.
 PLANE_TYPE = np.dtype(
@@ -28,15 +29,12 @@ PLANE_TYPE = np.dtype(
     ]
 )
 
-_POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
-_HEIGHT_TYPE = np.dtype([*_POINT_TYPE.descr, ('height', '<f4')])
-_GRID_TYPE = np.dtype(
-    [*_POINT_TYPE.descr, ('height_variance', '<f4'), ('class', '<u4'), ('age', '<f4')]
-)
+POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4')])
+_HEIGHT_TYPE = np.dtype([*POINT_TYPE.descr, ('height', '<f4')])
 _EDGE = tuple(f'edge_{axis}{end}' for end in (1, 2) for axis in 'xyz')
 _STAIRS_TYPE = np.dtype(
     [
-        *_POINT_TYPE.descr,
+        *POINT_TYPE.descr,
         *((name, '<f4') for name in (*_EDGE, 'width', 'rise', 'run')),
         ('count', '<u4'),
         ('direction', '<i4'),
@@ -47,27 +45,17 @@ _STAIRS_TYPE = np.dtype(
 _POINT_FIELD_TYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
 
 
-class CloudError(ValueError):
-    """A PointCloud2 that is damaged, or not what is asked for."""
-
-
 def points_from_message(cloud: Any) -> NDArray[np.float32] | NDArray[np.float64]:
-    """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2.
-
-    Raises
-    ------
-    CloudError
-        No points, no fields x, y, z of one floating-point type, one row only, or damaged.
-    """
+    """Points (H, W, 3), metres, of an organised sensor_msgs/PointCloud2; else MessageError."""
     if not cloud.height * cloud.width:
-        raise CloudError(f'cloud is empty ({cloud.width}x{cloud.height})')
+        raise MessageError(f'cloud is empty ({cloud.width}x{cloud.height})')
     records = _records(cloud)
     columns: Any = records.dtype.fields or {}
     kinds = {str(columns[name][0]) if name in columns else 'missing' for name in 'xyz'}
     if kinds not in ({'float32'}, {'float64'}):
-        raise CloudError('cloud must have the fields x, y, z of one floating-point type')
+        raise MessageError('cloud must have the fields x, y, z of one floating-point type')
     if cloud.height < 2 and cloud.width > 1:
-        raise CloudError(f'cloud is not organised ({cloud.width}x{cloud.height})')
+        raise MessageError(f'cloud is not organised ({cloud.width}x{cloud.height})')
     return np.stack([records[name] for name in 'xyz'], axis=-1)
 
 
@@ -95,7 +83,7 @@ def planes_from_message(cloud: Any) -> NDArray[np.void]:
 
     Raises
     ------
-    CloudError
+    MessageError
         The message is damaged.
     """
     return _records(cloud).ravel()
@@ -105,78 +93,43 @@ def _records(cloud: Any) -> NDArray[np.void]:
     """Structured array (H, W) of the fields of a PointCloud2, native byte order."""
     order = '>' if cloud.is_bigendian else '<'
     try:
+        kinds = [order + _POINT_FIELD_TYPES[field.datatype] for field in cloud.fields]
+        counts = [(field.count,) if field.count > 1 else () for field in cloud.fields]
         dtype = np.dtype(
             {
                 'names': [field.name for field in cloud.fields],
-                'formats': [
-                    (order + _POINT_FIELD_TYPES[field.datatype], field.count)
-                    if field.count > 1
-                    else order + _POINT_FIELD_TYPES[field.datatype]
-                    for field in cloud.fields
-                ],
+                'formats': list(zip(kinds, counts, strict=True)),
                 'offsets': [field.offset for field in cloud.fields],
                 'itemsize': cloud.point_step,
             }
         )
     except (ValueError, KeyError) as error:
-        raise CloudError(f'cloud has contradictory fields: {error}') from None
-    data = np.frombuffer(cloud.data, np.uint8)
+        raise MessageError(f'cloud has contradictory fields: {error}') from None
     if cloud.height * cloud.width == 0:
-        return np.empty((cloud.height, cloud.width), dtype).astype(dtype.newbyteorder('='))
-    row = cloud.width * cloud.point_step
-    needed = cloud.row_step * (cloud.height - 1) + row
-    if cloud.row_step < row or data.size < needed:
-        raise CloudError(
-            f'{data.size} bytes of data are too few for {cloud.width}x{cloud.height} points of '
-            f'{cloud.point_step} bytes in rows of {cloud.row_step} bytes'
-        )
-    strides = (cloud.row_step, cloud.point_step)
-    records: NDArray[np.void] = np.ndarray((cloud.height, cloud.width), dtype, data, 0, strides)
-    return records.astype(dtype.newbyteorder('='))
+        return np.empty((cloud.height, cloud.width), dtype.newbyteorder('='))
+    return elements(cloud, dtype, cloud.row_step, 'points')
 
 
 def planes_message(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
     """sensor_msgs/PointCloud2 with one point per plane; see `planes_from_message`."""
     upper = np.triu_indices(4)
-    rows = np.array(
-        [
-            (
-                *plane.centroid.tolist(),
-                *plane.normal.tolist(),
-                plane.distance,
-                plane.label,
-                plane.id,
-                plane.surface,
-                ROLES.index(plane.role or 'other'),
-                plane.count,
-                plane.rms,
-                plane.confidence,
-                plane.probability,
-                plane.area,
-                *plane.extents.tolist(),
-                *plane.centre.tolist(),
-                *plane.orientation.tolist(),
-                *plane.covariance[upper].tolist(),
-            )
-            for plane in planes
-        ],
-        PLANE_TYPE,
-    )
-    return _cloud(make, header, rows)
+    rows = [
+        (
+            *(*plane.centroid, *plane.normal, plane.distance),
+            *(plane.label, plane.id, plane.surface, ROLES.index(plane.role or 'other')),
+            *(plane.count, plane.rms, plane.confidence, plane.probability, plane.area),
+            *(*plane.extents, *plane.centre, *plane.orientation),
+            *plane.covariance[upper],
+        )
+        for plane in planes
+    ]
+    return cloud_message(make, header, np.array(rows, PLANE_TYPE))
 
 
 def points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
     """sensor_msgs/PointCloud2 of points (N, 3), metres, or (N, 4) with their height."""
-    kind = _POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
-    return _cloud(make, header, np.ascontiguousarray(points, '<f4').view(kind)[:, 0])
-
-
-def grid_points_message(make: Make, header: Any, points: NDArray[np.float32]) -> Any:
-    """sensor_msgs/PointCloud2 of cells (N, 6): x, y, z, variance of the height, class, age."""
-    rows = np.empty(len(points), _GRID_TYPE)
-    for name, values in zip(_GRID_TYPE.names or (), points.T, strict=True):
-        rows[name] = values
-    return _cloud(make, header, rows)
+    kind = POINT_TYPE if points.shape[1] == 3 else _HEIGHT_TYPE
+    return cloud_message(make, header, unstructured_to_structured(points, kind))
 
 
 def stairs_message(make: Make, header: Any, stairs: Sequence[Stairs]) -> Any:
@@ -184,28 +137,20 @@ def stairs_message(make: Make, header: Any, stairs: Sequence[Stairs]) -> Any:
 
     Its fields are those of the table of stairs; `direction` is 1 for up and -1 for down.
     """
-    rows = np.array(
-        [
-            (
-                *seen.edge.mean(axis=0).tolist(),
-                *seen.edge.ravel().tolist(),
-                seen.width,
-                seen.rise,
-                seen.run,
-                seen.count,
-                1 if seen.direction == 'up' else -1,
-            )
-            for seen in stairs
-        ],
-        _STAIRS_TYPE,
-    )
-    return _cloud(make, header, rows)
+    rows = [
+        (
+            *(*seen.edge.mean(axis=0), *seen.edge.ravel(), seen.width, seen.rise, seen.run),
+            *(seen.count, 1 if seen.direction == 'up' else -1),
+        )
+        for seen in stairs
+    ]
+    return cloud_message(make, header, np.array(rows, _STAIRS_TYPE))
 
 
-def _cloud(make: Make, header: Any, rows: NDArray[np.void]) -> Any:
+def cloud_message(make: Make, header: Any, rows: NDArray[np.void]) -> Any:
     """sensor_msgs/PointCloud2 of one row, a point for each of the records (N,)."""
     return make(
-        'sensor_msgs/msg/PointCloud2',
+        CLOUD,
         header=header,
         height=1,
         width=rows.size,

@@ -12,19 +12,15 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.messages.clouds import points_from_message
 from rangeseg_ros.messages.images import depth_from_message
+from rangeseg_ros.messages.make import nanoseconds
 
 
 @dataclass(frozen=True, eq=False)
 class DepthFrame:
     """A depth message to be segmented, decoded when asked for.
 
-    Attributes
-    ----------
-    message : sensor_msgs/Image, CompressedImage or PointCloud2
-    camera : Camera or None
-        Of an image; None for clouds.
-    time : int
-        When it arrived or was recorded, nanoseconds.
+    A sensor_msgs/Image or CompressedImage with its camera, or a PointCloud2 without; `time` is
+    when it arrived or was recorded, nanoseconds.
     """
 
     message: Any
@@ -34,24 +30,16 @@ class DepthFrame:
     @property
     def stamp(self) -> int:
         """Time of the measurement (header stamp), nanoseconds."""
-        stamp = self.message.header.stamp
-        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+        return nanoseconds(self.message.header.stamp)
 
     @property
     def frame_id(self) -> str:
         """Frame of the image or cloud."""
-        frame_id: str = self.message.header.frame_id
-        return frame_id
+        return str(self.message.header.frame_id)
 
     @property
     def depth(self) -> NDArray[np.uint16] | NDArray[np.float32]:
-        """Depth image (H, W): millimetres with 0 invalid, or metres with NaN or <= 0 invalid.
-
-        Raises
-        ------
-        EncodingError
-            See `depth_from_message`.
-        """
+        """Depth image (H, W): millimetres with 0 invalid, or metres with NaN or <= 0 invalid."""
         return depth_from_message(self.message, self.camera.shape if self.camera else None)
 
     def range_image(self) -> RangeImage:

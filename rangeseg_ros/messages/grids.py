@@ -5,63 +5,45 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from rangeseg_ros.core.ground.classes import GROUND, UNKNOWN
-from rangeseg_ros.core.ground.grid import GroundGrid
+from rangeseg_ros.core.ground.grid import GroundGrid, empty_grid
 from rangeseg_ros.core.rotations import rotation_matrix
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.clouds import POINT_TYPE, cloud_message
+from rangeseg_ros.messages.make import GRID, Make, header_of, pose_of
 
-GRID = 'nav_msgs/msg/OccupancyGrid'
-"""Type of `grid_message`."""
 _LETHAL = 100
+_CELL_TYPE = np.dtype(
+    [*POINT_TYPE.descr, ('height_variance', '<f4'), ('class', '<u4'), ('age', '<f4')]
+)
 
 
-def grid_message(make: Make, header: Any, grid: GroundGrid) -> Any:
+def grid_message(make: Make, header: Any, grid: GroundGrid | None) -> Any:
     """nav_msgs/OccupancyGrid: 0 ground, 100 obstacle or drop, -1 unknown.
 
-    Parameters
-    ----------
-    make : Make
-    header : std_msgs/Header
-        Of the image: its frame is used where the grid has no fixed one.
-    grid : GroundGrid
+    `header` is that of the image: its frame is used where the grid has no fixed one.
     """
+    grid = grid or empty_grid()
     values = np.where(grid.classes == GROUND, 0, _LETHAL).astype(np.int8)
     values[grid.classes == UNKNOWN] = -1
-
-    def named(kind: str, numbers: NDArray[np.float64]) -> Any:
-        fields = dict(zip('xyzw', map(float, numbers), strict=False))
-        return make(f'geometry_msgs/msg/{kind}', **fields)
-
-    corner = make(
-        'geometry_msgs/msg/Pose',
-        position=named('Point', grid.origin),
-        orientation=named('Quaternion', grid.orientation),
-    )
     info = make(
         'nav_msgs/msg/MapMetaData',
         map_load_time=make('builtin_interfaces/msg/Time', sec=0, nanosec=0),
         resolution=float(grid.resolution),
         width=values.shape[1],
         height=values.shape[0],
-        origin=corner,
+        origin=pose_of(make, grid.origin, grid.orientation),
     )
-    return make(GRID, header=grid_header(make, header, grid), info=info, data=values.ravel())
+    return make(GRID, header=_header(make, header, grid), info=info, data=values.ravel())
 
 
-def grid_header(make: Make, header: Any, grid: GroundGrid) -> Any:
-    """Header of the messages of a grid: in the fixed frame where it has one."""
-    if not grid.frame:
-        return header
-    return make('std_msgs/msg/Header', stamp=header.stamp, frame_id=grid.frame)
-
-
-def grid_points(grid: GroundGrid) -> NDArray[np.float32]:
-    """Cells (N, 6) of a grid that are known: x, y, z, variance of the height, class, age.
+def grid_points_message(make: Make, header: Any, grid: GroundGrid | None) -> Any:
+    """sensor_msgs/PointCloud2 of the cells that are known.
 
     z is the height of the ground, or that of the ground below the camera where none was seen.
     """
+    grid = grid or empty_grid()
     rows, columns = np.nonzero(grid.classes != UNKNOWN)
     place = (np.column_stack([columns, rows]) + 0.5) * grid.resolution
     place = np.column_stack([place, np.zeros(len(rows))]) @ rotation_matrix(grid.orientation).T
@@ -70,4 +52,11 @@ def grid_points(grid: GroundGrid) -> NDArray[np.float32]:
     if grid.frame:
         place[:, 2] = np.where(np.isnan(height), place[:, 2], height)
     others = (values[rows, columns] for values in (grid.variance, grid.classes, grid.age))
-    return np.column_stack([place, *others]).astype(np.float32)
+    points = np.column_stack([place, *others])
+    records = unstructured_to_structured(points, _CELL_TYPE, casting='unsafe')
+    return cloud_message(make, _header(make, header, grid), records)
+
+
+def _header(make: Make, header: Any, grid: GroundGrid) -> Any:
+    """In the fixed frame where the grid has one."""
+    return header_of(make, header.stamp, grid.frame) if grid.frame else header

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import IMAGE, Make, MessageError, elements
 
 # REP 118: millimetres as unsigned integers, or metres as floats.
 PIXEL_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
@@ -20,58 +20,29 @@ PIXEL_TYPES = {'16UC1': np.uint16, 'mono16': np.uint16, '32FC1': np.float32}
 _HEADER = struct.Struct('<iff')
 
 
-class EncodingError(ValueError):
-    """A message that holds no depth image, or a damaged one."""
-
-
 def depth_from_message(
     message: Any, shape: tuple[int, int] | None = None
 ) -> NDArray[np.uint16] | NDArray[np.float32]:
     """Depth image (H, W) of a sensor_msgs/Image, or a CompressedImage of compressedDepth.
 
-    Parameters
-    ----------
-    message : sensor_msgs/Image or CompressedImage
-    shape : (int, int), optional
-        (H, W) that a compressed image must have; one of another size is not decoded.
-
-    Returns
-    -------
-    (H, W) uint16 in millimetres or float32 in metres, native byte order; a view of the data where
-    that is possible, so not to be written to.
-
-    Raises
-    ------
-    EncodingError
-        Another encoding or compression, an empty image, data too short for the size or damaged, or
-        another size.
+    uint16 in millimetres or float32 in metres, native byte order; a view of the data where that is
+    possible, so not to be written to. MessageError: no depth image, a damaged one or, before it
+    is decoded, a compressed one of another size than `shape` (H, W).
     """
     return _compressed(message, shape) if hasattr(message, 'format') else _plain(message)
 
 
 def _plain(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
     """Image whose rows may be padded, the last one not."""
-    height, width, encoding, step = message.height, message.width, message.encoding, message.step
+    height, width, encoding = message.height, message.width, message.encoding
     if encoding not in PIXEL_TYPES:
-        raise EncodingError(
+        raise MessageError(
             f'encoding {encoding!r} is no depth image; known: {", ".join(PIXEL_TYPES)}'
         )
-    dtype = np.dtype(PIXEL_TYPES[encoding])
     if height < 1 or width < 1:
-        raise EncodingError(f'depth image is empty ({width}x{height})')
-    row = width * dtype.itemsize
-    if step < row:
-        raise EncodingError(f'step of {step} bytes is too short for {width} pixels of {encoding}')
-    raw = np.frombuffer(message.data, np.uint8)
-    needed = step * (height - 1) + row
-    if raw.size < needed:
-        raise EncodingError(
-            f'{raw.size} bytes of data are too few for {width}x{height} {encoding} in rows of '
-            f'{step} bytes'
-        )
-    rows = np.lib.stride_tricks.as_strided(raw, (height, row), (step, 1), writeable=False)
-    stored = dtype.newbyteorder('>' if message.is_bigendian else '<')
-    return np.ascontiguousarray(rows).view(stored).astype(dtype, copy=False)
+        raise MessageError(f'depth image is empty ({width}x{height})')
+    kind = np.dtype(PIXEL_TYPES[encoding]).newbyteorder('>' if message.is_bigendian else '<')
+    return np.ascontiguousarray(elements(message, kind, message.step, encoding))
 
 
 def _compressed(
@@ -86,15 +57,15 @@ def _compressed(
     known = ('compressedDepth', 'compressedDepth png')
     if encoding not in PIXEL_TYPES or compression not in known:
         formats = ', '.join(f'{name}; {known[1]}' for name in PIXEL_TYPES)
-        raise EncodingError(f'format {message.format!r} is no known depth image; known: {formats}')
+        raise MessageError(f'format {message.format!r} is no known depth image; known: {formats}')
     raw = np.frombuffer(message.data, np.uint8)
     if raw.size <= _HEADER.size:
-        raise EncodingError(f'compressed depth image of {raw.size} bytes has no PNG')
+        raise MessageError(f'compressed depth image of {raw.size} bytes has no PNG')
     _, a, b = _HEADER.unpack(raw[: _HEADER.size].tobytes())
     png = raw[_HEADER.size :]
-    size = png_shape(png.tobytes())
+    size, _ = shape_and_pages(png.tobytes(), 'PNG')
     if size and shape and size != shape:
-        raise EncodingError(
+        raise MessageError(
             f'depth image is {size[1]}x{size[0]}, its camera_info {shape[1]}x{shape[0]}'
         )
     try:
@@ -102,9 +73,9 @@ def _compressed(
     except cv2.error:
         image = None
     if image is None:
-        raise EncodingError('compressed depth image holds no readable PNG')
+        raise MessageError('compressed depth image holds no readable PNG')
     if image.ndim != 2 or image.dtype != np.uint16:
-        raise EncodingError(
+        raise MessageError(
             f'compressed depth image must be a 16-bit PNG of one channel, not {image.dtype} of '
             f'shape {image.shape}'
         )
@@ -116,27 +87,28 @@ def _compressed(
     return depth
 
 
-def png_shape(data: bytes) -> tuple[int, int] | None:
-    """(H, W) of a PNG; None when it is none, or its checksums say that it is damaged.
+def shape_and_pages(data: bytes, kind: str) -> tuple[tuple[int, int] | None, int]:
+    """(H, W) of a PNG or of the first page of a TIFF, and the number of pages.
 
-    Found before decoding: OpenCV would take gigabytes for a damaged length, and libpng complain on
-    stderr.
+    None for others, and for a PNG whose checksums say that it is damaged. Found before decoding:
+    OpenCV would take gigabytes for a damaged length, and libpng complain on stderr.
     """
     try:
-        with Image.open(io.BytesIO(data), formats=['PNG']) as file:
-            width, height = file.size
-            file.verify()
+        with Image.open(io.BytesIO(data), formats=[kind]) as file:
+            found = file.size[::-1], getattr(file, 'n_frames', 1)
+            if kind == 'PNG':
+                file.verify()
+            return found
     # Damaged bytes are met with exceptions of every kind.
     except Exception:
-        return None
-    return height, width
+        return None, 0
 
 
 def image_message(make: Make, header: Any, pixels: NDArray, encoding: str) -> Any:
     """sensor_msgs/Image of an array (H, W) or (H, W, channels)."""
     rows = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder('<'))
     return make(
-        'sensor_msgs/msg/Image',
+        IMAGE,
         header=header,
         height=rows.shape[0],
         width=rows.shape[1],

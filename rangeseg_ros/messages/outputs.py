@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground import points
 from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
-from rangeseg_ros.core.ground.grid import empty_grid
-from rangeseg_ros.core.ground.points import drops, outlines, points_of_class, thinned, unseen
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.placement import moved_planes
@@ -20,170 +21,111 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.drawing import overlay
-from rangeseg_ros.messages.clouds import (
-    grid_points_message,
-    planes_message,
-    points_message,
-    stairs_message,
-)
-from rangeseg_ros.messages.grids import GRID, grid_header, grid_message, grid_points
+from rangeseg_ros.messages import clouds, grids, markers
 from rangeseg_ros.messages.images import image_message
-from rangeseg_ros.messages.make import Make
-from rangeseg_ros.messages.marker_bytes import markers_bytes
-from rangeseg_ros.messages.markers import (
-    Marker,
-    of_outline,
-    of_planes,
-    of_ramps,
-    of_stairs,
-)
+from rangeseg_ros.messages.make import CLOUD, GRID, IMAGE, MARKERS, STATUS, Make, header_of
 from rangeseg_ros.messages.status import status_message
 
-_NONE = np.zeros((0, 4), np.float32)
+Pick = Callable[[RangeImage, Segmentation], Any]
 
 
-@dataclass(frozen=True)
-class Output:
-    """A topic of the node.
+class Output(NamedTuple):
+    """A topic of the node: the type of its message, how that is made, and of what.
 
-    Attributes
-    ----------
-    kind : str
-        Type of the message.
-    message : callable
-        (make, header, image, result) -> message, or its bytes where that is faster.
+    It may be made as bytes, where that is faster.
     """
 
     kind: str
-    message: Callable[[Make, Any, RangeImage, Segmentation], Any]
+    encode: Callable[[Make, Any, Any], Any]
+    pick: Pick
+
+    def message(self, make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
+        """Message of an image and its result."""
+        return self.encode(make, header, self.pick(image, result))
 
 
-def _of_markers(draw: Callable[[RangeImage, Segmentation], list[Marker]]) -> Output:
-    """A topic of markers."""
-    return Output(
-        'visualization_msgs/msg/MarkerArray',
-        lambda make, header, image, result: markers_bytes(header, draw(image, result)),
-    )
+def _drawn(make: Make, header: Any, drawn: Sequence[markers.Marker]) -> bytes:
+    return markers.markers_bytes(header, drawn)
 
 
-def _of_image(encoding: str, pick: Callable[[RangeImage, Segmentation], Any]) -> Output:
-    """A topic of images."""
-    return Output(
-        'sensor_msgs/msg/Image',
-        lambda make, header, image, result: image_message(
-            make, header, pick(image, result), encoding
-        ),
-    )
+def _image(encoding: str, pick: Pick) -> Output:
+    return Output(IMAGE, partial(image_message, encoding=encoding), pick)
 
 
-def _planes(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return planes_message(make, header, result.planes)
+def _points(
+    find: Callable[[RangeImage, Terrain], NDArray[np.float32]], most: int = points.MOST_POINTS
+) -> Output:
+    """A topic of points of the terrain, thinned to so many."""
 
+    def pick(image: RangeImage, result: Segmentation) -> NDArray[np.float32]:
+        if result.ground is None:
+            return np.zeros((0, 4), np.float32)
+        size = result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+        return points.thinned(find(image, result.ground), size, most)
 
-def _ground(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, result, GROUND))
-
-
-def _obstacles(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return points_message(make, header, _points(image, result, OBSTACLE))
-
-
-def _drops(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return _crossings(make, header, image, result, drops)
-
-
-def _unseen(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return _crossings(make, header, image, result, unseen)
-
-
-def _crossings(
-    make: Make,
-    header: Any,
-    image: RangeImage,
-    result: Segmentation,
-    find: Callable[[RangeImage, Terrain], NDArray[np.float32]],
-) -> Any:
-    found = _NONE if result.ground is None else find(image, result.ground)
-    # However many: none of them is left out where there is no other near it.
-    return points_message(make, header, thinned(found, _resolution(result), len(found)))
-
-
-def _points(image: RangeImage, result: Segmentation, kind: int) -> NDArray[np.float32]:
-    if result.ground is None:
-        return _NONE
-    return thinned(points_of_class(image, result.ground, kind), _resolution(result))
-
-
-def _resolution(result: Segmentation) -> float:
-    return result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
-
-
-def _grid(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return grid_message(make, header, result.grid or empty_grid())
-
-
-def _grid_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    grid = result.grid or empty_grid()
-    return grid_points_message(make, grid_header(make, header, grid), grid_points(grid))
-
-
-def _stairs_points(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return stairs_message(make, header, result.stairs)
-
-
-def _outline(image: RangeImage, result: Segmentation) -> list[Marker]:
-    return of_outline([] if result.ground is None else outlines(image, result.ground))
-
-
-def _stairs(image: RangeImage, result: Segmentation) -> list[Marker]:
-    return [*of_stairs(result.stairs), *of_ramps(result.ramps)]
-
-
-def _status(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:
-    return status_message(make, header, result)
+    return Output(CLOUD, clouds.points_message, pick)
 
 
 OUTPUTS = {
-    # What a robot stops for is published before pictures.
-    'drops': Output('sensor_msgs/msg/PointCloud2', _drops),
-    'obstacles': Output('sensor_msgs/msg/PointCloud2', _obstacles),
-    'unseen': Output('sensor_msgs/msg/PointCloud2', _unseen),
-    'ground': Output('sensor_msgs/msg/PointCloud2', _ground),
-    'terrain': _of_image('mono8', lambda image, result: result.terrain),
-    'labels': _of_image('mono16', lambda image, result: result.labels),
-    'planes': Output('sensor_msgs/msg/PointCloud2', _planes),
-    'markers': _of_markers(lambda image, result: of_planes(result.planes)),
-    'overlay': _of_image(
+    # What a robot stops for is published before pictures. Of edges, no point is left out that has
+    # no other near it, however many there are.
+    'drops': _points(points.drops, sys.maxsize),
+    'grid': Output(GRID, grids.grid_message, lambda image, result: result.grid),
+    'obstacles': _points(lambda image, terrain: points.points_of_class(image, terrain, OBSTACLE)),
+    'ground': _points(lambda image, terrain: points.points_of_class(image, terrain, GROUND)),
+    'unseen': _points(points.unseen, sys.maxsize),
+    'terrain': _image('mono8', lambda image, result: result.terrain),
+    'labels': _image('mono16', lambda image, result: result.labels),
+    'planes': Output(CLOUD, clouds.planes_message, lambda image, result: result.planes),
+    'markers': Output(MARKERS, _drawn, lambda image, result: markers.of_planes(result.planes)),
+    'overlay': _image(
         'rgb8', lambda image, result: overlay(image.inverse, result.labels, result.planes)
     ),
-    'normals': _of_image('32FC3', lambda image, result: result.normals),
-    'edges': _of_image('mono8', lambda image, result: 255 * result.edges.astype(np.uint8)),
-    'outline': _of_markers(_outline),
-    'stairs': _of_markers(_stairs),
-    'stairs_points': Output('sensor_msgs/msg/PointCloud2', _stairs_points),
-    'grid': Output(GRID, _grid),
-    'grid_points': Output('sensor_msgs/msg/PointCloud2', _grid_points),
-    'status': Output('diagnostic_msgs/msg/DiagnosticArray', _status),
+    'normals': _image('32FC3', lambda image, result: result.normals),
+    'edges': _image('mono8', lambda image, result: 255 * result.edges.astype(np.uint8)),
+    'outline': Output(
+        MARKERS,
+        _drawn,
+        lambda image, result: markers.of_outline(
+            points.outlines(image, result.ground) if result.ground else []
+        ),
+    ),
+    'stairs': Output(
+        MARKERS,
+        _drawn,
+        lambda image, result: markers.of_stairs(result.stairs) + markers.of_ramps(result.ramps),
+    ),
+    'stairs_points': Output(CLOUD, clouds.stairs_message, lambda image, result: result.stairs),
+    'grid_points': Output(CLOUD, grids.grid_points_message, lambda image, result: result.grid),
+    'status': Output(STATUS, status_message, lambda image, result: result),
 }
 
 IN_TARGET = frozenset({'planes', 'markers'})
 """Outputs in the target frame, where there is one; the others belong to the sensor's pixels."""
 
-
-def _map_markers(make: Make, header: Any, planes: Sequence[Plane]) -> Any:
-    return markers_bytes(header, of_planes(planes))
-
-
 MAP_OUTPUTS: dict[str, tuple[str, Callable[[Make, Any, Sequence[Plane]], Any]]] = {
-    'map': ('sensor_msgs/msg/PointCloud2', planes_message),
-    'map_markers': ('visualization_msgs/msg/MarkerArray', _map_markers),
+    'map': (CLOUD, clouds.planes_message),
+    'map_markers': (
+        MARKERS,
+        lambda make, header, planes: _drawn(make, header, markers.of_planes(planes)),
+    ),
 }
 """Topics of the map of planes: their types and how messages are made, in the fixed frame."""
 
 
-def in_target(
-    make: Make, header: Any, result: Segmentation, frame: str, motion: Transform
-) -> tuple[Any, Segmentation]:
-    """Header and result of the outputs `IN_TARGET`, in the frame that `motion` leads to."""
-    there = make('std_msgs/msg/Header', stamp=header.stamp, frame_id=frame)
-    return there, replace(result, planes=moved_planes(result.planes, motion))
+def messages_of(
+    make: Make,
+    header: Any,
+    image: RangeImage,
+    result: Segmentation,
+    target: tuple[str, Transform] | None,
+    names: Iterable[str],
+) -> Iterator[tuple[str, Any]]:
+    """Names of `OUTPUTS` and their messages; `target` is a frame and the motion to it."""
+    here = there = header, result
+    if target:
+        moved = replace(result, planes=moved_planes(result.planes, target[1]))
+        there = header_of(make, header.stamp, target[0]), moved
+    for name in names:
+        head, shown = there if name in IN_TARGET else here
+        yield name, OUTPUTS[name].message(make, head, image, shown)

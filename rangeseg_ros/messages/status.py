@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rangeseg_ros.core.segmentation import Segmentation
-from rangeseg_ros.messages.make import Make
+from rangeseg_ros.messages.make import STATUS, Make
 
 OK, WARN = 0, 1
 """diagnostic_msgs/DiagnosticStatus: levels."""
@@ -36,4 +36,4 @@ def status_message(make: Make, header: Any, result: Segmentation) -> Any:
             for key, value in values.items()
         ],
     )
-    return make('diagnostic_msgs/msg/DiagnosticArray', header=header, status=[status])
+    return make(STATUS, header=header, status=[status])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable
 from dataclasses import fields
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from rangeseg_ros.core.options import ConfigError, unknown_parameter
 from rangeseg_ros.core.runtime.cache import writable
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.depth_input import input_topics
-from rangeseg_ros.ros.gravity import IMU_TOPIC
+from rangeseg_ros.ros.locator import IMU_TOPIC
 from rangeseg_ros.ros.parameters import NodeConfig
 
 USAGE = """\
@@ -40,16 +39,13 @@ _POLICIES = {'reliability': ReliabilityPolicy, 'history': HistoryPolicy}
 
 
 def check_arguments(arguments: list[str]) -> None:
-    """Refuse what is no ROS argument; print the help, and exit, when asked for it.
-
-    Raises
-    ------
-    ConfigError
-        An argument that the node does not know.
-    """
+    """Refuse what is no ROS argument (ConfigError); print the help and exit when asked for it."""
     own = remove_ros_args(arguments)[1:]
     if '-h' in own or '--help' in own:
-        print(USAGE + '\n'.join(_described()))
+        print(USAGE, end='')
+        for field in fields(NodeConfig):
+            description = field.metadata['description']
+            print(f'  {field.name} (default {field.default!r}): {description}')
         sys.exit(0)
     if own:
         raise ConfigError(
@@ -61,13 +57,8 @@ def check_parameters(node: Node, arguments: list[str]) -> None:
     """Refuse parameters that the node does not have, so that none is misspelt in silence.
 
     Those of a parameter file may be meant for other nodes, and `qos_overrides` for other topics:
-    they are warned of, unless they look like one of this node.
-
-    Raises
-    ------
-    ConfigError
-        A name that is not a parameter, and the one that it looks like; a quality of service that
-        there is none of.
+    they are warned of, unless they look like one of this node. ConfigError names what is refused,
+    also a quality of service that there is none of.
     """
     quality = _quality_parameters(node)
     for name in sorted(quality & set(node._parameter_overrides)):
@@ -124,8 +115,3 @@ def _check_policy(name: str, value: object) -> None:
             )
     elif policy == 'depth' and (type(value) is not int or value < 0):
         raise ConfigError(f'parameter {name} must be a number of messages, not {value!r}')
-
-
-def _described() -> Iterable[str]:
-    for field in fields(NodeConfig):
-        yield f'  {field.name} (default {field.default!r}): {field.metadata["description"]}'

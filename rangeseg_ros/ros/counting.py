@@ -49,19 +49,13 @@ class Window:
 
 
 class Losses:
-    """Messages that were sent and did not arrive.
+    """Messages that were sent and did not arrive: `lost`, as the middleware reports.
 
-    Attributes
-    ----------
-    lost : Window
-        Lost, as the middleware reports.
-    implausible : int
-        Reports with an impossible count, which are ignored: Fast DDS reports 2147483647
-        when best-effort messages become smaller after others were lost, besides the true losses.
-    unseen : int or None
-        Gaps in the numbers that the publisher gives to its messages: those that were lost, and
-        those that newer ones replaced in the queue of the middleware. None where it tells no
-        numbers, or while there are several publishers, whose numbers mix.
+    Reports with an impossible count (`implausible`) are ignored: Fast DDS reports 2147483647 when
+    best-effort messages become smaller after others were lost, besides the true losses. `unseen`
+    are gaps in the numbers that the publisher gives to its messages: those that were lost, and
+    those that newer ones replaced in the queue of the middleware. None where it tells no numbers,
+    or while there are several publishers, whose numbers mix.
     """
 
     def __init__(self) -> None:

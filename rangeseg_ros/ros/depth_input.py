@@ -14,6 +14,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from rangeseg_ros.core.sensing.camera import CameraError
 from rangeseg_ros.messages.cameras import camera_from_message, raw_by_name
 from rangeseg_ros.messages.frames import DepthFrame
+from rangeseg_ros.messages.make import nanoseconds
 from rangeseg_ros.ros.counting import Losses
 from rangeseg_ros.ros.pairing import StampPairing
 from rangeseg_ros.ros.qos import MatchedSubscription
@@ -21,6 +22,7 @@ from rangeseg_ros.ros.qos import MatchedSubscription
 IMAGE_TOPIC = 'depth/image_rect'
 CAMERA_TOPIC = 'depth/camera_info'
 POINTS_TOPIC = 'depth/points'
+_KINDS = {'image': Image, 'compressed_depth': CompressedImage, 'points': PointCloud2}
 
 SEGMENT_SIZE = 512 * 1024
 """Of the shared memory of Fast DDS by default, bytes; larger best-effort messages get lost."""
@@ -33,31 +35,14 @@ PROFILE_HINT = (
 
 
 class DepthInput:
-    """Subscribes to depth messages and hands on those whose camera is known.
+    """Subscribes to depth messages and hands on to `accept` those whose camera is known.
 
     An image that arrives before its camera_info waits for it; the next image takes its place.
-    Which camera_info is an image's own: `StampPairing`.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    source : {'image', 'compressed_depth', 'points'}
-        The parameter `input`.
-    raw : bool
-        Whether the images are raw whatever the name of their topic says.
-    accept : callable
-        Gets every complete frame.
-    losses : Losses
-        Counts the depth messages that arrive and those that are lost.
-
-    Attributes
-    ----------
-    pairing : str
-        By what the last image got its camera_info; empty for clouds.
-    problem : str
-        What keeps the last message from being handed on; empty when nothing does.
-    last_arrival : float
-        Time (monotonic, seconds) of the last depth message, at first of the subscription.
+    Which camera_info is an image's own: `StampPairing`. `source` and `raw` are parameters of the
+    node; `losses` counts the depth messages that arrive and those that are lost. `pairing` says by
+    what the last image got its camera_info, `problem` what keeps the last message from being
+    handed on; `last_arrival` is the time (monotonic, seconds) of the last depth message, at first
+    of the subscription.
     """
 
     def __init__(
@@ -71,41 +56,24 @@ class DepthInput:
         self._node = node
         self._accept = accept
         self._waiting: tuple[Any, int] | None = None
-        self._cameras: StampPairing[CameraInfo] = StampPairing()
+        self._cameras = StampPairing()
         self._largest = 0
         self.pairing = ''
         self.problem = ''
         self.last_arrival = time.monotonic()
-        self._info_subscription: MatchedSubscription | None = None
-        if source == 'points':
-            self._subscription = MatchedSubscription(
-                node, PointCloud2, POINTS_TOPIC, self._on_cloud, losses
-            )
-            return
-        image_topic = node.resolve_topic_name(IMAGE_TOPIC)
-        self._raw = raw or raw_by_name(image_topic)
-        self._info_subscription = MatchedSubscription(
-            node, CameraInfo, _camera_topic(node, image_topic), self._on_camera_info
-        )
-        if source == 'compressed_depth':
-            self._subscription = MatchedSubscription(
-                node, CompressedImage, f'{image_topic}/compressedDepth', self._on_image, losses
-            )
-        else:
-            self._subscription = MatchedSubscription(
-                node, Image, image_topic, self._on_image, losses
-            )
+        topic, *info_topics = input_topics(node, source)
+        self._raw = raw or raw_by_name(topic)
+        self._infos = [
+            MatchedSubscription(node, CameraInfo, info_topic, self._on_camera_info)
+            for info_topic in info_topics
+        ]
+        kind = _KINDS[source]
+        self.subscription = MatchedSubscription(node, kind, topic, self._on_message, losses)
 
     @property
     def topic(self) -> str:
         """Topic of the depth messages."""
-        return self._subscription.topic
-
-    def publishers(self) -> str:
-        """How many publishers the topic has, and which of their types are not what is read."""
-        others = self._subscription.other_types
-        of = f' of {", ".join(others)}' if others else ''
-        return f'{self._subscription.publishers} publishers{of}'
+        return self.subscription.topic
 
     def loss_hint(self) -> str:
         """What may help against lost depth messages; empty when nothing is known to."""
@@ -121,34 +89,29 @@ class DepthInput:
 
     def follow_publishers(self) -> None:
         """Keep the quality of service at what the publishers offer."""
-        self._subscription.follow_publishers()
-        if self._info_subscription:
-            self._info_subscription.follow_publishers()
+        for subscription in (self.subscription, *self._infos):
+            subscription.follow_publishers()
 
     def destroy(self) -> None:
         """Unsubscribe."""
-        self._subscription.destroy()
-        if self._info_subscription:
-            self._info_subscription.destroy()
+        for subscription in (self.subscription, *self._infos):
+            subscription.destroy()
 
-    def _on_cloud(self, message: PointCloud2) -> None:
-        self._arrived(message)
-        self._accept(DepthFrame(message, None, self._now()))
-
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        self._arrived(message)
+    def _on_message(self, message: Image | CompressedImage | PointCloud2) -> None:
+        self.last_arrival = time.monotonic()
+        self._largest = max(self._largest, len(message.data))
+        arrival = int(self._node.get_clock().now().nanoseconds)
+        if not self._infos:
+            self._accept(DepthFrame(message, None, arrival))
+            return
         if self._waiting:
             self._cameras.give_up()
             self._hand_on()
-        self._waiting = message, self._now()
+        self._waiting = message, arrival
         self._hand_on()
 
-    def _arrived(self, message: Any) -> None:
-        self.last_arrival = time.monotonic()
-        self._largest = max(self._largest, len(message.data))
-
     def _on_camera_info(self, info: CameraInfo) -> None:
-        self._cameras.add(_nanoseconds(info.header.stamp), info)
+        self._cameras.add(nanoseconds(info.header.stamp), info)
         self._hand_on()
 
     def _hand_on(self) -> None:
@@ -156,15 +119,16 @@ class DepthInput:
         if self._waiting is None:
             return
         message, arrival = self._waiting
-        found = self._cameras.find(_nanoseconds(message.header.stamp))
+        (info,) = self._infos
+        found = self._cameras.find(nanoseconds(message.header.stamp))
         if found is None:
             if not self._cameras.by_stamp:
-                self._warn(f'no camera_info on {self._info_topic()} yet')
+                self._warn(f'no camera_info on {info.topic} yet')
             return
         try:
             camera = camera_from_message(found.item, self._raw)
         except CameraError as error:
-            self._warn(f'unusable camera_info on {self._info_topic()}: {error}')
+            self._warn(f'unusable camera_info on {info.topic}: {error}')
             return
         frame = found.item.header.frame_id
         # The size of a compressed image is known once it is decoded; the core checks it then.
@@ -188,33 +152,16 @@ class DepthInput:
         self.problem = problem
         self._node.get_logger().warning(problem, throttle_duration_sec=5.0)
 
-    def _info_topic(self) -> str:
-        return self._info_subscription.topic if self._info_subscription else ''
-
-    def _now(self) -> int:
-        nanoseconds: int = self._node.get_clock().now().nanoseconds
-        return nanoseconds
-
 
 def input_topics(node: Node, source: str) -> list[str]:
-    """Names of the topics that `DepthInput` subscribes to."""
+    """Topics that `DepthInput` subscribes to: the depth, and of images the camera_info.
+
+    That is beside the image wherever that is remapped to, or where it is remapped to itself.
+    """
     if source == 'points':
         return [node.resolve_topic_name(POINTS_TOPIC)]
     image = node.resolve_topic_name(IMAGE_TOPIC)
-    kind = '/compressedDepth' if source == 'compressed_depth' else ''
-    return [image + kind, _camera_topic(node, image)]
-
-
-def _nanoseconds(stamp: Any) -> int:
-    # rclpy's Time refuses negative ones, which are no reason to stop.
-    nanoseconds: int = stamp.sec * 10**9 + stamp.nanosec
-    return nanoseconds
-
-
-def _camera_topic(node: Node, image_topic: str) -> str:
-    """The camera_info beside the image wherever that is remapped to, or where it is itself."""
-    default = node.resolve_topic_name(CAMERA_TOPIC, only_expand=True)
-    remapped: str = node.resolve_topic_name(CAMERA_TOPIC)
-    if remapped != default:
-        return remapped
-    return f'{image_topic.rpartition("/")[0]}/camera_info'
+    info = node.resolve_topic_name(CAMERA_TOPIC)
+    if info == node.resolve_topic_name(CAMERA_TOPIC, only_expand=True):
+        info = f'{image.rpartition("/")[0]}/camera_info'
+    return [image + ('/compressedDepth' if source == 'compressed_depth' else ''), info]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import get_ident
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -17,16 +17,9 @@ from rangeseg_ros.ros.depth_input import DepthInput
 class FrameTimes:
     """Where the time of a frame went, milliseconds.
 
-    Attributes
-    ----------
-    transport : float
-        Stamp of the depth message to its arrival.
-    waiting : float
-        Arrival to the start of the work: for camera_info, or for the frame before.
-    conversion, compute, publication : float
-        Message to range image, segmentation, and result to published messages.
-    stages : dict
-        Stages of the computation.
+    Transport, from the stamp of the message to its arrival; waiting, to the start of the work: for
+    camera_info, or for the frame before; conversion to a range image, computation, of which
+    `stages` are parts, and publication.
     """
 
     transport: float
@@ -34,12 +27,7 @@ class FrameTimes:
     conversion: float
     compute: float
     publication: float
-    stages: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def work(self) -> float:
-        """Arrival to the end of the publication."""
-        return self.waiting + self.conversion + self.compute + self.publication
+    stages: dict[str, float]
 
     def values(self, longest_transport: float) -> dict[str, str]:
         """By name as diagnostics show them; without what other clocks would make of them.
@@ -47,18 +35,17 @@ class FrameTimes:
         Stamps of recordings, or of clocks that differ, say nothing of the transport: messages do
         not queue up, so that one which took longer than `longest_transport` ms did not come late.
         """
-        shown = {'latency since arrival (ms)': f'{self.work:.2f}'}
+        work = self.waiting + self.conversion + self.compute + self.publication
+        times = {'latency since arrival': work}
+        unknown = {}
         if abs(self.transport) <= longest_transport:
-            shown['latency (ms)'] = f'{self.transport + self.work:.2f}'
-            shown['transport (ms)'] = f'{self.transport:.2f}'
+            times |= {'latency': self.transport + work, 'transport': self.transport}
         else:
-            shown['latency (ms)'] = 'unknown: the stamps are not of the clock of the node'
-        for part in ('waiting', 'conversion', 'compute'):
-            shown[f'{part} (ms)'] = f'{getattr(self, part):.2f}'
-        for stage, milliseconds in self.stages.items():
-            shown[f'compute: {stage} (ms)'] = f'{milliseconds:.2f}'
-        shown['publication (ms)'] = f'{self.publication:.2f}'
-        return shown
+            unknown = {'latency (ms)': 'unknown: the stamps are not of the clock of the node'}
+        times |= {part: getattr(self, part) for part in ('waiting', 'conversion', 'compute')}
+        times |= {f'compute: {stage}': time for stage, time in self.stages.items()}
+        times['publication'] = self.publication
+        return {f'{name} (ms)': f'{time:.2f}' for name, time in times.items()} | unknown
 
 
 class Activity:
@@ -81,59 +68,32 @@ class Activity:
 
 
 class FrameStatistics:
-    """Counts what becomes of the frames.
+    """Counts what becomes of the frames, and keeps what is told of the last one.
 
-    Attributes
-    ----------
-    received, published, dropped, refused : Window
-        Frames that arrived complete; were segmented and published; were replaced by a newer
-        one; could not be segmented.
-    losses : Losses
-        Depth messages that never arrived.
-    compiling : str
-        How far the compilation of kernels is that frames wait for; empty when none do.
-    activity : Activity
-        Of the threads that work on frames.
-    pending : str
-        What is being done with parameters that are not in use yet; empty when all are.
-    problem : str
-        Why the last frame could not be segmented; empty when it could.
-    sources : dict of str
-        What up, fixed frame, target frame and map of the last frame come from.
-    no_terrain : str
-        Why there is no terrain: up is not known, or not where it is said; empty where there is.
-    missing : str
-        Which frames of the parameters were not known for the last frame, and why.
-    found : Segmentation or None
-        What was found in the last frame.
-    ground, stairs : str
-        Of the last frame; empty when nobody listens to what needs it.
-    times : FrameTimes or None
-        Of the last frame.
+    `received` arrived complete, `dropped` were replaced by a newer one, `refused` could not be
+    segmented, of which `problem` says why. `sources` tells what up, the frames and the map come
+    from, `missing` which frames were not known, `no_terrain` why up is not. Empty where there is
+    nothing to tell.
     """
 
     def __init__(self) -> None:
         self.received, self.published = Window(), Window()
         self.dropped, self.refused = Window(), Window()
         self.losses = Losses()
-        self.compiling = ''
         self.activity = Activity()
-        self.pending = ''
-        self.problem = ''
+        self.compiling = ''
+        self.pending = False
+        self.problem = self.missing = self.no_terrain = ''
         self.sources: dict[str, str] = {}
-        self.missing = ''
-        self.no_terrain = ''
         self.found: Segmentation | None = None
-        self.ground = ''
-        self.stairs = ''
         self.times: FrameTimes | None = None
         self._unanswered: float | None = None
 
-    def accepted(self, replaced: bool) -> None:
-        """Count a frame that arrived, and the one that it replaced."""
+    def accepted(self, replaced: int) -> None:
+        """Count a frame that arrived, and those that it replaced."""
         self.received.add()
         if replaced:
-            self.dropped.add()
+            self.dropped.add(replaced)
         if self._unanswered is None:
             self._unanswered = time.monotonic()
 
@@ -141,6 +101,11 @@ class FrameStatistics:
         """Count a frame that the worker is done with: published or refused."""
         counter.add()
         self._unanswered = None
+
+    def done(self, found: Segmentation, times: FrameTimes) -> None:
+        """Count a frame that is published."""
+        self.found, self.times = found, times
+        self.answered(self.published)
 
     def stalled(self) -> float:
         """Seconds since the first frame to which there was no answer yet; 0 when there is none."""
@@ -154,6 +119,8 @@ class FrameStatistics:
         level, message = self._judge(source, stall_timeout)
         found = self.found
         unseen = self.losses.unseen
+        # Only what was worked out for a listener.
+        known = vars(found) if found else {}
         values = {
             'input rate (Hz)': f'{self.received.rate():.2f}',
             'output rate (Hz)': f'{self.published.rate():.2f}',
@@ -168,15 +135,15 @@ class FrameStatistics:
             ),
             'camera_info': source.pairing if source else '',
             'doing': self.doing() or 'waiting for a frame',
-            'parameters': self.pending or 'in use',
+            'parameters': 'in preparation, those before serve' if self.pending else 'in use',
             **{f'{what} from': source for what, source in self.sources.items()},
             'input': str(found.verdict) if found else '',
             'planes': str(len(found.planes)) if found else '0',
             'reason for no planes': found.reason if found else '',
             'sensor': str(found.sensor) if found else '',
             'work_budget': f'{found.work_budget:g}' if found else '1',
-            'ground': self.ground,
-            'stairs': self.stairs,
+            'ground': str(known.get('ground', '')),
+            'stairs': ', '.join(map(str, known.get('stairs', ()))),
         }
         if self.times:
             values.update(self.times.values(1000 * stall_timeout))
@@ -198,7 +165,8 @@ class FrameStatistics:
         silence = time.monotonic() - source.last_arrival
         if silence <= stall_timeout:
             return ''
-        return f'no depth message on {source.topic} for {silence:.1f} s ({source.publishers()})'
+        publishers = source.subscription.publishers()
+        return f'no depth message on {source.topic} for {silence:.1f} s ({publishers})'
 
     def lost(self, source: DepthInput) -> str:
         """What share of the messages of `source` is lost, and what may help; empty when none."""
@@ -213,27 +181,22 @@ class FrameStatistics:
         if source is None:
             busy = f'; {self.compiling}' if self.compiling else ''
             return DiagnosticStatus.OK, f'idle: nobody listens{busy}'
-        lost = self.lost(source)
-        if silent := self.silence(source, stall_timeout):
-            return DiagnosticStatus.ERROR, f'{lost}; {silent}' if lost else silent
-        if problem := source.problem or self.problem:
-            return DiagnosticStatus.ERROR, problem
-        found = self.found
-        if found and found.verdict.invalid:
-            return DiagnosticStatus.ERROR, str(found.verdict)
-        if (stalled := self.stalled()) > stall_timeout:
-            return DiagnosticStatus.ERROR, f'no output for {stalled:.1f} s: {self.doing()}'
-        if self.compiling:
-            return DiagnosticStatus.WARN, self.compiling
-        if lost:
-            return DiagnosticStatus.WARN, lost
-        if self.no_terrain:
-            return DiagnosticStatus.ERROR, self.no_terrain
-        if self.missing:
-            return DiagnosticStatus.WARN, self.missing
-        if found and not found.verdict.ok:
-            return DiagnosticStatus.WARN, str(found.verdict)
-        if found and not found.planes:
-            return DiagnosticStatus.WARN, f'no planes: {found.reason}'
+        error, warning = DiagnosticStatus.ERROR, DiagnosticStatus.WARN
+        lost, found, stalled = self.lost(source), self.found, self.stalled()
+        silence = self.silence(source, stall_timeout)
+        no_output = f'no output for {stalled:.1f} s: {self.doing()}'
+        problems = [
+            (error, '; '.join(filter(None, (lost, silence))) if silence else ''),
+            (error, source.problem or self.problem),
+            (error, str(found.verdict) if found and found.verdict.invalid else ''),
+            (error, no_output if stalled > stall_timeout else ''),
+            (warning, self.compiling),
+            (warning, lost),
+            (error, self.no_terrain),
+            (warning, self.missing),
+            (warning, str(found.verdict) if found and not found.verdict.ok else ''),
+            (warning, f'no planes: {found.reason}' if found and not found.planes else ''),
+        ]
         count = len(found.planes) if found else 0
-        return DiagnosticStatus.OK, f'{count} planes at {self.published.rate():.1f} Hz'
+        fine = DiagnosticStatus.OK, f'{count} planes at {self.published.rate():.1f} Hz'
+        return next((problem for problem in problems if problem[1]), fine)

@@ -18,11 +18,8 @@ class LatestReady(Generic[Item]):
     """Gives the newest item that is ready, and drops the items before it.
 
     An item that is not ready does not block others; it is given once its waiting time is over.
-
-    Parameters
-    ----------
-    delay : callable
-        (item, seconds waited) -> seconds that it has to wait longer, 0 when it is ready.
+    `delay` tells of an item and the seconds that it has waited how many more it has to wait, 0
+    when it is ready.
     """
 
     def __init__(self, delay: Callable[[Item, float], float] = lambda item, waited: 0.0) -> None:

@@ -27,13 +27,12 @@ from rclpy.signals import SignalHandlerOptions, install_signal_handlers
 
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.make import message_class
-from rangeseg_ros.messages.motion import ODOMETRY
+from rangeseg_ros.messages.make import ODOMETRY, message_class
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.arguments import check_arguments, check_parameters, logging_arguments
 from rangeseg_ros.ros.depth_input import DepthInput, input_topics
 from rangeseg_ros.ros.diagnostics import FrameStatistics
-from rangeseg_ros.ros.gravity import IMU_TOPIC
+from rangeseg_ros.ros.locator import IMU_TOPIC
 from rangeseg_ros.ros.parameters import bind
 from rangeseg_ros.ros.pipeline import Pipeline
 from rangeseg_ros.ros.publication import Publication
@@ -56,12 +55,8 @@ class SegmentPlanes(LifecycleNode):
     The executor's thread receives, answers parameter requests and reports; the threads of
     `Pipeline` compute and publish, and that of `Settings` has kernels compiled.
 
-    A managed node with the parameter `managed`; else it is configured and active at once.
-
-    Parameters
-    ----------
-    **node_kwargs
-        Of `rclpy.node.Node`, such as `namespace`: several fit into one process.
+    A managed node with the parameter `managed`; else it is configured and active at once. The
+    arguments are those of `rclpy.node.Node`, such as `namespace`: several fit into one process.
     """
 
     def __init__(self, node_name: str = 'segment_planes', **node_kwargs: Any) -> None:
@@ -76,13 +71,10 @@ class SegmentPlanes(LifecycleNode):
         newest = QoSProfile(depth=5)
         # Late listeners get the last map.
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._outputs = {
-            name: self._publisher(name, output.kind, newest) for name, output in OUTPUTS.items()
-        }
-        self._maps = {
-            name: self._publisher(name, kind, latched) for name, (kind, _) in MAP_OUTPUTS.items()
-        }
-        self._odometry = self._publisher('odometry', ODOMETRY, newest)
+        topics = {name: (output.kind, newest) for name, output in OUTPUTS.items()}
+        topics |= {name: (kind, latched) for name, (kind, _) in MAP_OUTPUTS.items()}
+        topics['odometry'] = ODOMETRY, newest
+        self._outputs = {name: self._publisher(name, *what) for name, what in topics.items()}
         self._diagnostics = self.create_publisher(
             DiagnosticArray, '/diagnostics', 10, callback_group=self._throttled
         )
@@ -92,9 +84,7 @@ class SegmentPlanes(LifecycleNode):
         # What follows a change of parameters is done by the executor, as are all subscriptions.
         self._changed = self.create_guard_condition(self._configure)
         self._settings = Settings(config, self._on_compiling, self._changed.trigger)
-        publication = Publication(
-            self._outputs, self._maps, self._odometry, self._settings, self._statistics
-        )
+        publication = Publication(self._outputs, self._settings, self._statistics)
         self._pipeline = Pipeline(self, publication, self._settings, self._statistics)
         if config.managed:
             self.get_logger().info('waits for a lifecycle manager')
@@ -131,8 +121,7 @@ class SegmentPlanes(LifecycleNode):
         return self._pipeline.stop(patience) and not self._settings.busy
 
     def _waits_for(self) -> str:
-        names = (*OUTPUTS, *self._maps, 'odometry')
-        outputs = ', '.join(f'~/{name}' for name in names)
+        outputs = ', '.join(f'~/{name}' for name in self._outputs)
         topics = ' and '.join(input_topics(self, self._config.input))
         if self._config.use_imu:
             topics += f', up from {self.resolve_topic_name(IMU_TOPIC)}'
@@ -156,13 +145,13 @@ class SegmentPlanes(LifecycleNode):
             self._follow_demand()
         # No frame is lost for it.
         elif self._input and _places(config) != _places(before):
-            self._pipeline.locator.unsubscribe()
             self._pipeline.locator.subscribe(config)
 
     def _follow_demand(self) -> None:
         """Subscribe to the input when the first listener comes, unsubscribe with the last."""
-        publishers = [*self._outputs.values(), *self._maps.values(), self._odometry]
-        listeners = sum(p.get_subscription_count() for p in publishers) if self._active else 0
+        listeners = self._active and any(
+            publisher.get_subscription_count() for publisher in self._outputs.values()
+        )
         if listeners and self._input is None:
             config, losses = self._config, self._statistics.losses
             self._input = DepthInput(self, config.input, config.raw, self._accept, losses)
@@ -193,10 +182,7 @@ class SegmentPlanes(LifecycleNode):
                 self.get_logger().warning(silence)
             self._silent = bool(silence)
         self._pipeline.locator.follow_publishers()
-        if self._settings.pending:
-            self._statistics.pending = 'in preparation, those before serve'
-        else:
-            self._statistics.pending = ''
+        self._statistics.pending = self._settings.pending
         name = self.get_fully_qualified_name().lstrip('/')
         status = self._statistics.status(name, self._input, self._config.stall_timeout)
         report = DiagnosticArray(status=[status])

@@ -29,14 +29,8 @@ class Pace:
     all the same, would just have lasted the period P with the share b (P - o) / r. Its logarithm,
     as a median of three and through a low-pass filter of first order, is what the share is told
     from: the largest of a few steps that is enough at once where that is less, one step more when
-    it has been well possible for some time.
-
-    Parameters
-    ----------
-    rate : float
-        To be held, Hz; 0 leaves `most`.
-    most : float
-        Largest share of the work, 0...1.
+    it has been well possible for some time. `rate` is to be held, Hz, 0 leaves `most`: the largest
+    share of the work, 0...1.
     """
 
     def __init__(self, rate: float, most: float) -> None:

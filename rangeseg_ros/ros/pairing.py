@@ -3,42 +3,34 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Generic, TypeVar
-
-Item = TypeVar('Item')
+from typing import Any, NamedTuple
 
 KEPT = 10
 """Camera infos to look among: as many as the queues of image and camera_info may lie apart."""
 
 
-@dataclass(frozen=True)
-class Found(Generic[Item]):
+class Found(NamedTuple):
     """What to use for an image, and whether it carries the stamp of the image."""
 
-    item: Item
+    item: Any
     exact: bool
 
 
-class StampPairing(Generic[Item]):
+class StampPairing:
     """Pairs by stamp where both carry one; the last otherwise, as some cameras send one only.
 
     Which of both a camera does is learned from what it sends: once a pair of equal stamps was
-    seen, an image waits for its own, until the next image shows that there will be none.
-
-    Attributes
-    ----------
-    by_stamp : bool
-        Whether images wait for the item of their own stamp.
+    seen, an image waits for its own (`by_stamp`), until the next image shows that there will be
+    none.
     """
 
     def __init__(self) -> None:
         self.by_stamp = False
-        self._items: OrderedDict[int, Item] = OrderedDict()
-        self._last: Item | None = None
+        self._items: OrderedDict[int, Any] = OrderedDict()
+        self._last: Any = None
         self._asked = 0
 
-    def add(self, stamp: int, item: Item) -> None:
+    def add(self, stamp: int, item: Any) -> None:
         """Take an item; `stamp` in nanoseconds, 0 = none."""
         self._last = item
         if not stamp:
@@ -49,7 +41,7 @@ class StampPairing(Generic[Item]):
         # It came after its image, which was not known to wait for.
         self.by_stamp |= stamp == self._asked
 
-    def find(self, stamp: int) -> Found[Item] | None:
+    def find(self, stamp: int) -> Found | None:
         """The item for an image; None while it has to wait."""
         self._asked = stamp
         if stamp in self._items:

@@ -66,32 +66,19 @@ class NodeConfig(Config):
 
 
 def bind(node: Node, apply: Callable[[NodeConfig], None]) -> NodeConfig:
-    """Declare the parameters of `node` and keep a configuration in step with them.
+    """Declare the parameters of `node`: the configuration to start with.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    apply : callable
-        Gets the new configuration after every change.
-
-    Returns
-    -------
-    NodeConfig
-        The configuration to start with.
-
-    Raises
-    ------
-    ConfigError, rclpy.exceptions.ParameterException
-        A bad value among the parameters that the node was started with.
+    `apply` gets the new configuration after every change. ConfigError or ParameterException: a bad
+    value among the parameters that the node was started with.
     """
-    for declared in fields(NodeConfig):
-        node.declare_parameter(declared.name, declared.default, _descriptor(declared))
-    names = [declared.name for declared in fields(NodeConfig)]
-    config = NodeConfig(**{name: node.get_parameter(name).value for name in names})
+    declared: list[Any] = [(f.name, f.default, _descriptor(f)) for f in fields(NodeConfig)]
+    given = node.declare_parameters('', declared)
+    config = NodeConfig(**{parameter.name: parameter.value for parameter in given})
     check_corrections(config)
 
     def changed(parameters: list[Parameter]) -> NodeConfig:
-        return replace(config, **{p.name: p.value for p in parameters if p.name in names})
+        known = NodeConfig.__dataclass_fields__
+        return replace(config, **{p.name: p.value for p in parameters if p.name in known})
 
     def check(parameters: list[Parameter]) -> SetParametersResult:
         try:
@@ -117,12 +104,10 @@ def _descriptor(declared: Field[Any]) -> ParameterDescriptor:
     descriptor = ParameterDescriptor(description=metadata['description'])
     if metadata['choices']:
         descriptor.additional_constraints = f'one of {", ".join(metadata["choices"])}'
-    if metadata['low'] is not None and isinstance(declared.default, float):
-        descriptor.floating_point_range = [
-            FloatingPointRange(from_value=metadata['low'], to_value=metadata['high'])
-        ]
-    elif metadata['low'] is not None:
-        descriptor.integer_range = [
-            IntegerRange(from_value=int(metadata['low']), to_value=int(metadata['high']), step=1)
-        ]
+    low, high = metadata['low'], metadata['high']
+    if isinstance(declared.default, float) and low is not None:
+        bounds = FloatingPointRange(from_value=float(low), to_value=float(high))
+        descriptor.floating_point_range = [bounds]
+    elif low is not None:
+        descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=1)]
     return descriptor

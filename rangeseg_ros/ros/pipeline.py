@@ -17,7 +17,6 @@ from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.runtime.threads import sharing_cores
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
-from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
@@ -25,7 +24,7 @@ from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.latest_ready import LatestReady
 from rangeseg_ros.ros.locator import Locator
 from rangeseg_ros.ros.pace import Pace
-from rangeseg_ros.ros.publication import Publication, Result
+from rangeseg_ros.ros.publication import Publication, Segmented
 from rangeseg_ros.ros.settings import Settings
 from rangeseg_ros.ros.ticket_lock import TicketLock
 
@@ -43,30 +42,10 @@ class Work(NamedTuple):
     began: float
 
 
-class Segmented(NamedTuple):
-    """What is known of a frame without those before."""
-
-    image: RangeImage
-    found: Segmentation
-    at: Placement
-    start: int
-    ticks: list[float]
-
-
 class Pipeline:
     """Segments the newest frame whenever one of its threads is free.
 
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    publication : Publication
-    settings : Settings
-    statistics : FrameStatistics
-
-    Attributes
-    ----------
-    locator : Locator
-        Tells where the camera is.
+    `locator` tells where the camera is.
     """
 
     def __init__(
@@ -103,10 +82,7 @@ class Pipeline:
 
     def put(self, frame: DepthFrame) -> None:
         """Take a frame in place of one that waits."""
-        dropped = self._frames.put(frame)
-        self._statistics.accepted(replaced=dropped > 0)
-        if dropped > 1:
-            self._statistics.dropped.add(dropped - 1)
+        self._statistics.accepted(replaced=self._frames.put(frame))
 
     def stop(self, patience: float) -> bool:
         """Let the frames in hand be finished; False when it takes more seconds than that."""
@@ -166,14 +142,14 @@ class Pipeline:
         doing(f'segmenting {image.shape[1]}x{image.shape[0]} pixels')
         at = self.locator.place(config, frame)
         found = work.segmenter.segment(image)
-        return Segmented(image, found, at, start, ticks)
+        return Segmented(frame, image, found, at, start, ticks)
 
     def _finish(self, work: Work, segmented: Segmented | Exception) -> None:
         """Do what takes frames one after the other, publishing included."""
         try:
             if isinstance(segmented, Exception):
                 raise segmented
-            result = self._follow(work, segmented)
+            done, sequence = self._follow(work, segmented)
         except ValueError as error:
             self._refuse(str(error))
         # Whatever one frame does, the next one gets its chance.
@@ -181,37 +157,32 @@ class Pipeline:
             self._fail(error)
         else:
             self._statistics.problem = ''
-            self._size = result.image.inverse.size
+            self._size = done.image.inverse.size
             try:
-                self._publication.publish(result)
+                self._publication.publish(done, sequence)
             except Exception as error:
                 self._fail(error)
-            self._set_pace(work, result.segmentation)
+            self._set_pace(work, done.found)
 
-    def _follow(self, work: Work, segmented: Segmented) -> Result:
+    def _follow(self, work: Work, segmented: Segmented) -> tuple[Segmented, SequenceSegmenter]:
         """Find the planes of the frames before in a frame."""
-        image, found, at, start, ticks = segmented
-        config = work.segmenter.config
+        config, at, stamp = work.segmenter.config, segmented.at, work.frame.stamp
         if self._sequence is None:
             self._sequence = SequenceSegmenter(config)
         elif config is not self._sequence.config:
             self._sequence.config = config
         sequence = self._sequence
-        lost = ''
-        if config.gravity_frame:
-            lost = self._up.hold(at, work.frame.stamp, config.track_time)
-        placed = work.frame.stamp, at.up, at.pose, at.height
-        found = sequence.follow(found, image, *placed)
+        lost = self._up.hold(at, stamp, config.track_time) if config.gravity_frame else ''
+        placed = stamp, at.up, at.pose, at.height
+        found = sequence.follow(segmented.found, segmented.image, *placed)
         if not lost and found.tilt:
             lost = f'no terrain: {found.tilt}'
         self._statistics.no_terrain = lost
         if lost:
             found = replace(found, survey=None)
         self._tell(sequence, at)
-        ticks.append(time.perf_counter())
-        target = (config.target_frame, at.target) if at.target else None
-        planes = self._publication.map_to_send(sequence)
-        return Result(work.frame, image, found, start, ticks, target, planes, sequence.motion)
+        segmented.ticks.append(time.perf_counter())
+        return segmented._replace(found=found), sequence
 
     def _set_pace(self, work: Work, found: Segmentation) -> None:
         """Take up how long a frame took, after the one before if they were worked on at once."""

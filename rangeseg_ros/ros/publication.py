@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from rclpy.publisher import Publisher
 
-from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.odometry import Motion
-from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.mapping.placement import Placement
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.frames import DepthFrame
-from rangeseg_ros.messages.make import make_rclpy
+from rangeseg_ros.messages.make import header_of, make_rclpy
 from rangeseg_ros.messages.motion import odometry_message
-from rangeseg_ros.messages.outputs import IN_TARGET, MAP_OUTPUTS, OUTPUTS, in_target
+from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS, messages_of
 from rangeseg_ros.ros.diagnostics import FrameStatistics, FrameTimes
 from rangeseg_ros.ros.settings import Settings
 
@@ -26,102 +24,75 @@ _MAP_INTERVAL = 1.0
 """Seconds between messages of the map: it changes with every frame, and is not for control."""
 
 
-_FIRST = ('drops', 'grid', 'obstacles', 'ground')
-"""Outputs that a robot stops for: published before those that people look at."""
+class Segmented(NamedTuple):
+    """A segmented frame, and where the camera was.
 
-
-class Result(NamedTuple):
-    """A segmented frame; `ticks` are the times at which its parts began and ended, seconds."""
+    `start` is when the work on it began, by the clock of the node, nanoseconds; `ticks` are the
+    times at which its parts began and ended, seconds.
+    """
 
     frame: DepthFrame
     image: RangeImage
-    segmentation: Segmentation
+    found: Segmentation
+    at: Placement
     start: int
     ticks: list[float]
-    target: tuple[str, Transform] | None = None
-    map: list[MapPlane] | None = None
-    motion: Motion | None = None
 
 
 class Publication:
-    """Publishes results, each output while somebody listens to it.
-
-    Parameters
-    ----------
-    publishers, map_publishers : mapping
-        By the names of `OUTPUTS` and `MAP_OUTPUTS`.
-    odometry_publisher : rclpy.publisher.Publisher
-    settings : Settings
-    statistics : FrameStatistics
-    """
+    """Publishes results, each topic (by its name) while somebody listens to it."""
 
     def __init__(
         self,
         publishers: Mapping[str, Publisher],
-        map_publishers: Mapping[str, Publisher],
-        odometry_publisher: Publisher,
         settings: Settings,
         statistics: FrameStatistics,
     ) -> None:
         self._publishers = publishers
         self._settings = settings
         self._statistics = statistics
-        self._map_publishers = map_publishers
-        self._odometry_publisher = odometry_publisher
         self._map_time = 0.0
 
-    def map_to_send(self, sequence: SequenceSegmenter) -> list[MapPlane] | None:
-        """The planes of the map, once a second while somebody listens."""
-        config = sequence.config
-        listeners = sum(p.get_subscription_count() for p in self._map_publishers.values())
-        now = time.monotonic()
-        if not config.map_frame or not listeners or now - self._map_time < _MAP_INTERVAL:
-            return None
-        self._map_time = now
-        return sequence.map.planes
-
-    def publish(self, result: Result) -> None:
+    def publish(self, done: Segmented, sequence: SequenceSegmenter) -> None:
         """Publish what somebody listens to, and report the frame."""
-        frame, image, found, start, ticks = result[:5]
-        doing = self._statistics.activity.now
-        here = frame.message.header, found
-        there = in_target(make_rclpy, *here, *result.target) if result.target else here
-        for name in self._settings.in_order(OUTPUTS, _FIRST):
-            output = OUTPUTS[name]
-            publisher = self._publishers[name]
-            if publisher.get_subscription_count():
-                doing(f'publishing {name}')
-                if not self._settings.ready_for(name):
-                    return
-                header, shown = there if name in IN_TARGET else here
-                publisher.publish(output.message(make_rclpy, header, image, shown))
-        if result.motion and self._odometry_publisher.get_subscription_count():
-            message = odometry_message(make_rclpy, frame.message.header, result.motion)
-            self._odometry_publisher.publish(message)
-        if result.map is not None:
-            doing('publishing the map')
-            self._publish_map(result.map, frame.message.header.stamp)
-        doing()
+        frame, image, found, at, start, ticks = done
+        header, config = frame.message.header, sequence.config
+        target = (config.target_frame, at.target) if at.target else None
+        for name, message in messages_of(
+            make_rclpy, header, image, found, target, self._listened()
+        ):
+            self._publishers[name].publish(message)
+        if sequence.motion and self._has_listeners('odometry'):
+            message = odometry_message(make_rclpy, header, sequence.motion)
+            self._publishers['odometry'].publish(message)
+        now = time.monotonic()
+        if (
+            config.map_frame
+            and now - self._map_time >= _MAP_INTERVAL
+            and any(map(self._has_listeners, MAP_OUTPUTS))
+        ):
+            self._statistics.activity.now('publishing the map')
+            self._map_time = now
+            fixed = header_of(make_rclpy, header.stamp, config.map_frame)
+            for name, (_, map_message) in MAP_OUTPUTS.items():
+                planes = map_message(make_rclpy, fixed, sequence.map.planes)
+                self._publishers[name].publish(planes)
+        self._statistics.activity.now()
         times = [*ticks, time.perf_counter()]
         conversion, compute, publication = (1000 * (end - begin) for begin, end in pairwise(times))
-        statistics = self._statistics
-        statistics.times = FrameTimes(
-            transport=(frame.time - frame.stamp) / 1e6,
-            waiting=(start - frame.time) / 1e6,
-            conversion=conversion,
-            compute=compute,
-            publication=publication,
-            stages=found.timings,
+        waits = (frame.time - frame.stamp) / 1e6, (start - frame.time) / 1e6
+        self._statistics.done(
+            found, FrameTimes(*waits, conversion, compute, publication, found.timings)
         )
-        statistics.found = found
-        # Only what was worked out for a listener.
-        known = vars(found)
-        statistics.ground = str(known.get('ground', ''))
-        statistics.stairs = ', '.join(map(str, known.get('stairs', ())))
-        statistics.answered(statistics.published)
 
-    def _publish_map(self, planes: list[MapPlane], stamp: Any) -> None:
-        frame = self._settings.wanted.map_frame
-        header = make_rclpy('std_msgs/msg/Header', stamp=stamp, frame_id=frame)
-        for name, (_, message) in MAP_OUTPUTS.items():
-            self._map_publishers[name].publish(message(make_rclpy, header, planes))
+    def _has_listeners(self, name: str) -> bool:
+        return bool(self._publishers[name].get_subscription_count())
+
+    def _listened(self) -> Iterator[str]:
+        """Names of the outputs that somebody listens to, each once its kernels are there."""
+        for name in self._settings.ready_first(OUTPUTS):
+            if self._has_listeners(name):
+                self._statistics.activity.now(f'publishing {name}')
+                if not self._settings.ready_for(name):
+                    return
+                yield name

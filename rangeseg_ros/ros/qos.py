@@ -21,17 +21,7 @@ class MatchedSubscription:
     The middleware's own `best_available` policy looks once, when the subscription is made, and
     takes a topic without publishers for a reliable one. Here the choice is made anew when
     publishers come or go. The parameter `qos_overrides.<topic>.subscription.reliability` ends it.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-    kind : type
-        Class of the messages.
-    topic : str
-    callback : callable
-        Gets every message.
-    losses : Losses, optional
-        Counts the messages that arrive and those that are lost.
+    `losses` counts the messages that arrive and those that are lost.
     """
 
     def __init__(
@@ -57,22 +47,15 @@ class MatchedSubscription:
     @property
     def topic(self) -> str:
         """Name of the topic, remapped."""
-        name: str = self._subscription.topic_name
-        return name
+        return str(self._subscription.topic_name)
 
-    @property
-    def publishers(self) -> int:
-        """Number of publishers, whether their quality of service fits or not."""
-        count: int = self._node.count_publishers(self.topic)
-        return count
-
-    @property
-    def other_types(self) -> list[str]:
-        """Types that are published on the topic and are not that of the subscription."""
+    def publishers(self) -> str:
+        """How many publishers the topic has, and which of their types are not what is read."""
         kind = self._arguments[0]
         own = f'{kind.__module__.partition(".")[0]}/msg/{kind.__name__}'
         offers = self._node.get_publishers_info_by_topic(self.topic)
-        return sorted({info.topic_type for info in offers} - {own})
+        others = sorted({info.topic_type for info in offers} - {own})
+        return f'{len(offers)} publishers' + (f' of {", ".join(others)}' if others else '')
 
     def follow_publishers(self) -> None:
         """Subscribe anew where the publishers there are now offer something else.
@@ -80,7 +63,7 @@ class MatchedSubscription:
         Called by the middleware's events, and to be called now and then: the event of a
         publisher that leaves may come before the list of publishers is without it.
         """
-        self._single = self.publishers == 1
+        self._single = self._node.count_publishers(self.topic) == 1
         # A topic that has lost its last publisher keeps its policies for when that comes back.
         best = self._best_offered(self.topic)
         if best and best != self._offered and not self._overridden:
@@ -132,8 +115,9 @@ class MatchedSubscription:
         offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(topic)]
         reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
         latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers)
-        best = (
+        if not offers:
+            return None
+        return (
             ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         )
-        return best if offers else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import fields
 from threading import Condition, Thread
 
@@ -18,21 +18,10 @@ class Settings:
     """The configuration in use: the newest one whose kernels are there.
 
     Those that need no other kernels count at once. While others compile, the one before serves.
-    The first serves for the outputs `FIRST` before the kernels of the others are there.
-
-    Parameters
-    ----------
-    config : NodeConfig
-        To start with.
-    report : callable
-        Gets how far a compilation is, and the empty string after the last.
-    changed : callable
-        Called after another one has come into use, by any thread.
-
-    Attributes
-    ----------
-    busy : bool
-        Whether something is being compiled or loaded.
+    The first serves for the outputs `FIRST` before the kernels of the others are there. `report`
+    gets how far a compilation is, and the empty string after the last; `changed` is called after
+    another configuration has come into use, by any thread. `wanted` is the one that was asked for
+    last; `busy` while something is compiled or loaded.
     """
 
     def __init__(
@@ -41,7 +30,7 @@ class Settings:
         self._report = report
         self._on_change = changed
         self._in_use: NodeConfig | None = None
-        self._wanted = config
+        self.wanted = config
         self._prepared: set[tuple[object, ...]] = set()
         self._jobs: LatestReady[NodeConfig] = LatestReady()
         self._closed = self.busy = False
@@ -52,27 +41,20 @@ class Settings:
         self.want(config)
 
     @property
-    def wanted(self) -> NodeConfig:
-        """What was asked for last."""
-        return self._wanted
-
-    @property
     def pending(self) -> bool:
         """Whether what was asked for is not in use yet."""
-        return self._in_use is not self._wanted
+        return self._in_use is not self.wanted
 
     def want(self, config: NodeConfig) -> None:
         """Ask for another configuration."""
-        self._wanted = config
+        self.wanted = config
+        current = self._in_use
         # What runs the kernels of the one in use need not wait for those of other outputs.
-        if _needs(config) in self._prepared or self._serves(config):
+        serves = current is not None and _needs(current) == _needs(config)
+        if serves or _needs(config) in self._prepared:
             self._use(config)
         else:
             self._jobs.put(config)
-
-    def _serves(self, config: NodeConfig) -> bool:
-        current = self._in_use
-        return current is not None and _needs(current) == _needs(config)
 
     def in_use(self) -> NodeConfig | None:
         """The configuration for the next frame; waits for the first. None once closed."""
@@ -86,9 +68,9 @@ class Settings:
             self._came.wait_for(lambda: self._closed or output in self._ready)
             return not self._closed
 
-    def in_order(self, outputs: Iterable[str], first: Sequence[str]) -> list[str]:
-        """`outputs`, those of `first` before the others as soon as their kernels are there."""
-        return sorted(outputs, key=lambda name: name not in first or name not in self._ready)
+    def ready_first(self, outputs: Iterable[str]) -> list[str]:
+        """`outputs` in their order, those before the others whose kernels are there."""
+        return sorted(outputs, key=lambda name: name not in self._ready)
 
     def close(self) -> None:
         """Let those who wait go."""
@@ -114,13 +96,14 @@ class Settings:
             self._prepared.add(_needs(config))
             self._report('')
             self.busy = False
-            if config is self._wanted:
+            if config is self.wanted:
                 self._use(config)
 
     def _prepare(self, config: NodeConfig, outputs: tuple[str, ...]) -> None:
         # What cannot be compiled will be reported by the frame that needs it.
         try:
-            prepare(_of_core(config), (_kind(config),), self._report, outputs)
+            core, kind = _rehearsed(config)
+            prepare(core, (kind,), self._report, outputs)
         except Exception as error:
             self._report(f'not compiled ahead: {error}')
         with self._came:
@@ -130,14 +113,14 @@ class Settings:
 
 def _needs(config: NodeConfig) -> tuple[object, ...]:
     """What decides which kernels run."""
-    return *needs(_of_core(config)), _kind(config)
+    core, kind = _rehearsed(config)
+    return *needs(core), kind
 
 
-def _kind(config: NodeConfig) -> str:
-    """Of `rehearsal.KINDS`."""
-    return 'points' if config.input == 'points' else 'image'
+def _rehearsed(config: NodeConfig) -> tuple[Config, str]:
+    """What kernels are compiled for: parameters and kind of the input, see `rehearse`.
 
-
-def _of_core(config: NodeConfig) -> Config:
-    """Without what only the node knows, which the compiling processes need not import."""
-    return Config(**{field.name: getattr(config, field.name) for field in fields(Config)})
+    Without what only the node knows, which the compiling processes need not import.
+    """
+    core = Config(**{field.name: getattr(config, field.name) for field in fields(Config)})
+    return core, 'points' if config.input == 'points' else 'image'

@@ -13,12 +13,7 @@ class ThrottledCallbackGroup(MutuallyExclusiveCallbackGroup):
 
     For every message the executor checks all entities of a node. With three events per publisher
     this takes longer than taking the message, and blocks the interpreter for the segmentation.
-    Events that are not checked stay pending.
-
-    Parameters
-    ----------
-    interval : float
-        Seconds.
+    Events that are not checked stay pending. `interval` is in seconds.
     """
 
     def __init__(self, interval: float) -> None:
