@@ -15,9 +15,9 @@ from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
 from rangeseg_ros.core.mapping.floor_plan import FloorPlan, Up, estimate_up, make_plan
-from rangeseg_ros.core.mapping.map_planes import MapPlane
 from rangeseg_ros.core.mapping.observations import PoseNoise
 from rangeseg_ros.core.mapping.occupancy import points_within
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -36,17 +36,9 @@ PICTURE, PAGE = 'plan.svg', 'plan.html'
 class PlanOutcome:
     """What became of a recording.
 
-    Attributes
-    ----------
-    frames, located : int
-        Number of frames, and of those whose place was known.
-    frame : str
-        Fixed frame of the plan.
-    planes, walls, openings, squared : int
-        Numbers in the plan; of planes with exact right angles.
-    up : str
-        What tells which way is up.
-    warnings : list of str
+    Numbers of its frames and of those whose place was known, its fixed `frame`; numbers of planes,
+    walls, openings, and planes with exact right angles (`squared`) in the plan; what tells which
+    way is `up`.
     """
 
     frames: int
@@ -68,22 +60,16 @@ class _Stretch:
     the images, by the parameters and by the sensors.
     """
 
+    map: PlaneMap
     seen: Adjustment
     frames: list[int] = field(default_factory=list)
-    planes: list[MapPlane] = field(default_factory=list)
-    successors: dict[int, int] = field(default_factory=dict)
     looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
     told: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    def end(self, planes: list[MapPlane], successors: dict[int, int]) -> _Stretch:
-        """Take the planes that the map has now."""
-        self.planes, self.successors = planes, successors
-        return self
 
     @property
     def extent(self) -> tuple[float, int]:
         """Area of its planes, and number of frames."""
-        return sum(plane.area for plane in self.planes), len(self.frames)
+        return sum(plane.area for plane in self.map.planes), len(self.frames)
 
 
 @dataclass(frozen=True)
@@ -143,9 +129,9 @@ class PlanTask:
                 f'{self.recording}: where the camera was in {config.map_frame!r} is not known for '
                 f'any of {frames} frames: {"; ".join(warnings) or "no tf"}'
             )
-        if not best.planes:
+        if not (planes := best.map.planes):
             raise BagError(f'{self.recording}: no planes in {len(best.frames)} frames')
-        solution = best.seen.solve(best.planes, best.successors)
+        solution = best.seen.solve(planes, best.map.successors)
         if solution.drifts:
             warnings.append(solution.drift_text())
         points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
@@ -172,15 +158,13 @@ class PlanTask:
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
 
         def begin() -> _Stretch:
-            return _Stretch(Adjustment(noise, odometry=not config.fixed_frame))
+            return _Stretch(sequence.map, Adjustment(noise, odometry=not config.fixed_frame))
 
-        stretches, frames, warnings, epoch = [begin()], 0, [], sequence.map.epoch
+        stretches, frames, warnings = [begin()], 0, []
         with self._open() as source, Locator(self.recording, config) as located:
             for number, *_ in segment_frames(source, sequence, located.place, progress):
                 frames += 1
-                if sequence.map.epoch != epoch:
-                    epoch = sequence.map.epoch
-                    stretches[-1].end(sequence.map.planes_before, sequence.map.successors_before)
+                if stretches[-1].map is not sequence.map:
                     warnings.append(f'frame {number}: {sequence.map.begun_anew}')
                     stretches.append(begin())
                 now = stretches[-1]
@@ -194,7 +178,6 @@ class PlanTask:
             warnings += [f'{n} frames without the {why}' for why, n in located.problems.items()]
             if source.damage:
                 warnings.append(source.damage)
-        stretches[-1].end(sequence.map.planes, sequence.map.successors)
         best = max(stretches, key=lambda stretch: stretch.extent)
         return frames, best, warnings + sequence.map.doubts
 
@@ -222,21 +205,12 @@ class PlanTask:
         points: Iterator[NDArray[np.float64]],
         config: Config,
     ) -> FloorPlan:
-        tolerance = np.radians(config.role_tolerance)
+        up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
         if best.told.any():
             source = config.gravity_frame or 'the accelerometer'
             up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
-        else:
-            up = estimate_up(solution.planes, best.looked, tolerance)
-        return make_plan(
-            solution,
-            config.map_frame,
-            up,
-            points,
-            config,
-            self.headroom,
-            self.resolution,
-        )
+        grid = self.headroom, self.resolution
+        return make_plan(solution, config.map_frame, up, points, config, *grid)
 
     @contextmanager
     def _open(self) -> Iterator[DepthBag]:

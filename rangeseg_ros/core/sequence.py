@@ -13,9 +13,9 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
 from rangeseg_ros.core.ground.survey import Survey, grid_options
+from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
-from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
@@ -64,7 +64,7 @@ class SequenceSegmenter:
         self._tracker.config = config
         before = self.map.config
         if config.map_frame != before.map_frame:
-            self.map.clear('its frame has changed')
+            self.map = self.map.anew('its frame has changed')
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config), None
@@ -114,7 +114,7 @@ class SequenceSegmenter:
         """
         if stamp < self._stamp:
             self._tracker.reset()
-            self.map.clear('time has gone back')
+            self.map = self.map.anew('time has gone back')
             self._ground.forget()
             self._pose = None
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
@@ -171,7 +171,7 @@ class SequenceSegmenter:
         motion = self._odometry.add(planes, seen, stamp, unit(towards), image.axes)
         self.motion = motion.of_origin(image.place)
         if not self.motion.held and len(self.map) and not config.fixed_frame:
-            self.map.clear('no plane held the camera')
+            self.map = self.map.anew('no plane held the camera')
 
 
 def with_roles(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -13,7 +14,12 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
-from rangeseg_ros.core.rotations import quaternions
+from rangeseg_ros.core.mapping.plane_set import PlaneSet
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import quaternions, rotation_matrix, turn_between
+from rangeseg_ros.core.tracking.plane_errors import moved_plane
+
+AnyPlane = TypeVar('AnyPlane', bound=Plane)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,40 +122,25 @@ class Record:
         self.roles += other.roles
 
 
-def describe(
-    record: Record,
-    normal: NDArray[np.float64],
-    point: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> MapPlane:
-    """The plane of a record.
+def describe(record: Record, plane: PlaneSet, covariance: NDArray[np.float64]) -> MapPlane:
+    """The plane of a record: one of the fixed frame, with the axes of its grid.
 
-    Parameters
-    ----------
-    record : Record
-    normal, point : (3,) float64
-        In the fixed frame.
-    axes : (2, 3) float64
-        Those of its grid.
-    covariance : (4, 4) float64
-        Of normal and distance.
+    `covariance` (4, 4) is that of normal and distance.
     """
-    grid = record.grid
+    grid, normal = record.grid, plane.normal[0]
     cells = grid.centres()
     middle, size, angle = cv2.minAreaRect(cells.astype(np.float32))
     along = np.radians(angle if size[0] >= size[1] else angle + 90)
-    major = np.array([np.cos(along), np.sin(along)]) @ axes
+    major = np.array([np.cos(along), np.sin(along)]) @ plane.axes[0]
     frame = np.stack([major, np.cross(normal, major), normal], axis=1)
-    rings = MapOutline([list(part) for part in grid.polygons()])
     return MapPlane(
         label=record.id,
         id=record.id,
         surface=record.id,
         normal=normal.copy(),
-        distance=float(-normal @ point),
+        distance=float(plane.distance[0]),
         covariance=covariance,
-        centroid=point + cells.mean(axis=0) @ axes,
+        centroid=plane.points(cells.mean(axis=0)[None])[0],
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
@@ -157,13 +148,58 @@ def describe(
         shape=Shape(
             area=grid.area,
             extents=np.sort(size)[::-1] + grid.side,
-            centre=point + np.array(middle) @ axes,
+            centre=plane.points(np.array([middle]))[0],
             orientation=quaternions(frame),
         ),
-        outline=rings.moved(lambda ring: point + ring @ axes),
+        outline=MapOutline([list(part) for part in grid.polygons()]).moved(plane.points),
         role=record.roles.most_common(1)[0][0],
         observations=record.observations,
         age=(record.last - record.first) * 1e-9,
         first_stamp=record.first,
         last_stamp=record.last,
     )
+
+
+def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane]:
+    """Planes in the frame that `motion` leads to; normals stay on the side of the sensor."""
+    turn, shift = motion
+    jacobian = moved_plane(turn, shift)
+    moved = []
+    for plane in planes:
+        normal = turn @ plane.normal
+        shape = Shape(
+            area=plane.area,
+            extents=plane.extents,
+            centre=turn @ plane.centre + shift,
+            orientation=quaternions(turn @ rotation_matrix(plane.orientation)),
+        )
+        outline = MapOutline(plane.outline.parts).moved(lambda ring: ring @ turn.T + shift)
+        moved.append(
+            replace(
+                plane,
+                normal=normal,
+                distance=float(plane.distance - normal @ shift),
+                covariance=jacobian @ plane.covariance @ jacobian.T,
+                centroid=turn @ plane.centroid + shift,
+                shape=shape,
+                outline=outline,  # type: ignore[arg-type]
+            )
+        )
+    return moved
+
+
+def moved_onto(
+    planes: Sequence[MapPlane], equations: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> list[MapPlane]:
+    """Planes turned about their centroids onto other equations (P, 4).
+
+    `covariance` (4 P, 4 P) is that of all of these.
+    """
+    found = []
+    for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
+        turn = turn_between(plane.normal, equation[:3])
+        foot = plane.centroid - (equation @ [*plane.centroid, 1]) * equation[:3]
+        (moved,) = moved_planes([plane], Transform(turn, foot - turn @ plane.centroid))
+        own = np.s_[4 * k : 4 * k + 4]
+        found.append(replace(moved, covariance=covariance[own, own]))
+    return found

@@ -20,19 +20,9 @@ _STEEPEST = np.radians(60.0)
 class Mount(NamedTuple):
     """Where a camera is above the floor, the floor's frame below it with x forward, z up.
 
-    Attributes
-    ----------
-    roll, pitch : float
-        About the optical axis, positive where the camera's right side is lower, and downwards,
-        radians.
-    height : float
-        Metres.
-    sigma : (3,) float64
-        Standard deviations of these three.
-    rotation : (3, 3) float64
-        The floor's frame from the optical one.
-    doubts : list of str
-        Why the floor is not sure.
+    Roll about the optical axis is positive where the camera's right side is lower, pitch
+    downwards, radians; height is in metres, and `sigma` (3,) are standard deviations of the three.
+    `rotation` takes the optical frame to the floor's; `doubts` say why the floor is not sure.
     """
 
     roll: float
@@ -55,24 +45,11 @@ class Mount(NamedTuple):
 
 
 def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount | None:
-    """The mount by the floor among planes that were fused in the frame of the camera.
+    """The mount by the floor among planes that were fused in the optical frame.
 
     The floor is the largest plane that faces up; of a robot that drives on a flat floor, it alone
-    stays where it is.
-
-    Parameters
-    ----------
-    planes : sequence of MapPlane
-        In the optical frame.
-    frames : int
-        Number of frames they are from.
-    tolerance : float
-        Angle by which a floor is told from other planes, degrees: the parameter `role_tolerance`.
-
-    Returns
-    -------
-    Mount or None
-        None when nothing faces up.
+    stays where it is. None when nothing faces up. `frames` is the number of frames the planes are
+    from, `tolerance` the parameter `role_tolerance`, degrees.
     """
     facing = [plane for plane in planes if -plane.normal[1] > np.cos(_STEEPEST)]
     weight = [plane.area * plane.observations for plane in facing]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.plane_grid import HIT, LEAST, MISS
+from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, PlaneGrid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
@@ -20,16 +20,9 @@ _SAMPLES = 120
 
 
 class Grid(NamedTuple):
-    """Cells on the ground.
+    """Cells (H, W) on the ground, `FREE`, `OCCUPIED` or `UNKNOWN`, row 0 at the least y.
 
-    Attributes
-    ----------
-    cells : (H, W) int8
-        `FREE`, `OCCUPIED` or `UNKNOWN`; row 0 at the least y.
-    origin : (float, float)
-        x and y of the outer corner of the first cell, metres.
-    resolution : float
-        Side of a cell, metres.
+    `origin` is the outer corner (x, y) of the first cell, metres, `resolution` their side.
     """
 
     cells: NDArray[np.int8]
@@ -62,42 +55,21 @@ def occupancy(
     ground: float,
     band: tuple[float, float],
     resolution: float,
-) -> Grid:
-    """Cells in which points stand in the way, or lie on the ground.
+) -> PlaneGrid:
+    """Log-odds that something stands in the way in cells of the ground.
 
-    Parameters
-    ----------
-    points : iterable of (N, 3) float64
-        Of each frame, z up, metres.
-    ground : float
-        Height of the ground, metres.
-    band : (float, float)
-        Heights above the ground from which to which things are in the way, metres; what is as far
-        below the ground as the band begins above it is no ground.
-    resolution : float
-        Side of a cell, metres.
+    Points (N, 3) of each frame are with z up, as the heights of the ground and of the band above
+    it in which things are in the way, metres. What is as far below the ground as the band begins
+    above it is no ground.
     """
-    # Points in the way, and on the ground.
-    counts, first = np.zeros((2, 1, 1)), np.zeros(2, np.intp)
+    grid = PlaneGrid(resolution, np.inf)
     for some in points:
         above = some[:, 2] - ground
-        blocking = (above >= band[0]) & (above < band[1])
-        used = blocking | (np.abs(above) < band[0])
-        if not used.any():
-            continue
-        cells = np.floor(some[used, :2] / resolution).astype(np.intp)
-        if not counts.any():
-            first = cells[0]
-        last = first + counts.shape[:0:-1]
-        before = np.maximum(first - cells.min(axis=0), 0)
-        after = np.maximum(cells.max(axis=0) + 1 - last, 0)
-        if before.any() or after.any():
-            counts = np.pad(counts, [(0, 0), *zip(before[::-1], after[::-1], strict=True)])
-            first = first - before
-        column, row = (cells - first).T
-        np.add.at(counts, (np.where(blocking[used], 0, 1), row, column), 1)
-    # The odds of a cell; a few points that err are no obstacle.
-    values = np.where(counts[1] > 0, FREE, UNKNOWN)
-    values[HIT * counts[0] + MISS * counts[1] > -LEAST] = OCCUPIED
-    origin = (float(first[0] * resolution), float(first[1] * resolution))
-    return Grid(values.astype(np.int8), origin, resolution)
+        for chosen, change in (
+            ((above >= band[0]) & (above < band[1]), HIT),
+            (np.abs(above) < band[0], MISS),
+        ):
+            if chosen.any():
+                grid.reach(some[chosen, :2])
+                np.add.at(grid.odds, grid.cells(some[chosen, :2]), change)
+    return grid

@@ -1,4 +1,4 @@
-"""Where a plane of a map is: an occupancy grid on the plane.
+"""Where a plane of a map is, or where the ground is free: occupancy grids.
 
 References
 ----------
@@ -29,23 +29,15 @@ Polygon = Sequence[NDArray[np.float64]]
 
 
 class PlaneGrid:
-    """Log-odds that a plane is there, in square cells along its axes.
+    """Log-odds that a plane is there, in square cells of a side, metres, along its axes.
 
-    Parameters
-    ----------
-    side : float
-        Of a cell, metres.
-
-    Attributes
-    ----------
-    odds : (V, U) float32
-        0 where nothing is known; rows along the second axis of the plane.
-    first : (2,) int
-        Numbers of the first cell along both axes.
+    `odds` (V, U) float32 are 0 where nothing is known, rows along the second axis; `first` (2,)
+    are the numbers of the first cell along both axes. From `most` cells on, they become twice as
+    large.
     """
 
-    def __init__(self, side: float) -> None:
-        self.side = side
+    def __init__(self, side: float, most: float = _CELLS) -> None:
+        self.side, self._most = side, most
         self.odds = np.zeros((0, 0), np.float32)
         self.first = np.zeros(2, np.intp)
 
@@ -71,40 +63,38 @@ class PlaneGrid:
 
     def distance(self, point: NDArray[np.float64]) -> float:
         """From a point (2,) to the next cell where the plane is, metres; 0 inside."""
-        u, v = np.floor(point / self.side).astype(np.intp) - self.first
+        (v,), (u,) = self.cells(point[None])
         height, width = self.odds.shape
         if 0 <= u < width and 0 <= v < height and self.odds[v, u] > 0:
             return 0.0
-        away = self.centres() - point
-        return float(np.sqrt((away**2).sum(axis=1).min(initial=np.inf)))
+        return float(np.hypot(*(self.centres() - point).T).min(initial=np.inf))
 
-    def see(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
-        """Take in the parts of the plane that a frame has found; their cells (V, U)."""
-        corners = np.concatenate([ring for part in parts for ring in part])
-        self._reach(corners)
+    def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (K,) and columns (K,) of the cells that points (K, 2) are in."""
+        u, v = (np.floor(points / self.side).astype(np.intp) - self.first).T
+        return v, u
+
+    def fill(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
+        """Cells (V, U) all of whose corners are in a polygon; of slivers, one in their middle."""
+        self.reach(np.concatenate([ring for part in parts for ring in part]))
         height, width = self.odds.shape
-        # Samples at the corners of cells; a cell is seen where all four of its corners are.
         lattice = np.zeros((height + 1, width + 1), np.uint8)
         for part in parts:
             rings = [np.rint((r / self.side - self.first) * 2**_BITS).astype(int) for r in part]
             cv2.fillPoly(lattice, [ring.astype(np.int32) for ring in rings], 1, shift=_BITS)
         inside = cv2.erode(lattice, np.ones((2, 2), np.uint8), anchor=(0, 0))[:-1, :-1] > 0
         if not inside.any():
-            # A sliver between the corners of cells.
-            u, v = np.floor(corners.mean(axis=0) / self.side).astype(np.intp) - self.first
-            inside[v, u] = True
-        self._add(inside, HIT)
+            inside[self.cells(np.mean(parts[0][0], axis=0, keepdims=True))] = True
         return inside
 
-    def miss(self, cells: NDArray[np.bool_]) -> None:
-        """Take in cells (V, U) that were looked at without finding the plane."""
-        self._add(cells, MISS)
+    def add(self, cells: NDArray[np.bool_], change: float) -> None:
+        """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
+        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
 
     def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
-        self._reach(centres)
-        u, v = (np.floor(centres / self.side).astype(np.intp) - self.first).T
-        np.maximum.at(self.odds, (v, u), odds)
+        self.reach(centres)
+        np.maximum.at(self.odds, self.cells(centres), odds)
 
     def polygons(self) -> list[Polygon]:
         """Outlines of the parts, largest first, counter-clockwise, holes clockwise."""
@@ -126,11 +116,8 @@ class PlaneGrid:
             if parents[k] < 0
         ]
 
-    def _add(self, cells: NDArray[np.bool_], change: float) -> None:
-        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
-
-    def _reach(self, points: NDArray[np.float64]) -> None:
-        """Have cells for points (N, 2)."""
+    def reach(self, points: NDArray[np.float64]) -> None:
+        """Have cells for points (N, 2), one at least."""
         least, most = points.min(axis=0), points.max(axis=0)
         low, high = (np.floor(end / self.side).astype(np.intp) for end in (least, most))
         last = self.first + self.odds.shape[::-1]
@@ -139,9 +126,9 @@ class PlaneGrid:
         before, after = np.maximum(self.first - low, 0), np.maximum(high + 1 - last, 0)
         if not (before.any() or after.any()):
             return
-        if np.prod(last + after - self.first + before) > _CELLS:
+        if np.prod(last + after - self.first + before) > self._most:
             self._coarsen()
-            return self._reach(points)
+            return self.reach(points)
         self.odds = np.pad(self.odds, list(zip(before[::-1], after[::-1], strict=True)))
         self.first = self.first - before
 

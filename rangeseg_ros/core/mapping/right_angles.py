@@ -13,23 +13,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.adjustment import moved_onto
-from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.significance import chi2_quantile
 
 
 class Squared(NamedTuple):
     """A plane and what was made exact of it.
 
-    Attributes
-    ----------
-    plane : MapPlane
-    group : int
-        Number of the walls that it is parallel or at right angles to, 1...; 0 for none.
-    exact : str
-        'level', 'plumb', 'square' (plumb, and of a group), or ''.
-    turned : float
-        Angle by which it was turned, radians.
+    `exact` is 'level', 'plumb', 'square' (plumb, and of the walls of a `group`, 1..., that are
+    parallel or at right angles), or ''; `turned` is the angle it was turned by, radians.
     """
 
     plane: MapPlane
@@ -43,19 +35,9 @@ def square_up(
 ) -> list[Squared]:
     """Make planes level or plumb, and walls parallel or at right angles to each other.
 
-    Parameters
-    ----------
-    planes : sequence of MapPlane
-        P of them, in a frame whose z is up.
-    covariance : (4 P, 4 P) float64
-        Of the normals and distances of all of them.
-    tolerance : float
-        Largest angle to the horizontal or vertical of a plane that may be meant so, radians.
-
-    Returns
-    -------
-    list of Squared
-        In the order of the planes. Outlines are moved onto their planes.
+    The P planes are in a frame whose z is up, with the covariance (4 P, 4 P) of the normals and
+    distances of all of them; they stay in order, their outlines moved onto them. Planes within
+    `tolerance`, radians, of the horizontal or vertical may be meant so.
     """
     known = _Conditions(planes, covariance)
     exact, group = [''] * len(planes), [0] * len(planes)
