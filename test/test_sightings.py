@@ -5,14 +5,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.mapping.plane_grid import HIT, PlaneGrid
-from rangeseg_ros.core.mapping.plane_set import PlaneSet
-from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.mapping.visibility import (
+from rangeseg_ros.core.mapping.observations import PlaneSet
+from rangeseg_ros.core.mapping.plane_grid import (
+    HIT,
+    PlaneGrid,
     labels_of_cells,
     may_be_in_sight,
     passed_through,
 )
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel

@@ -14,9 +14,14 @@ from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, Up, estimate_up, make_plan
+from rangeseg_ros.core.mapping.floor_plan import (
+    FloorPlan,
+    Up,
+    estimate_up,
+    make_plan,
+    points_within,
+)
 from rangeseg_ros.core.mapping.observations import PoseNoise
-from rangeseg_ros.core.mapping.occupancy import points_within
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel

@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED
+from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing

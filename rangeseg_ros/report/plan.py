@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, Grid
+from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, Grid, deviation_of
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing

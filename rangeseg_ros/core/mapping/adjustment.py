@@ -10,7 +10,7 @@ x_p the error of the plane, s_f that of the pose (a turn about the camera and a 
 of the sensor. The part of v that lasts (`observations`) is the same in the n frames of a run in
 which the plane is seen by the same pixels: it counts n times, so that the mean of the run has it
 once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f;
-those before a jump (`pose_jumps`) moreover by what the jump was taken for wrongly.
+those before a jump (`plane_filter`) moreover by what the jump was taken for wrongly.
 The errors of an odometry add up: e_f - e_(f-1) is its noise, and it has no other drift. A drift
 that is not significant is none.
 """
@@ -31,12 +31,12 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
     Observations,
+    PlaneSet,
     PoseNoise,
     observations,
 )
+from rangeseg_ros.core.mapping.plane_filter import Jump
 from rangeseg_ros.core.mapping.plane_map import Sighting
-from rangeseg_ros.core.mapping.plane_set import PlaneSet
-from rangeseg_ros.core.mapping.pose_jumps import Jump
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import cross_matrix
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
@@ -94,7 +94,7 @@ class Adjustment:
     """
 
     def __init__(self, noise: PoseNoise, odometry: bool = False) -> None:
-        self._noise = np.repeat(np.maximum([noise.turn, noise.shift], _LEAST), 3)
+        self._noise = np.maximum(noise.deviations, _LEAST)
         self._odometry = odometry
         self._poses: list[Transform] = []
         self._seen: list[Observations] = []

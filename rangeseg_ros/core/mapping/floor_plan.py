@@ -12,15 +12,77 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_planes
-from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, UNKNOWN, Grid, occupancy
-from rangeseg_ros.core.mapping.plane_grid import LEAST, PlaneGrid
+from rangeseg_ros.core.mapping.plane_grid import HIT, LEAST, MISS, PlaneGrid
 from rangeseg_ros.core.mapping.right_angles import Squared, square_up
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import turn_between
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 _ROUNDS = 5  # until the direction of up settles
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Values of cells, as in nav_msgs/OccupancyGrid."""
+
+# So many rows or columns of an image count, whichever are fewer.
+_SAMPLES = 120
+
+
+class Grid(NamedTuple):
+    """Cells (H, W) on the ground, `FREE`, `OCCUPIED` or `UNKNOWN`, row 0 at the least y.
+
+    `origin` is the outer corner (x, y) of the first cell, metres, `resolution` their side.
+    """
+
+    cells: NDArray[np.int8]
+    origin: tuple[float, float]
+    resolution: float
+
+    def at(self, points: NDArray[np.float64]) -> NDArray[np.int8]:
+        """Values (N,) at points (N, 2)."""
+        column, row = np.floor((points - self.origin) / self.resolution).astype(np.intp).T
+        height, width = self.cells.shape
+        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
+        values = np.full(len(points), UNKNOWN, np.int8)
+        values[inside] = self.cells[row[inside], column[inside]]
+        return values
+
+
+def points_within(image: RangeImage, sensor: SensorModel, error: float) -> NDArray[np.float64]:
+    """Some points (N, 3) of an image that err by less than `error` along the ray, metres."""
+    step = max(min(image.shape) // _SAMPLES, 1)
+    sample = np.s_[::step, ::step]
+    inverse = image.inverse[sample].astype(np.float64)
+    squared = np.where(inverse > 0, inverse, 1) ** 2
+    variance = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+    sure = (inverse > 0) & (variance < (error * squared) ** 2)
+    return image.points[sample][sure].astype(np.float64)
+
+
+def occupancy(
+    points: Iterable[NDArray[np.float64]],
+    ground: float,
+    band: tuple[float, float],
+    resolution: float,
+) -> PlaneGrid:
+    """Log-odds that something stands in the way in cells of the ground.
+
+    Points (N, 3) of each frame are with z up, as the heights of the ground and of the band above
+    it in which things are in the way, metres. What is as far below the ground as the band begins
+    above it is no ground.
+    """
+    grid = PlaneGrid(resolution, np.inf)
+    for some in points:
+        above = some[:, 2] - ground
+        for chosen, change in (
+            ((above >= band[0]) & (above < band[1]), HIT),
+            (np.abs(above) < band[0], MISS),
+        ):
+            if chosen.any():
+                grid.reach(some[chosen, :2])
+                np.add.at(grid.odds, grid.cells(some[chosen, :2]), change)
+    return grid
 
 
 class Up(NamedTuple):
@@ -86,8 +148,8 @@ def estimate_up(planes: Sequence[MapPlane], looked: NDArray[np.float64], toleran
 
     Of the directions of planes near to what was up in the images, that with the largest area of
     planes at right angles to it or along it; refined by their least squares. `looked` (3,) is the
-    mean of up in the images, in the fixed frame, `tolerance`, radians, the largest angle of a level
-    or upright plane to it.
+    mean of up in the images, in the fixed frame, `tolerance`, radians, the largest angle of level
+    or upright planes to it.
     """
     looked = looked / np.linalg.norm(looked)
     normals = np.array([plane.normal for plane in planes]).reshape(-1, 3)
@@ -231,7 +293,7 @@ def _openings(wall: Wall, grid: Grid) -> list[Opening]:
     found = []
     for ends in wall.segments.reshape(-1, 2)[1:-1].reshape(-1, 2, 2):
         width = float(np.linalg.norm(ends[1] - ends[0]))
-        across = np.linspace(*ends, max(int(width / grid.resolution), 3))[1:-1]
+        across = np.linspace(ends[0], ends[1], max(int(width / grid.resolution), 3))[1:-1]
         # Narrower than two cells, the grid does not tell.
         if width >= 2 * grid.resolution and (grid.at(across) == FREE).mean() > 0.5:
             found.append(Opening(wall.plane, ends))

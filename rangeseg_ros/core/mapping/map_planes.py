@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
+from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
-from rangeseg_ros.core.mapping.plane_set import PlaneSet
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import quaternions, rotation_matrix, turn_between
 from rangeseg_ros.core.tracking.plane_errors import moved_plane

@@ -35,11 +35,11 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
     Observations,
+    PlaneSet,
     PoseNoise,
     continuity,
     observations,
 )
-from rangeseg_ros.core.mapping.plane_set import PlaneSet
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import cross_matrix, rotation_by
 from rangeseg_ros.core.tracking.plane_errors import GATE, congruent, mahalanobis
@@ -96,10 +96,7 @@ class Motion(NamedTuple):
 class PlaneOdometry:
     """Follows a camera by the planes it sees.
 
-    Parameters
-    ----------
-    config : Config, optional
-        `odometry_frame`, `camera_turn` and `camera_speed`.
+    Of the parameters, `odometry_frame`, `camera_turn` and `camera_speed` count.
 
     Examples
     --------
@@ -130,20 +127,11 @@ class PlaneOdometry:
         up: ArrayLike,
         axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ) -> Motion:
-        """Take in the next frame.
+        """Take in the planes of the next frame, tracked, with their `views`.
 
-        Parameters
-        ----------
-        planes : sequence of Plane
-            In the frame of the image, tracked.
-        view : (M, C) float64
-            See `views`.
-        stamp : int
-            Nanoseconds; when it does not tell, as much as is common has passed.
-        up : (3,) float
-            In the frame of the image; counts for the first one.
-        axes : (3, 3) float
-            What is right, down and forward in the image; the identity in an optical frame.
+        When stamps, nanoseconds, do not tell, as much time as is common has passed. Of the first
+        frame, `up` (3,) counts, and the `axes` (3, 3) that are right, down and forward in the
+        image, both in the frame of the image as the planes are.
         """
         pose = self._pose or Transform(_level(np.array(up, float), np.array(axes)), np.zeros(3))
         if self._pose:

@@ -13,11 +13,16 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.roles import corners_of
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
 from rangeseg_ros.core.mapping.observations import Observations, PoseNoise, observations, views
-from rangeseg_ros.core.mapping.plane_filter import PlaneFilters
-from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, PlaneGrid
-from rangeseg_ros.core.mapping.pose_jumps import Jump, find_jump
+from rangeseg_ros.core.mapping.plane_filter import Jump, PlaneFilters, find_jump
+from rangeseg_ros.core.mapping.plane_grid import (
+    HIT,
+    MISS,
+    PlaneGrid,
+    labels_of_cells,
+    may_be_in_sight,
+    passed_through,
+)
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.mapping.visibility import labels_of_cells, may_be_in_sight, passed_through
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.tracker import NOMINAL
@@ -157,7 +162,7 @@ class PlaneMap:
         ids = np.array([self._records[k].id for k in match[chosen].tolist()], np.int64)
         begins = np.append(begins, np.ones(len(new), np.bool_))
         self.sighting = Sighting(pose, [planes[m] for m in chosen], ids, begins, jump)
-        self._find(labels, planes, match, image, pose)
+        self._find(labels, planes, match, image, pose, noise)
         self._merge(np.unique(match), camera)
         self._forget()
 
@@ -178,7 +183,7 @@ class PlaneMap:
         jump = find_jump(same, seen.where(both), camera, noise)
         if jump:
             self.jumps.append((self._stamp, jump))
-            self._filters = jump.of(self._filters)
+            self._filters = self._filters.moved(jump.motion, jump.camera, jump.covariance)
         return jump
 
     def _associate(
@@ -206,6 +211,7 @@ class PlaneMap:
         match: NDArray[np.intp],
         image: RangeImage,
         pose: Transform,
+        noise: PoseNoise,
     ) -> None:
         """Take in the cells of planes of the map that a frame finds, and those it sees through."""
         camera, known = image.camera, self._filters.planes
@@ -224,26 +230,27 @@ class PlaneMap:
             return
         circles = [record.grid.circle() for record in self._records]
         middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
-        known = known.moved(pose.inverse())
-        shown = np.flatnonzero(may_be_in_sight(known.points(middles), reaches, camera)).tolist()
+        error = np.diag(noise.deviations**2)
+        seen = self._filters.moved(pose.inverse(), np.zeros(3), error)
+        near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
+        shown = np.flatnonzero(near).tolist()
         others, centres, points = [], [np.zeros((0, 2))], [np.zeros((0, 3))]
         for k in shown:
-            grid, plane = self._records[k].grid, known.where([k])
-            found = of_label[labels_of_cells(grid, plane, labels, camera)] == k
+            grid, plane_seen = self._records[k].grid, seen.planes.where([k])
+            found = of_label[labels_of_cells(grid, plane_seen, labels, camera)] == k
             grid.add(found, HIT)
             others.append((grid.odds > 0) & ~found)
             centres.append(grid.centres(others[-1]))
-            points.append(plane.points(centres[-1]))
+            points.append(plane_seen.points(centres[-1]))
         owner = np.repeat(shown, [len(own) for own in centres[1:]]).astype(np.intp)
-        at, there = np.concatenate(centres), np.concatenate(points)
-
-        def variance(some: NDArray[np.intp]) -> NDArray[np.float64]:
-            own = self._filters.variances(owner[some], at[some])
-            turn = np.radians(self.config.pose_turn_noise) ** 2 * (there[some] ** 2).sum(axis=1)
-            return own + self.config.pose_noise**2 + turn
-
-        sensor = SensorModel.from_config(self.config)
-        passed = passed_through(there, known.distance[owner], variance, image, sensor)
+        at, sensor = np.concatenate(centres), SensorModel.from_config(self.config)
+        passed = passed_through(
+            np.concatenate(points),
+            seen.planes.distance[owner],
+            lambda some: seen.variances(owner[some], at[some]),
+            image,
+            sensor,
+        )
         for k, cells in zip(shown, others, strict=True):
             cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
             self._records[k].grid.add(cells, MISS)

@@ -125,25 +125,12 @@ class TransformBuffer:
         shift: ArrayLike,
         static: bool = False,
     ) -> None:
-        """Take in where a frame is in its parent; names may have a leading slash.
+        """Take in where a frame is in its parent at a stamp, nanoseconds.
 
-        Parameters
-        ----------
-        parent, child : str
-        stamp : int
-            Nanoseconds.
-        rotation : (4,) float
-            Quaternion x, y, z, w that turns the child's coordinates to the parent's.
-        shift : (3,) float
-            The child's origin in the parent, metres.
-        static : bool
-            Holds at any time, and replaces what was known of the child.
-
-        Raises
-        ------
-        TransformError
-            No name, a frame in itself, values that are not finite, or a quaternion far from
-            unit length.
+        The quaternion x, y, z, w turns the child's coordinates to the parent's, the shift is of
+        the child's origin in the parent, metres. What is static holds at any time, and replaces
+        what was known of the child. Names may have a leading slash. TransformError for no name, a
+        frame in itself, values that are not finite, or a quaternion far from unit length.
         """
         parent, child = parent.removeprefix('/'), child.removeprefix('/')
         name = f'transform from {parent!r} to {child!r}'
@@ -175,20 +162,11 @@ class TransformBuffer:
         self._moving.clear()
 
     def lookup(self, target: str, source: str, stamp: int) -> Transform:
-        """The motion that takes coordinates in `source` to those in `target`.
+        """The motion that takes coordinates in the frame `source` to those in `target`.
 
-        Parameters
-        ----------
-        target, source : str
-            Names of frames.
-        stamp : int
-            Nanoseconds; 0 for the last time at which all of the chain is known, as in tf2.
-
-        Raises
-        ------
-        TransformError
-            A frame that is not known, frames that are not connected, a loop, or a time outside
-            what is known.
+        `stamp` is in nanoseconds, 0 for the last time at which all of the chain is known, as in
+        tf2. TransformError for a frame that is not known, frames that are not connected, a loop,
+        or a time outside what is known.
         """
         target, source = target.removeprefix('/'), source.removeprefix('/')
         for frame in (target, source):
