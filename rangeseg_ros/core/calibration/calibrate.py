@@ -47,28 +47,6 @@ class CalibrationError(ValueError):
     """A recording from which the distortion cannot be learned."""
 
 
-class Fold(NamedTuple):
-    """One block of frames left out.
-
-    Attributes
-    ----------
-    frames : (first, last) int
-        The block.
-    field : (K, G) float64
-        Of the other frames, 1/m.
-    before, after : float
-        Root mean square residual of the cells of the block, without and with the field, 1/m.
-    weight : float
-        Sum of the weights of these cells.
-    """
-
-    frames: tuple[int, int]
-    field: NDArray[np.float64]
-    before: float
-    after: float
-    weight: float
-
-
 class Calibration(NamedTuple):
     """What was learned.
 
@@ -77,47 +55,23 @@ class Calibration(NamedTuple):
     distortion : DistortionMap
     views : (rows, columns) int
         Different distances at which each cell was seen.
-    folds : list of Fold
-        The blocks left out.
+    before, after : float
+        Root mean square residual of the cells of planes, 1/m, and that on frames left out, with
+        the map of the others.
     """
 
     distortion: DistortionMap
     views: NDArray[np.intp]
-    folds: list[Fold]
-
-    @property
-    def before(self) -> float:
-        """Root mean square residual of the cells of planes, 1/m."""
-        return self._rms([fold.before for fold in self.folds])
-
-    @property
-    def after(self) -> float:
-        """The same on frames left out, with the map of the others, 1/m."""
-        return self._rms([fold.after for fold in self.folds])
-
-    def _rms(self, values: list[float]) -> float:
-        weight = [fold.weight for fold in self.folds]
-        return float(np.sqrt(np.average(np.square(values), weights=weight)))
+    before: float
+    after: float
 
 
 def calibrate(
     seen: Sightings, shape: tuple[int, int], camera: Camera | None = None
 ) -> Calibration:
-    """Learn the distortion of a sensor.
+    """Learn the distortion of a sensor from sightings in images of a shape, in the order of time.
 
-    Parameters
-    ----------
-    seen : Sightings
-        Of all frames, in the order of time.
-    shape : (int, int)
-        Of the images.
-    camera : Camera, optional
-        Whose images they are.
-
-    Raises
-    ------
-    CalibrationError
-        The recording does not hold the distortion; the message says what to record.
+    CalibrationError where the recording does not hold it; the message says what to record.
     """
     views = _views(seen, shape)
     _check(seen, views)
@@ -129,14 +83,14 @@ def calibrate(
     basis = np.stack([np.ones(len(change)), change / spread])
     blocks = _blocks(seen, grid)
 
-    def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
+    def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[_Fold]]:
         folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
-        return min(zip(tried, folds, strict=True), key=lambda pair: sum(map(_left, pair[1])))
+        return min(zip(tried, folds, strict=True), key=lambda pair: sum(f.after for f in pair[1]))
 
     smoothness, folds = best(_SMOOTHNESS)
     sloped = best([(*smoothness, slope) for slope in _SLOPES])
     # The simpler model, unless the other is better by more than the standard error of that.
-    gain = np.array([_left(one) - _left(two) for one, two in zip(folds, sloped[1], strict=True)])
+    gain = np.array([one.after - two.after for one, two in zip(folds, sloped[1], strict=True)])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
     weight = _settled_weights(seen, grid)
@@ -148,20 +102,23 @@ def calibrate(
     known, flat = views > 0, field[0].reshape(grid)
     each = [fold.field[0].reshape(grid) for fold in folds]
     deviation = _deviation(each, rough[0].reshape(grid) - flat, known)
-    pixels = _in_pixels(known, shape)
+    size = cell_size(shape)
+    pixels = np.kron(known, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
     slope = None
     if len(field) > 1:
-        slope = np.where(pixels, _smooth_in_pixels(field[1].reshape(grid) / spread, shape), 0)
+        slope = pixels * _smooth_in_pixels(field[1].reshape(grid) / spread, shape)
         # One slope everywhere scales all planes, and leaves them planes.
         slope = (slope - pixels * slope[pixels].mean()).astype(np.float32)
     distortion = DistortionMap(
         without_plane(_smooth_in_pixels(flat, shape), pixels).astype(np.float32),
-        np.where(pixels, _smooth_in_pixels(deviation, shape), 0).astype(np.float32),
+        (pixels * _smooth_in_pixels(deviation, shape)).astype(np.float32),
         slope,
         camera,
         0.0 if slope is None else reference,
     )
-    return Calibration(distortion, views, folds)
+    total = sum(fold.weight for fold in folds)
+    before, after = (sum(part) for part in zip(*(fold[1:3] for fold in folds), strict=True))
+    return Calibration(distortion, views, (before / total) ** 0.5, (after / total) ** 0.5)
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -173,24 +130,22 @@ def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
 
 
 def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
-    frames = len(np.unique(seen.frame))
+    frames, covered = len(np.unique(seen.frame)), float((views > 0).mean())
+    why = ''
     if frames < _FEWEST_FRAMES:
-        raise CalibrationError(
+        why = (
             f'too few planes: {frames} of {seen.frames} frames show one that is large enough, '
-            f'{_FEWEST_FRAMES} are needed; {ADVICE}'
+            f'{_FEWEST_FRAMES} are needed'
         )
-    covered = float((views > 0).mean())
-    if covered < 0.5:
-        raise CalibrationError(
-            f'too few positions: planes cover {covered:.0%} of the image, '
-            f'half of it is needed; {ADVICE}'
-        )
-    typical = int(np.median(views[views > 0]))
-    if typical < _FEWEST_VIEWS:
-        raise CalibrationError(
+    elif covered < 0.5:
+        why = f'too few positions: planes cover {covered:.0%} of the image, half of it is needed'
+    elif (typical := int(np.median(views[views > 0]))) < _FEWEST_VIEWS:
+        why = (
             f'too few ranges: most parts of the image see planes at no more than {typical} of the '
-            f'{_FEWEST_VIEWS} distances that tell the sensor from the shape of things; {ADVICE}'
+            f'{_FEWEST_VIEWS} distances that tell the sensor from the shape of things'
         )
+    if why:
+        raise CalibrationError(f'{why}; {ADVICE}')
 
 
 def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float64]:
@@ -201,16 +156,27 @@ def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float
 
 
 _Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
-"""Which planes (P,) are of a block of frames, and weights of the cells of all others."""
 
 
 def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
-    """The blocks that are left out, and weights of the others that know nothing of them."""
+    """Which planes (P,) are of each block of frames, and weights of the cells of all others."""
     found = []
     for block in np.array_split(np.unique(seen.frame), BLOCKS):
         inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
         found.append((inside, _settled_weights(seen.of_planes(~inside), grid)))
     return found
+
+
+class _Fold(NamedTuple):
+    """The field (K, G) of the frames outside of a block, and how it fits the cells of the block.
+
+    Sums of their squared residuals without and with the field, and of their weights.
+    """
+
+    field: NDArray[np.float64]
+    before: float
+    after: float
+    weight: float
 
 
 def _folds(
@@ -219,25 +185,18 @@ def _folds(
     blocks: Sequence[_Block],
     grid: tuple[int, int],
     smoothness: Sequence[float],
-) -> list[Fold]:
-    """Each block of frames, and what the field of the others leaves of it."""
+) -> list[_Fold]:
+    """The blocks of frames, each left out."""
     found = []
     for inside, weight in blocks:
         out = ~inside[seen.plane()]
-        train, test = seen.of_planes(~inside), seen.of_planes(inside)
-        field = solve(train, basis[:, out], weight, grid, smoothness)
+        test = seen.of_planes(inside)
+        field = solve(seen.of_planes(~inside), basis[:, out], weight, grid, smoothness)
         before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
-        share = residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
-        total = float(counts.sum())
-        rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
-        ends = int(test.frame.min()), int(test.frame.max())
-        found.append(Fold(ends, field, rms[0], rms[1], total))
+        after = before - residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
+        squares = float(counts @ before**2), float(counts @ after**2)
+        found.append(_Fold(field, *squares, float(counts.sum())))
     return found
-
-
-def _left(fold: Fold) -> float:
-    """Sum of the squares of what the field leaves of the residuals of a block."""
-    return fold.weight * fold.after**2
 
 
 def _deviation(
@@ -260,11 +219,6 @@ def without_plane(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArr
     result = np.zeros_like(field)
     result[v, u] = field[v, u] - terms @ plane
     return result
-
-
-def _in_pixels(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    size = cell_size(shape)
-    return np.kron(cells, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
 
 
 def _smooth_in_pixels(cells: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
