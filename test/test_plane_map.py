@@ -71,10 +71,8 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
             told = Transform(off @ pose.rotation, pose.shift + random.normal(0, NOISE.shift, 3))
             view = np.eye(15)[[k if pattern == 'changes' else 0]]
             seen = observations([plane], view, told, NOISE)
-            if filters is None:
-                filters = PlaneFilters.of(seen)
-            else:
-                filters.update(np.array([0]), seen)
+            filters = filters or PlaneFilters.of(seen)
+            filters.update(np.array([0]), seen)
         error = filters.planes.equations[0] - truth
         covariance = filters.planes.covariances(filters.covariance)[0]
         values.append(error @ np.linalg.pinv(covariance, 1e-10) @ error / 3)

@@ -152,7 +152,7 @@ class PlanTask:
             len(plan.planes),
             len(plan.walls),
             len(plan.openings),
-            sum(squared.exact == 'square' for squared in plan.planes),
+            sum(plane.exact == 'square' for plane in plan.planes),
             plan.up.source,
             warnings,
         )

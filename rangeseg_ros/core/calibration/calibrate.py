@@ -47,21 +47,36 @@ class CalibrationError(ValueError):
     """A recording from which the distortion cannot be learned."""
 
 
+class Fold(NamedTuple):
+    """One block of frames, first and last, left out, and the field (K, G) of the others, 1/m.
+
+    Root mean square residual of the cells of the block, without and with the field, 1/m, and the
+    sum of the weights of these cells.
+    """
+
+    frames: tuple[int, int]
+    field: NDArray[np.float64]
+    before: float
+    after: float
+    weight: float
+
+    @property
+    def left(self) -> float:
+        """Sum of the squares of what the field leaves of the residuals."""
+        return self.weight * self.after**2
+
+
 class Calibration(NamedTuple):
     """What was learned.
 
-    Attributes
-    ----------
-    distortion : DistortionMap
-    views : (rows, columns) int
-        Different distances at which each cell was seen.
-    before, after : float
-        Root mean square residual of the cells of planes, 1/m, and that on frames left out, with
-        the map of the others.
+    `views` (rows, columns) are the different distances at which each cell was seen; `before` is
+    the root mean square residual of the cells of planes, 1/m, `after` that on frames left out,
+    with the map of the others.
     """
 
     distortion: DistortionMap
     views: NDArray[np.intp]
+    folds: list[Fold]
     before: float
     after: float
 
@@ -83,14 +98,14 @@ def calibrate(
     basis = np.stack([np.ones(len(change)), change / spread])
     blocks = _blocks(seen, grid)
 
-    def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[_Fold]]:
+    def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
         folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
-        return min(zip(tried, folds, strict=True), key=lambda pair: sum(f.after for f in pair[1]))
+        return min(zip(tried, folds, strict=True), key=lambda pair: sum(f.left for f in pair[1]))
 
     smoothness, folds = best(_SMOOTHNESS)
     sloped = best([(*smoothness, slope) for slope in _SLOPES])
     # The simpler model, unless the other is better by more than the standard error of that.
-    gain = np.array([one.after - two.after for one, two in zip(folds, sloped[1], strict=True)])
+    gain = np.array([one.left - two.left for one, two in zip(folds, sloped[1], strict=True)])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
     weight = _settled_weights(seen, grid)
@@ -106,9 +121,9 @@ def calibrate(
     pixels = np.kron(known, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
     slope = None
     if len(field) > 1:
-        slope = pixels * _smooth_in_pixels(field[1].reshape(grid) / spread, shape)
+        sloping = pixels * _smooth_in_pixels(field[1].reshape(grid) / spread, shape)
         # One slope everywhere scales all planes, and leaves them planes.
-        slope = (slope - pixels * slope[pixels].mean()).astype(np.float32)
+        slope = (sloping - pixels * sloping[pixels].mean()).astype(np.float32)
     distortion = DistortionMap(
         without_plane(_smooth_in_pixels(flat, shape), pixels).astype(np.float32),
         (pixels * _smooth_in_pixels(deviation, shape)).astype(np.float32),
@@ -116,9 +131,9 @@ def calibrate(
         camera,
         0.0 if slope is None else reference,
     )
-    total = sum(fold.weight for fold in folds)
-    before, after = (sum(part) for part in zip(*(fold[1:3] for fold in folds), strict=True))
-    return Calibration(distortion, views, (before / total) ** 0.5, (after / total) ** 0.5)
+    squares = np.square([(fold.before, fold.after) for fold in folds])
+    mean = np.sqrt(np.average(squares, axis=0, weights=[fold.weight for fold in folds]))
+    return Calibration(distortion, views, folds, float(mean[0]), float(mean[1]))
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -167,25 +182,13 @@ def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
     return found
 
 
-class _Fold(NamedTuple):
-    """The field (K, G) of the frames outside of a block, and how it fits the cells of the block.
-
-    Sums of their squared residuals without and with the field, and of their weights.
-    """
-
-    field: NDArray[np.float64]
-    before: float
-    after: float
-    weight: float
-
-
 def _folds(
     seen: Sightings,
     basis: NDArray[np.float64],
     blocks: Sequence[_Block],
     grid: tuple[int, int],
     smoothness: Sequence[float],
-) -> list[_Fold]:
+) -> list[Fold]:
     """The blocks of frames, each left out."""
     found = []
     for inside, weight in blocks:
@@ -194,8 +197,10 @@ def _folds(
         field = solve(seen.of_planes(~inside), basis[:, out], weight, grid, smoothness)
         before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
         after = before - residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
-        squares = float(counts @ before**2), float(counts @ after**2)
-        found.append(_Fold(field, *squares, float(counts.sum())))
+        total, parts = float(counts.sum()), (before, after)
+        rms = [float(np.sqrt(counts @ part**2 / total)) for part in parts]
+        ends = int(test.frame.min()), int(test.frame.max())
+        found.append(Fold(ends, field, rms[0], rms[1], total))
     return found
 
 

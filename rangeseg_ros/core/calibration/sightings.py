@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -108,5 +108,5 @@ def concatenate(frames: Sequence[Sightings]) -> Sightings:
     first = np.cumsum([0, *count])
     cells = np.cumsum(np.concatenate([[0], *map(np.diff, start)]))
     frame = np.concatenate(frame) + np.repeat(first[:-1], [len(part) for part in frame])
-    parts = map(np.concatenate, (cell, inverse, ray))
-    return Sightings(frame, cells.astype(np.intp), *parts, int(first[-1]))
+    parts: list[NDArray[Any]] = [np.concatenate(part) for part in (cell, inverse, ray)]
+    return Sightings(frame, cells.astype(np.intp), parts[0], parts[1], parts[2], int(first[-1]))

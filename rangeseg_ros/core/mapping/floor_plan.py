@@ -211,22 +211,20 @@ def make_plan(
     turned = np.kron(np.eye(len(solution.planes)), moved_plane(*motion))
     covariance = turned @ solution.covariance @ turned.T
     squared = square_up(moved_planes(solution.planes, motion), covariance, tolerance)
-    roles, ground = _roles([s.plane for s in squared], config)
-    squared = [
-        s._replace(plane=s.plane.named(role=r)) for s, r in zip(squared, roles, strict=True)
-    ]
+    roles, ground = _roles(squared, config)
+    squared = [plane.named(role=role) for plane, role in zip(squared, roles, strict=True)]
     # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
     upright = (some @ motion.rotation.T + motion.shift for some in points)
     odds = occupancy(upright, ground, band, resolution)
     reach = ground + band[0], ground + headroom
     found = (
-        _wall(k, s.plane, reach, resolution)
-        for k, s in enumerate(squared)
-        if abs(s.plane.normal[2]) < np.sin(tolerance)
+        _wall(k, plane, reach, resolution)
+        for k, plane in enumerate(squared)
+        if abs(plane.normal[2]) < np.sin(tolerance)
     )
     walls = [wall for wall in found if wall is not None]
-    grid = _drawn(odds, [s.plane for s in squared if s.plane.role == 'floor'], walls)
+    grid = _drawn(odds, [plane for plane in squared if plane.role == 'floor'], walls)
     openings = [o for wall in walls for o in _openings(wall, grid)]
     return FloorPlan(frame, motion, up, ground, squared, walls, openings, grid)
 
@@ -254,7 +252,7 @@ def _roles(planes: Sequence[MapPlane], config: Config) -> tuple[list[str], float
     height = np.array([plane.centroid[2] for plane in planes])
     large = np.array([plane.area >= config.role_area for plane in planes], np.bool_)
     facing_up, facing_down = tilt > np.cos(tolerance), tilt < -np.cos(tolerance)
-    lowest = [ring[:, 2].min() for p in planes for part in p.outline.parts for ring in part]
+    lowest = [ring[:, 2].min() for plane in planes for ring in plane.outline.rings]
     ground = float(min(height[facing_up & large].tolist() or lowest or [0.0]))
     top = height[facing_down & large].max(initial=-np.inf)
     found = np.full(len(planes), 'other', dtype='<U7')

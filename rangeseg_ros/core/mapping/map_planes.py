@@ -45,6 +45,11 @@ class MapOutline:
         """Borders (N, 3) of the holes in the largest part."""
         return self.parts[0][1:] if self.parts else []
 
+    @property
+    def rings(self) -> list[NDArray[np.float64]]:
+        """All borders (N, 3)."""
+        return [ring for part in self.parts for ring in part]
+
     def moved(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> MapOutline:
         """The outline with its corners (N, 3) moved."""
         return MapOutline([[motion(ring) for ring in part] for part in self.parts])
@@ -114,12 +119,9 @@ class Record:
         self.id = min(self.id, other.id)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
         self.seen = max(self.seen, other.seen)
-        self.observations += other.observations
-        self.pixels += other.pixels
-        self.squares += other.squares
-        self.confidence += other.confidence
         self.probability = max(self.probability, other.probability)
-        self.roles += other.roles
+        for name in ('observations', 'pixels', 'squares', 'confidence', 'roles'):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
 def describe(record: Record, plane: PlaneSet, covariance: NDArray[np.float64]) -> MapPlane:

@@ -51,12 +51,14 @@ class PlaneFilters(NamedTuple):
 
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
-        """Planes seen for the first time."""
-        return cls(seen.planes, seen.spread, seen.view, np.ones(len(seen.view), np.intp))
+        """Planes where they are seen for the first time, of which nothing else is known yet."""
+        unknown = np.tile(1e6 * np.eye(3), (len(seen.view), 1, 1))
+        return cls(seen.planes, unknown, 0 * seen.view, np.zeros(len(seen.view), np.intp))
 
     def where(self, chosen: NDArray[Any] | list[int]) -> PlaneFilters:
         """Some of the planes."""
-        return PlaneFilters(self.planes.where(chosen), *(part[chosen] for part in self[1:]))
+        parts: list[Any] = [part[chosen] for part in self[1:]]
+        return PlaneFilters(self.planes.where(chosen), *parts)
 
     def moved(
         self, motion: Transform, place: NDArray[np.float64], error: NDArray[np.float64]
@@ -71,8 +73,8 @@ class PlaneFilters(NamedTuple):
 
     def joined(self, others: PlaneFilters) -> PlaneFilters:
         """These planes followed by others."""
-        parts: list[Any]
-        parts = [np.concatenate(pair) for pair in zip(self[1:], others[1:], strict=True)]
+        pairs = zip(self[1:], others[1:], strict=True)
+        parts: list[Any] = [np.concatenate(pair) for pair in pairs]
         return PlaneFilters(self.planes.joined(others.planes), *parts)
 
     def alike(

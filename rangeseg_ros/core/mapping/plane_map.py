@@ -145,25 +145,23 @@ class PlaneMap:
             self._filters = self._filters._replace(view=view)
         jump = self._followed(planes, seen, camera, noise)
         match = self._associate(planes, seen, camera)
-        # Of parts of one plane, the largest decides on it.
-        order = np.argsort([-plane.count for plane in planes], kind='stable')
-        known, first = np.unique(match[order], return_index=True)
-        largest = order[first[known >= 0]]
-        begins = self._filters.update(known[known >= 0], seen.where(largest))
-        new = np.flatnonzero(match < 0)
-        match[new] = len(self._records) + np.arange(len(new))
+        new = match < 0
+        match[new] = len(self._records) + np.arange(np.count_nonzero(new))
         self._filters = self._filters.joined(PlaneFilters.of(seen.where(new)))
-        for _ in new:
+        for _ in range(np.count_nonzero(new)):
             self._records.append(Record(self._next, stamp, PlaneGrid(config.map_resolution)))
             self._next += 1
         for plane, k in zip(planes, match.tolist(), strict=True):
             self._records[k].add(plane, stamp, self._time)
-        chosen = np.concatenate([largest, new]).tolist()
-        ids = np.array([self._records[k].id for k in match[chosen].tolist()], np.int64)
-        begins = np.append(begins, np.ones(len(new), np.bool_))
-        self.sighting = Sighting(pose, [planes[m] for m in chosen], ids, begins, jump)
+        # Of parts of one plane, the largest decides on it.
+        order = np.argsort([-plane.count for plane in planes], kind='stable')
+        index, first = np.unique(match[order], return_index=True)
+        largest = order[first]
+        begins = self._filters.update(index, seen.where(largest))
+        ids = np.array([self._records[k].id for k in index.tolist()], np.int64)
+        self.sighting = Sighting(pose, [planes[m] for m in largest], ids, begins, jump)
         self._find(labels, planes, match, image, pose, noise)
-        self._merge(np.unique(match), camera)
+        self._merge(index, camera)
         self._forget()
 
     def _followed(

@@ -8,7 +8,7 @@ about where it is known best, and two that become parallel share what they turn 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,14 @@ from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.significance import chi2_quantile
 
 
-class Squared(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Squared(MapPlane):
     """A plane and what was made exact of it.
 
     `exact` is 'level', 'plumb', 'square' (plumb, and of the walls of a `group`, 1..., that are
     parallel or at right angles), or ''; `turned` is the angle it was turned by, radians.
     """
 
-    plane: MapPlane
     group: int
     exact: str
     turned: float
@@ -65,10 +65,11 @@ def square_up(
             normal = _exact(exact[k], equations[k], equations[seeds.get(k, k)])
             equations[k, 3] += (equations[k, :3] - normal) @ plane.centroid
             equations[k, :3] = normal
-    moved = moved_onto(planes, equations, known.covariance)
-    cosines = [a.normal @ b.normal for a, b in zip(planes, moved, strict=True)]
-    turned = np.arccos(np.clip(cosines, -1, 1)).tolist()
-    return list(map(Squared, moved, group, exact, turned))
+    found = []
+    for k, moved in enumerate(moved_onto(planes, equations, known.covariance)):
+        turned = float(np.arccos(np.clip(planes[k].normal @ moved.normal, -1, 1)))
+        found.append(Squared(**vars(moved), group=group[k], exact=exact[k], turned=turned))
+    return found
 
 
 class _Conditions:
