@@ -1,6 +1,7 @@
 """What rays say of places where something is known to be."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,9 +10,9 @@ from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
     PlaneGrid,
-    labels_of_cells,
     may_be_in_sight,
     passed_through,
+    seen_cells,
 )
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
@@ -59,21 +60,25 @@ def test_rays_pass_through_what_is_before_their_ends_in_any_frame_of_the_camera(
         np.testing.assert_array_equal(found[clear], (truth < depth[v, u])[clear])
 
 
-def test_cells_have_the_labels_of_the_pixels_that_look_at_them():
+def test_cells_are_seen_where_pixels_of_the_plane_look_at_them():
     random = np.random.default_rng(3)
-    labels = random.integers(1, 1000, CAMERA.shape).astype(np.uint16)
+    labels = random.integers(1, 4, CAMERA.shape).astype(np.uint16)
     grid = PlaneGrid(0.07)
     grid.add(grid.fill([[np.array([[-3.0, -2], [3, -2], [3, 2], [-3, 2]])]]), HIT)
     normal = Rotation.from_rotvec([0.4, -0.3, 0.2]).apply([[0, 0, -1]])
-    plane = PlaneSet(normal, np.array([[0.2, 0.1, 2.5]]), tangents(normal))
-    points = plane.points(grid.centres())
+    known = PlaneSet(normal, np.array([[0.2, 0.1, 2.5]]), tangents(normal))
+    # As the frame found it, and where that lies over the cells.
+    off = Rotation.from_rotvec([0.02, 0.01, 0]).apply(normal[0])
+    points = known.points(grid.centres())
+    points -= (points @ off + 2.4)[:, None] * off
     x, y, z = points.T
     column = np.rint(CAMERA.fx * x / z + CAMERA.cx).astype(int)
     row = np.rint(CAMERA.fy * y / z + CAMERA.cy).astype(int)
     inside = (row >= 0) & (column >= 0) & (row < CAMERA.height) & (column < CAMERA.width)
     truth = np.where(inside, labels[row * inside, column * inside], 0)
     for turn, camera in ((np.eye(3), CAMERA), (BODY.axes, BODY)):
-        moved = plane.moved(Transform(turn, np.zeros(3)))
-        found = labels_of_cells(grid, moved, labels, camera)[grid.odds > 0]
+        seen = SimpleNamespace(normal=turn @ off, distance=2.4, label=2)
+        moved = known.moved(Transform(turn, np.zeros(3)))
+        found = seen_cells(grid, moved, seen, labels, camera)[grid.odds > 0]
         # Of some, the border of a pixel looks at the centre.
-        assert (found == truth)[z > 0.1].mean() > 0.98
+        assert (found == (truth == 2))[z > 0.1].mean() > 0.98

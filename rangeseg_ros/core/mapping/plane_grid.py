@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -164,21 +165,22 @@ def may_be_in_sight(
     return (outside <= radii * np.hypot(1, slope)) & (z >= -radii)
 
 
-def labels_of_cells(
-    grid: PlaneGrid, plane: PlaneSet, labels: NDArray[np.uint16], camera: Camera
-) -> NDArray[np.uint16]:
-    """Labels (V, U) of the pixels that look at the cells of a plane, one in the image's frame.
+def seen_cells(
+    grid: PlaneGrid, own: PlaneSet, plane: Plane, labels: NDArray[np.uint16], camera: Camera
+) -> NDArray[np.bool_]:
+    """Cells (V, U) of a plane of the map, one in the frame of the image, where a frame found it.
 
-    Cells behind the camera get labels from beyond the horizon of the plane, which are never its
-    own.
+    The plane that the frame found lies over the cells, which pixels of its label look at. Cells
+    behind the camera get pixels beyond the horizon, which are never of the plane.
     """
-    # From column, row and 1 to coordinates, points, and pixels.
+    # From column, row and 1 to coordinates, points, points on the plane, and pixels.
     place = np.column_stack([grid.side * np.eye(2), grid.side * (grid.first + 0.5)])
-    points = plane.axes[0].T @ place
-    points[:, 2] += plane.point[0]
+    points = own.axes[0].T @ place
+    points[:, 2] += own.point[0]
+    points -= np.outer(plane.normal, plane.normal @ points + [0, 0, plane.distance])
     pixels, size = camera.matrix @ camera.axes.T @ points, grid.odds.shape[::-1]
     flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
-    return np.asarray(cv2.warpPerspective(labels, pixels, size, flags=flags), np.uint16)
+    return np.asarray(cv2.warpPerspective(labels, pixels, size, flags=flags) == plane.label)
 
 
 def passed_through(

@@ -18,9 +18,9 @@ from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
     MISS,
     PlaneGrid,
-    labels_of_cells,
     may_be_in_sight,
     passed_through,
+    seen_cells,
 )
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -212,34 +212,33 @@ class PlaneMap:
         noise: PoseNoise,
     ) -> None:
         """Take in the cells of planes of the map that a frame finds, and those it sees through."""
-        camera, known = image.camera, self._filters.planes
-        of_label = np.full(int(labels.max(initial=0)) + 1, -1)
-        for plane, k in zip(planes, match.tolist(), strict=True):
-            of_label[plane.label] = k
-            grid, own = self._records[k].grid, known.where([k])
-            rings = [corners_of(plane)] if camera else [plane.hull, *plane.holes]
-            flat = [own.coordinates(r @ pose.rotation.T + pose.shift) for r in rings]
+        camera, records = image.camera, self._records
+        seen = self._filters.moved(pose.inverse(), np.zeros(3), np.diag(noise.deviations**2))
+        found = {}
+        for k in np.unique(match).tolist():
+            own, grid = seen.planes.where([k]), records[k].grid
+            parts = [planes[m] for m in np.flatnonzero(match == k).tolist()]
             if camera:
-                grid.reach(flat[0])
-            elif len(flat[0]) > 2:
-                grid.add(grid.fill([flat]), HIT)
+                grid.reach(own.coordinates(np.concatenate([corners_of(part) for part in parts])))
+                each = [seen_cells(grid, own, part, labels, camera) for part in parts]
+                found[k] = np.any(each, axis=0)
+            else:
+                borders = [[part.hull, *part.holes] for part in parts if len(part.hull) > 2]
+                found[k] = grid.fill([[own.coordinates(r) for r in rings] for rings in borders])
+            grid.add(found[k], HIT)
         # Of a cloud, nobody knows which pixel looks where.
-        if not camera or not self._records:
+        if not camera or not records:
             return
-        circles = [record.grid.circle() for record in self._records]
+        circles = [record.grid.circle() for record in records]
         middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
-        error = np.diag(noise.deviations**2)
-        seen = self._filters.moved(pose.inverse(), np.zeros(3), error)
         near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
         shown = np.flatnonzero(near).tolist()
         others, centres, points = [], [np.zeros((0, 2))], [np.zeros((0, 3))]
         for k in shown:
-            grid, plane_seen = self._records[k].grid, seen.planes.where([k])
-            found = of_label[labels_of_cells(grid, plane_seen, labels, camera)] == k
-            grid.add(found, HIT)
-            others.append((grid.odds > 0) & ~found)
+            grid = records[k].grid
+            others.append((grid.odds > 0) & ~found.get(k, np.False_))
             centres.append(grid.centres(others[-1]))
-            points.append(plane_seen.points(centres[-1]))
+            points.append(seen.planes.where([k]).points(centres[-1]))
         owner = np.repeat(shown, [len(own) for own in centres[1:]]).astype(np.intp)
         at, sensor = np.concatenate(centres), SensorModel.from_config(self.config)
         passed = passed_through(
@@ -251,7 +250,7 @@ class PlaneMap:
         )
         for k, cells in zip(shown, others, strict=True):
             cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
-            self._records[k].grid.add(cells, MISS)
+            records[k].grid.add(cells, MISS)
 
     def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with `some` of this frame."""
