@@ -28,13 +28,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
-from rangeseg_ros.core.mapping.observations import (
-    LASTING,
-    Observations,
-    PlaneSet,
-    PoseNoise,
-    observations,
-)
+from rangeseg_ros.core.mapping.observations import LASTING, PlaneSet, PoseNoise
 from rangeseg_ros.core.mapping.plane_filter import Jump
 from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -80,12 +74,8 @@ class Solution(NamedTuple):
 class Adjustment:
     """Collects what the frames of a recording show of the planes of its map.
 
-    Parameters
-    ----------
-    noise : PoseNoise
-        Of the poses that are told, or of their changes from frame to frame.
-    odometry : bool
-        Whether the errors of the poses add up.
+    `noise` is that of the poses that are told or, where their errors add up as those of an
+    odometry do, of their changes from frame to frame.
 
     Examples
     --------
@@ -97,15 +87,13 @@ class Adjustment:
         self._noise = np.maximum(noise.deviations, _LEAST)
         self._odometry = odometry
         self._poses: list[Transform] = []
-        self._seen: list[Observations] = []
+        self._planes: list[PlaneSet] = []
+        self._covariance: list[NDArray[np.float64]] = []
         # Number of its frame, id of its plane and number of its run, for each observation.
         self._index: list[tuple[int, int, int]] = []
         self._runs: dict[int, int] = {}
         # Number of the frame after each jump of the poses.
         self._jumps: list[tuple[int, Jump]] = []
-
-    def __len__(self) -> int:
-        return len(self._poses)
 
     def add(self, frame: Sighting) -> None:
         """Take in a frame."""
@@ -118,8 +106,8 @@ class Adjustment:
             self._index.append((len(self._poses), number, self._runs[number]))
         self._poses.append(frame.pose)
         # As the camera sees them.
-        still = Transform.identity(), PoseNoise(0.0, 0.0)
-        self._seen.append(observations(frame.planes, np.zeros((len(frame.ids), 0)), *still))
+        self._planes.append(frame.seen.planes.moved(frame.pose.inverse()))
+        self._covariance.append(frame.seen.covariance)
 
     def solve(self, planes: Sequence[MapPlane], successors: Mapping[int, int]) -> Solution:
         """Planes and poses of all frames, of these planes of the map.
@@ -136,10 +124,9 @@ class Adjustment:
                 index.append((at, number[own], run))
         frame, plane, runs = np.array(index, np.intp).reshape(-1, 3).T
         times = np.bincount(runs)[runs]
-        parts = zip(*(seen.planes for seen in self._seen), strict=True)
-        seen = PlaneSet(*map(np.concatenate, parts)).where(used)
-        error = np.concatenate([seen.covariance for seen in self._seen])[used]
-        error = (1 - LASTING + times * LASTING)[:, None, None] * error
+        seen = PlaneSet(*map(np.concatenate, zip(*self._planes, strict=True))).where(used)
+        error = np.concatenate(self._covariance)[used]
+        error *= (1 - LASTING + times * LASTING)[:, None, None]
         told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
         sightings = frame, plane, seen, error
         state, drift, covariance = self._solved(told, sightings, drifts=not self._odometry)

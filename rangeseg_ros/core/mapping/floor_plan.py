@@ -97,15 +97,10 @@ class Up(NamedTuple):
 
 
 class Wall(NamedTuple):
-    """Where a vertical plane stands: number of its plane in the plan, and ends (N, 2, 2) of parts.
-
-    The parts are in their order along the wall; it was seen between the heights low and high.
-    """
+    """Where a plane of the plan stands upright: ends (N, 2, 2) of its parts, in order along it."""
 
     plane: int
     segments: NDArray[np.float64]
-    low: float
-    high: float
 
 
 class Opening(NamedTuple):
@@ -188,23 +183,11 @@ def make_plan(
     headroom: float,
     resolution: float,
 ) -> FloorPlan:
-    """Turn a map into a plan.
+    """Turn the planes of a map, in a frame of that name, and points (N, 3) of frames into a plan.
 
-    Parameters
-    ----------
-    solution : Solution
-        Its planes.
-    frame : str
-        Their frame.
-    up : Up
-    points : iterable of (N, 3) float64
-        Of each frame, in that frame.
-    config : Config
-        `role_tolerance`, `role_area`, `role_height`, `obstacle_height`.
-    headroom : float
-        Height of what is to pass, metres: what is higher above the ground is not in the way.
-    resolution : float
-        Side of the cells of the grid, metres.
+    What is higher above the ground than the headroom, metres, is not in the way; `resolution`,
+    metres, is the side of the cells of the grid. Of the parameters, `role_tolerance`, `role_area`,
+    `role_height` and `obstacle_height` count.
     """
     tolerance = np.radians(config.role_tolerance)
     motion = _upright(up)
@@ -273,7 +256,7 @@ def _wall(k: int, plane: MapPlane, reach: tuple[float, float], resolution: float
     parts = [[(r - np.append(foot, 0)) @ turned.T for r in part] for part in plane.outline.parts]
     polygons = [shapely.make_valid(shapely.Polygon(part[0], part[1:])) for part in parts]
     side = shapely.union_all(polygons)
-    left, low, right, high = side.bounds
+    left, _, right, _ = side.bounds
     within = shapely.get_parts(shapely.clip_by_rect(side, left, reach[0], right, reach[1]))
     # What is seen of it as intervals along the wall; those that overlap are one.
     bounds = shapely.bounds(within[shapely.area(within) > 0]).reshape(-1, 4)
@@ -283,7 +266,7 @@ def _wall(k: int, plane: MapPlane, reach: tuple[float, float], resolution: float
     ends = np.maximum.accumulate(ends)
     apart = starts[1:] > ends[:-1] + resolution / 2
     spans = np.stack([starts[np.append(True, apart)], ends[np.append(apart, True)]], axis=1)
-    return Wall(k, foot + spans[..., None] * along, float(low), float(high))
+    return Wall(k, foot + spans[..., None] * along)
 
 
 def _openings(wall: Wall, grid: Grid) -> list[Opening]:

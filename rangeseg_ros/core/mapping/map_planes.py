@@ -24,13 +24,10 @@ AnyPlane = TypeVar('AnyPlane', bound=Plane)
 
 @dataclass(frozen=True, eq=False)
 class MapOutline:
-    """Parts of a plane that were seen, in the fixed frame.
+    """Parts of a plane that were seen, in the fixed frame, largest first.
 
-    Attributes
-    ----------
-    parts : list of list of (N, 3) float64
-        For each part, largest first, its border, counter-clockwise seen from where the
-        plane was seen, and the borders of its holes, clockwise.
+    For each its border (N, 3), counter-clockwise seen from where the plane was seen, and the
+    borders of its holes, clockwise.
     """
 
     parts: list[list[NDArray[np.float64]]]

@@ -86,6 +86,8 @@ class PlaneGrid:
 
     def fill(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
         """Cells (V, U) all of whose corners are in a polygon; of slivers, one in their middle."""
+        if not parts:
+            return np.zeros(self.odds.shape, np.bool_)
         self.reach(np.concatenate([ring for part in parts for ring in part]))
         height, width = self.odds.shape
         lattice = np.zeros((height + 1, width + 1), np.uint8)

@@ -35,13 +35,13 @@ _TOLD = 10
 class Sighting(NamedTuple):
     """What a frame shows of the planes of a map: M planes, of parts of one the largest.
 
-    `pose` takes the frame of the image, which they are in, to the fixed frame; `ids` (M,) are of
-    the planes of the map, and `begins` (M,) tells whether other pixels than before see them.
-    `jump` is that of the fixed frame since the frame before.
+    `pose` takes the frame of the image to the fixed frame, `ids` (M,) are of the planes of the
+    map, and `begins` (M,) tells whether other pixels than before see them. `jump` is that of the
+    fixed frame since the frame before.
     """
 
     pose: Transform
-    planes: Sequence[Plane]
+    seen: Observations
     ids: NDArray[np.int64]
     begins: NDArray[np.bool_]
     jump: Jump | None = None
@@ -159,7 +159,7 @@ class PlaneMap:
         largest = order[first]
         begins = self._filters.update(index, seen.where(largest))
         ids = np.array([self._records[k].id for k in index.tolist()], np.int64)
-        self.sighting = Sighting(pose, [planes[m] for m in largest], ids, begins, jump)
+        self.sighting = Sighting(pose, seen.where(largest), ids, begins, jump)
         self._find(labels, planes, match, image, pose, noise)
         self._merge(index, camera)
         self._forget()
