@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
+from rangeseg_ros.core.mapping.adjustment import Adjustment
 from rangeseg_ros.core.mapping.floor_plan import (
-    FloorPlan,
     Up,
     estimate_up,
     make_plan,
@@ -81,19 +80,9 @@ class _Stretch:
 class PlanTask:
     """The plan of one recording.
 
-    Attributes
-    ----------
-    recording, folder : Path
-    config : Config
-        Without `fixed_frame`, the frame that the recording's tf moves in counts, and without tf
-        that of the odometry.
-    headroom : float
-        Metres above the ground up to which things are in the way.
-    resolution : float
-        Side of a cell of the grid, metres.
-    overwrite : bool
-        Replace files of these names.
-    depth_topic, camera_topic : str or None
+    Without `fixed_frame` in the config, the frame that the recording's tf moves in counts, and
+    without tf that of the odometry. Things up to the headroom above the ground are in the way;
+    the resolution is the side of a cell of the grid, both in metres.
     """
 
     recording: Path
@@ -116,10 +105,7 @@ class PlanTask:
     def run(self, progress: Progress | None = None) -> PlanOutcome:
         """Map the recording and write the files.
 
-        Raises
-        ------
-        ValueError
-            As `check`; a recording in which no plane was found, or the camera's place is unknown.
+        ValueError as `check`, and where no plane was found or the camera's place is unknown.
         """
         self.check()
         config = self.config
@@ -140,7 +126,12 @@ class PlanTask:
         if solution.drifts:
             warnings.append(solution.drift_text())
         points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
-        plan = self._plan(best, solution, points, config)
+        up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
+        if best.told.any():
+            source = config.gravity_frame or 'the accelerometer'
+            up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
+        grid = self.headroom, self.resolution
+        plan = make_plan(solution, config.map_frame, up, points, config, *grid)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_picture(self.folder / PICTURE, plan)
@@ -202,20 +193,6 @@ class PlanTask:
             # What comes after the damage has no poses.
             except DamagedBagError:
                 pass
-
-    def _plan(
-        self,
-        best: _Stretch,
-        solution: Solution,
-        points: Iterator[NDArray[np.float64]],
-        config: Config,
-    ) -> FloorPlan:
-        up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
-        if best.told.any():
-            source = config.gravity_frame or 'the accelerometer'
-            up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
-        grid = self.headroom, self.resolution
-        return make_plan(solution, config.map_frame, up, points, config, *grid)
 
     @contextmanager
     def _open(self) -> Iterator[DepthBag]:

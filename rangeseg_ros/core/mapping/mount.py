@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.odometry import level
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
@@ -59,14 +60,12 @@ def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount
     floor = facing[order[0]]
     up = floor.normal
     roll, pitch = float(np.arctan2(-up[0], -up[1])), float(np.arcsin(np.clip(-up[2], -1, 1)))
-    level = up[0] ** 2 + up[1] ** 2
+    across = up[0] ** 2 + up[1] ** 2
     jacobian = np.zeros((3, 4))
-    jacobian[0, :2] = up[1] / level, -up[0] / level
+    jacobian[0, :2] = up[1] / across, -up[0] / across
     jacobian[1, 2] = -1 / np.sqrt(max(1 - up[2] ** 2, 1e-12))
     jacobian[2, 3] = 1
     sigma = np.sqrt(np.diag(jacobian @ floor.covariance @ jacobian.T))
-    forward = np.array([0, 0, 1.0]) - up[2] * up
-    forward /= np.linalg.norm(forward)
     doubts = []
     if 2 * floor.observations < frames:
         doubts.append(f'it was found in {floor.observations} of {frames} frames')
@@ -75,5 +74,4 @@ def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount
         doubts.append(f'a plane {other.distance:.2f} m below the camera may be the floor as well')
     if OUTLIER * sigma[:2].max() > np.radians(tolerance):
         doubts.append(f'its direction is known to {np.degrees(sigma[:2].max()):.1f} degrees only')
-    frame = np.stack([forward, np.cross(up, forward), up])
-    return Mount(roll, pitch, floor.distance, sigma, frame, doubts)
+    return Mount(roll, pitch, floor.distance, sigma, level(up, np.eye(3)), doubts)

@@ -133,7 +133,7 @@ class PlaneOdometry:
         frame, `up` (3,) counts, and the `axes` (3, 3) that are right, down and forward in the
         image, both in the frame of the image as the planes are.
         """
-        pose = self._pose or Transform(_level(np.array(up, float), np.array(axes)), np.zeros(3))
+        pose = self._pose or Transform(level(np.array(up, float), np.array(axes)), np.zeros(3))
         if self._pose:
             elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
             pose = self._predict(pose, elapsed)
@@ -254,7 +254,7 @@ def _by_camera(planes: PlaneSet, pose: Transform) -> NDArray[np.float64]:
     return design
 
 
-def _level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation from a camera that sees `up` to x forward and z up."""
     up = up / np.linalg.norm(up)
     # Straight up or down, forward is where the top of the image is.
