@@ -77,7 +77,7 @@ class PlaneMap:
         self._records: list[Record] = []
         self._filters = PlaneFilters.of(observations([], np.zeros((0, 0)), *_NOWHERE))
         self._next = 1
-        self._stamp = self._time = 0
+        self._stamp = self._time = self._frames = 0
 
     def anew(self, why: str) -> PlaneMap:
         """An empty map that follows this one: ids are not given twice."""
@@ -137,7 +137,7 @@ class PlaneMap:
         config, camera = self.config, pose.shift
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
         self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
-        self._stamp = stamp
+        self._stamp, self._frames = stamp, self._frames + 1
         seen = observations(planes, views(labels, planes, config.distortion_length), pose, noise)
         if self._filters.view.shape[1] != seen.view.shape[1]:
             # Of images of another size, what comes is of other pixels than before.
@@ -232,7 +232,8 @@ class PlaneMap:
         circles = [record.grid.circle() for record in records]
         middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
         near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
-        shown = np.flatnonzero(near).tolist()
+        # In turns, every second frame: what is gone is seldom, and to look for it takes long.
+        shown = [k for k in np.flatnonzero(near).tolist() if (records[k].id + self._frames) % 2]
         others, centres, points = [], [np.zeros((0, 2))], [np.zeros((0, 3))]
         for k in shown:
             grid = records[k].grid
@@ -250,7 +251,7 @@ class PlaneMap:
         )
         for k, cells in zip(shown, others, strict=True):
             cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
-            records[k].grid.add(cells, MISS)
+            records[k].grid.add(cells, 2 * MISS)
 
     def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with `some` of this frame."""
