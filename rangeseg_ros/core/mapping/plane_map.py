@@ -218,7 +218,8 @@ class PlaneMap:
         for k in np.unique(match).tolist():
             own, grid = seen.planes.where([k]), records[k].grid
             parts = [planes[m] for m in np.flatnonzero(match == k).tolist()]
-            if camera:
+            # Through a lens, or in a cloud, no homography leads from cells to pixels.
+            if camera and not camera.distortion_model:
                 grid.reach(own.coordinates(np.concatenate([corners_of(part) for part in parts])))
                 each = [seen_cells(grid, own, part, labels, camera) for part in parts]
                 found[k] = np.any(each, axis=0)
