@@ -60,15 +60,8 @@ class MapPlane(Plane):
     seen from. `extents`, `centre` and `orientation` are those of the least rectangle around all
     parts, `count` is the number of pixels of all observations, `rms` and `confidence` are means
     over them, `probability` is the largest, and `role` is what most observations found.
-
-    Attributes
-    ----------
-    observations : int
-        Number of regions that were fused.
-    age : float
-        Seconds between the first and the last sight of it.
-    first_stamp, last_stamp : int
-        Of these, nanoseconds.
+    `observations` is the number of regions that were fused, `age` the seconds from the first
+    stamp, nanoseconds, to the last one.
     """
 
     outline: MapOutline  # type: ignore[assignment]

@@ -56,20 +56,11 @@ _CAMERA = 12
 class Motion(NamedTuple):
     """Where the camera is and how it moves.
 
-    Attributes
-    ----------
-    frame : str
-        Name of the frame of the odometry: x forward where the camera looked first, z up, its
-        origin where the camera was then.
-    pose : Transform
-        From the frame of the image to that one.
-    covariance : (6, 6) float64
-        Of the pose: shift, then turn about the fixed axes, metres and radians.
-    velocity : (6,) float64
-        In the frame of the image: metres per second, then radians per second.
-    velocity_covariance : (6, 6) float64
-    held : int
-        Number of planes that tell how the camera moved since the frame before.
+    The pose takes the frame of the image to that of the odometry, `frame`: x forward where the
+    camera looked first, z up, its origin where the camera was then. Its covariance (6, 6) is of
+    the shift, then the turn about the fixed axes, metres and radians. The velocity (6,), metres
+    per second, then radians per second, is in the frame of the image. `held` is the number of
+    planes that tell how the camera moved since the frame before.
     """
 
     frame: str

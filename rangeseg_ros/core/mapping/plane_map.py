@@ -122,17 +122,9 @@ class PlaneMap:
     ) -> None:
         """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
 
-        Parameters
-        ----------
-        labels : (H, W) uint16
-        planes : sequence of Plane
-            Of these labels, in the frame of the image, tracked and with their roles.
-        image : RangeImage
-            What was measured: its rays tell which planes are gone.
-        pose : Transform
-            Fixed frame from the frame of the image.
-        stamp : int
-            Nanoseconds.
+        The planes, of these labels (H, W), are in the frame of the image, tracked and with their
+        roles; what was measured in the image tells which planes are gone. The pose takes that
+        frame to the fixed one; the stamp is in nanoseconds.
         """
         config, camera = self.config, pose.shift
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))

@@ -56,13 +56,7 @@ class Transform(NamedTuple):
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
-        """Motion of a 4x4 matrix, its rotation the nearest one.
-
-        Raises
-        ------
-        TransformError
-            Values that are not finite, or no rigid motion.
-        """
+        """Motion of a 4x4 matrix, its rotation the nearest one; TransformError if not rigid."""
         values = np.asarray(matrix, np.float64)
         if values.shape != (4, 4):
             raise TransformError(f'not a 4x4 matrix: shape {values.shape}')
