@@ -145,19 +145,19 @@ def _rounded(values: NDArray[np.float64], digits: int = 4) -> Any:
 
 
 def _write_pgm(path: Path, plan: FloorPlan) -> None:
-    shades = np.full(plan.grid.cells.shape, _UNKNOWN, np.uint8)
+    shades = np.full(plan.cells.shape, _UNKNOWN, np.uint8)
     for value, shade in _SHADES.items():
-        shades[plan.grid.cells == value] = shade
+        shades[plan.cells == value] = shade
     # Row 0 of the picture is at the greatest y.
     _, data = cv2.imencode('.pgm', shades[::-1])
     path.write_bytes(data.tobytes())
 
 
 def _write_yaml(path: Path, plan: FloorPlan) -> None:
-    x, y = plan.grid.origin
+    x, y = plan.origin
     path.write_text(
         'image: map.pgm\nmode: trinary\n'
-        f'resolution: {plan.grid.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
+        f'resolution: {plan.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
         f'occupied_thresh: {_OCCUPIED_THRESHOLD}\nfree_thresh: {_FREE_THRESHOLD}\n'
     )
 

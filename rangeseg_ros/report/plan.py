@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, Grid, deviation_of
+from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
@@ -30,9 +30,9 @@ _MARGIN, _LEGEND = 0.3, 1.3
 
 def svg(plan: FloorPlan) -> str:
     """The plan as an SVG picture, 100 units to the metre, y down."""
-    height, width = plan.grid.cells.shape
-    left, low = plan.grid.origin
-    side = plan.grid.resolution
+    height, width = plan.cells.shape
+    left, low = plan.origin
+    side = plan.resolution
     top = -low - height * side - _MARGIN
     down = height * side + 2 * _MARGIN + _LEGEND
     box = [left - _MARGIN, top, width * side + 2 * _MARGIN, down]
@@ -55,8 +55,8 @@ def svg(plan: FloorPlan) -> str:
         plan=plan,
         box=np.round(box, 3).tolist(),
         side=side,
-        free=_runs(plan.grid, FREE),
-        occupied=_runs(plan.grid, OCCUPIED),
+        free=_runs(plan, FREE),
+        occupied=_runs(plan, OCCUPIED),
         level=level,
         walls=walls,
         openings=[(o.ends.round(3).tolist(), o.width) for o in plan.openings],
@@ -70,13 +70,13 @@ def _title(plane: Squared) -> str:
     return f'{name}, standard deviation {1e3 * deviation_of(plane):.1f} mm{exact}'
 
 
-def _runs(grid: Grid, value: int) -> list[list[float]]:
+def _runs(plan: FloorPlan, value: int) -> list[list[float]]:
     """Runs of cells of a value along the rows: left end, upper side and width, y down."""
-    cells = np.pad((grid.cells == value).astype(np.int8), [(0, 0), (1, 1)])
+    cells = np.pad((plan.cells == value).astype(np.int8), [(0, 0), (1, 1)])
     row, ends = np.nonzero(np.diff(cells, axis=1))
-    start, end = ends.reshape(-1, 2).T * grid.resolution
-    upper = -grid.origin[1] - (row[::2] + 1) * grid.resolution
-    found: list[list[float]] = np.stack([grid.origin[0] + start, upper, end - start], 1).tolist()
+    start, end = ends.reshape(-1, 2).T * plan.resolution
+    upper = -plan.origin[1] - (row[::2] + 1) * plan.resolution
+    found: list[list[float]] = np.stack([plan.origin[0] + start, upper, end - start], 1).tolist()
     return [[round(v, 3) for v in run] for run in found]
 
 

@@ -29,26 +29,6 @@ FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 _SAMPLES = 120
 
 
-class Grid(NamedTuple):
-    """Cells (H, W) on the ground, `FREE`, `OCCUPIED` or `UNKNOWN`, row 0 at the least y.
-
-    `origin` is the outer corner (x, y) of the first cell, metres, `resolution` their side.
-    """
-
-    cells: NDArray[np.int8]
-    origin: tuple[float, float]
-    resolution: float
-
-    def at(self, points: NDArray[np.float64]) -> NDArray[np.int8]:
-        """Values (N,) at points (N, 2)."""
-        column, row = np.floor((points - self.origin) / self.resolution).astype(np.intp).T
-        height, width = self.cells.shape
-        inside = (row >= 0) & (column >= 0) & (row < height) & (column < width)
-        values = np.full(len(points), UNKNOWN, np.int8)
-        values[inside] = self.cells[row[inside], column[inside]]
-        return values
-
-
 def points_within(image: RangeImage, sensor: SensorModel, error: float) -> NDArray[np.float64]:
     """Some points (N, 3) of an image that err by less than `error` along the ray, metres."""
     step = max(min(image.shape) // _SAMPLES, 1)
@@ -120,6 +100,8 @@ class FloorPlan(NamedTuple):
 
     `motion` leads from the fixed frame, `frame`, to that of the plan: the identity where z of the
     former is up. `ground` is the height of the ground; planes have their roles in the plan.
+    `cells` (H, W), of a side of `resolution`, are `FREE`, `OCCUPIED` or `UNKNOWN`, row 0 at the
+    least y, and (x, y) of the outer corner of the first one are the `origin`.
     """
 
     frame: str
@@ -129,7 +111,9 @@ class FloorPlan(NamedTuple):
     planes: list[Squared]
     walls: list[Wall]
     openings: list[Opening]
-    grid: Grid
+    cells: NDArray[np.int8]
+    origin: tuple[float, float]
+    resolution: float
 
 
 def deviation_of(plane: MapPlane) -> float:
@@ -199,7 +183,7 @@ def make_plan(
     # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
     upright = (some @ motion.rotation.T + motion.shift for some in points)
-    odds = occupancy(upright, ground, band, resolution)
+    grid = occupancy(upright, ground, band, resolution)
     reach = ground + band[0], ground + headroom
     found = (
         _wall(k, plane, reach, resolution)
@@ -207,9 +191,11 @@ def make_plan(
         if abs(plane.normal[2]) < np.sin(tolerance)
     )
     walls = [wall for wall in found if wall is not None]
-    grid = _drawn(odds, [plane for plane in squared if plane.role == 'floor'], walls)
-    openings = [o for wall in walls for o in _openings(wall, grid)]
-    return FloorPlan(frame, motion, up, ground, squared, walls, openings, grid)
+    cells = _drawn(grid, [plane for plane in squared if plane.role == 'floor'], walls)
+    openings = [o for wall in walls for o in _openings(wall, cells, grid)]
+    x, y = (grid.first * resolution).tolist()
+    told = frame, motion, up, ground, squared, walls, openings
+    return FloorPlan(*told, cells, (x, y), resolution)
 
 
 def _upright(up: Up) -> Transform:
@@ -269,31 +255,30 @@ def _wall(k: int, plane: MapPlane, reach: tuple[float, float], resolution: float
     return Wall(k, foot + spans[..., None] * along)
 
 
-def _openings(wall: Wall, grid: Grid) -> list[Opening]:
+def _openings(wall: Wall, cells: NDArray[np.int8], grid: PlaneGrid) -> list[Opening]:
     """Gaps of a wall in which the ground was seen on most of the way across."""
     found = []
     for ends in wall.segments.reshape(-1, 2)[1:-1].reshape(-1, 2, 2):
         width = float(np.linalg.norm(ends[1] - ends[0]))
-        across = np.linspace(ends[0], ends[1], max(int(width / grid.resolution), 3))[1:-1]
+        across = np.linspace(ends[0], ends[1], max(int(width / grid.side), 3))[1:-1]
         # Narrower than two cells, the grid does not tell.
-        if width >= 2 * grid.resolution and (grid.at(across) == FREE).mean() > 0.5:
+        if width >= 2 * grid.side and (cells[grid.cells(across)] == FREE).mean() > 0.5:
             found.append(Opening(wall.plane, ends))
     return found
 
 
-def _drawn(odds: PlaneGrid, floors: Sequence[MapPlane], walls: Sequence[Wall]) -> Grid:
-    """The cells in which points were seen, with the floors of the map and its walls."""
+def _drawn(grid: PlaneGrid, floors: Sequence[MapPlane], walls: Sequence[Wall]) -> NDArray[np.int8]:
+    """Cells in which points were seen, with the floors of the map and its walls."""
     free = [[ring[:, :2] for ring in part] for p in floors for part in p.outline.parts]
     lines = [ends for wall in walls for ends in wall.segments]
-    corners = [ring for part in free for ring in part] + lines
-    for corner in corners:
-        odds.reach(np.concatenate([corner - odds.side, corner + odds.side]))
-    cells = np.where(odds.odds < 0, FREE, UNKNOWN).astype(np.int8)
-    if free:
-        cells[odds.fill(free)] = FREE
-    cells[odds.odds > -LEAST] = OCCUPIED
+    for corners in [ring for part in free for ring in part] + lines:
+        grid.reach(np.concatenate([corners - grid.side, corners + grid.side]))
+    if not grid.odds.size:
+        grid.reach(np.zeros((1, 2)))
+    cells = np.where(grid.odds < 0, FREE, UNKNOWN).astype(np.int8)
+    cells[grid.fill(free)] = FREE
+    cells[grid.odds > -LEAST] = OCCUPIED
     for start, end in lines:
-        count = max(int(np.linalg.norm(end - start) / odds.side * 2), 1) + 1
-        cells[odds.cells(np.linspace(start, end, count))] = OCCUPIED
-    x, y = (odds.first * odds.side).tolist()
-    return Grid(cells, (x, y), odds.side)
+        count = max(int(np.linalg.norm(end - start) / grid.side * 2), 1) + 1
+        cells[grid.cells(np.linspace(start, end, count))] = OCCUPIED
+    return cells
