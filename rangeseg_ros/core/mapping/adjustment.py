@@ -115,14 +115,16 @@ class Adjustment:
         `successors` are the ids that planes have now, by those they had when they were observed.
         """
         number = {plane.id: k for k, plane in enumerate(planes)}
-        used, index = [], []
-        for i, (at, own, run) in enumerate(self._index):
+
+        def now(own: int) -> int:
             while own in successors:
                 own = successors[own]
-            if own in number:
-                used.append(i)
-                index.append((at, number[own], run))
+            return number.get(own, -1)
+
+        index = [(at, now(own), run) for at, own, run in self._index]
         frame, plane, runs = np.array(index, np.intp).reshape(-1, 3).T
+        used = plane >= 0
+        frame, plane, runs = frame[used], plane[used], runs[used]
         times = np.bincount(runs)[runs]
         seen = PlaneSet(*map(np.concatenate, zip(*self._planes, strict=True))).where(used)
         error = np.concatenate(self._covariance)[used]

@@ -134,9 +134,9 @@ class PlaneOdometry:
         seen = observations(chosen, view[largest], Transform.identity(), PoseNoise(0.0, 0.0))
         ids = np.array([plane.id for plane in chosen], np.int64)
         self._keep(np.isin(self._id, ids))
-        order = {number: m for m, number in enumerate(ids.tolist())}
         if len(self._id):
-            pose = self._update(pose, seen.where([order[number] for number in self._id.tolist()]))
+            order = [ids.tolist().index(number) for number in self._id.tolist()]
+            pose = self._update(pose, seen.where(order))
         held, new = len(self._id), ~np.isin(ids, self._id)
         self._append(pose, seen.where(new), ids[new])
         self._pose = pose

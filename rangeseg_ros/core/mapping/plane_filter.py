@@ -52,6 +52,7 @@ class PlaneFilters(NamedTuple):
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
         """Planes where they are seen for the first time, of which nothing else is known yet."""
+        # Kilometres, beside which the first observation is all that counts.
         unknown = np.tile(1e6 * np.eye(3), (len(seen.view), 1, 1))
         return cls(seen.planes, unknown, 0 * seen.view, np.zeros(len(seen.view), np.intp))
 
