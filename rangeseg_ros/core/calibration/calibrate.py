@@ -60,10 +60,8 @@ class Fold(NamedTuple):
     after: float
     weight: float
 
-    @property
-    def left(self) -> float:
-        """Sum of the squares of what the field leaves of the residuals."""
-        return self.weight * self.after**2
+
+_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
 
 
 class Calibration(NamedTuple):
@@ -100,12 +98,12 @@ def calibrate(
 
     def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
         folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
-        return min(zip(tried, folds, strict=True), key=lambda pair: sum(f.left for f in pair[1]))
+        return min(zip(tried, folds, strict=True), key=lambda pair: _left(pair[1]).sum())
 
     smoothness, folds = best(_SMOOTHNESS)
     sloped = best([(*smoothness, slope) for slope in _SLOPES])
     # The simpler model, unless the other is better by more than the standard error of that.
-    gain = np.array([one.left - two.left for one, two in zip(folds, sloped[1], strict=True)])
+    gain = _left(folds) - _left(sloped[1])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
     weight = _settled_weights(seen, grid)
@@ -170,9 +168,6 @@ def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float
     return robust_weights(seen, field[seen.cell])
 
 
-_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
-
-
 def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
     """Which planes (P,) are of each block of frames, and weights of the cells of all others."""
     found = []
@@ -197,11 +192,15 @@ def _folds(
         field = solve(seen.of_planes(~inside), basis[:, out], weight, grid, smoothness)
         before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
         after = before - residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
-        total, parts = float(counts.sum()), (before, after)
-        rms = [float(np.sqrt(counts @ part**2 / total)) for part in parts]
+        rms = [float(np.sqrt(np.average(part**2, weights=counts))) for part in (before, after)]
         ends = int(test.frame.min()), int(test.frame.max())
-        found.append(Fold(ends, field, rms[0], rms[1], total))
+        found.append(Fold(ends, field, rms[0], rms[1], float(counts.sum())))
     return found
+
+
+def _left(folds: Sequence[Fold]) -> NDArray[np.float64]:
+    """Sums of the squares of what the fields leave of the residuals of each block."""
+    return np.array([fold.weight * fold.after**2 for fold in folds])
 
 
 def _deviation(

@@ -135,8 +135,8 @@ class PlaneOdometry:
         ids = np.array([plane.id for plane in chosen], np.int64)
         self._keep(np.isin(self._id, ids))
         if len(self._id):
-            order = [ids.tolist().index(number) for number in self._id.tolist()]
-            pose = self._update(pose, seen.where(order))
+            order = {number: m for m, number in enumerate(ids.tolist())}
+            pose = self._update(pose, seen.where([order[own] for own in self._id.tolist()]))
         held, new = len(self._id), ~np.isin(ids, self._id)
         self._append(pose, seen.where(new), ids[new])
         self._pose = pose

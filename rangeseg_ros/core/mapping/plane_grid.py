@@ -176,8 +176,8 @@ def seen_cells(
     behind the camera get pixels beyond the horizon, which are never of the plane.
     """
     # From column, row and 1 to coordinates, points, points on the plane, and pixels.
-    place = np.column_stack([grid.side * np.eye(2), grid.side * (grid.first + 0.5)])
-    points = own.axes[0].T @ place
+    u, v = grid.side * (grid.first + 0.5)
+    points = own.axes[0].T @ np.array([[grid.side, 0, u], [0, grid.side, v]])
     points[:, 2] += own.point[0]
     points -= np.outer(plane.normal, plane.normal @ points + [0, 0, plane.distance])
     pixels, size = camera.matrix @ camera.axes.T @ points, grid.odds.shape[::-1]
