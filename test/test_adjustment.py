@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment
-from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, Sighting
+from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, observations
+from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
 
@@ -42,6 +43,12 @@ def seen(random, face, pose, lasting):
     )
 
 
+def sighting(pose, planes, *about):
+    """Planes that a frame shows."""
+    seen = observations(planes, np.zeros((len(planes), 0)), pose, NOISE)
+    return Sighting(pose, seen, *about)
+
+
 def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
     """Solution for a camera that walks 4 m along a room, and its true poses."""
     random = np.random.default_rng(seed)
@@ -58,10 +65,10 @@ def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
         told = Transform(turned, truth.shift + told_off + np.array(drift) * way)
         # All pixels are others after four frames.
         lasting = np.random.default_rng([seed, k // 4]).standard_normal((len(FACES), 3))
-        view = np.eye(len(FACES) * frames)[(k // 4) * len(FACES) + np.arange(len(FACES))]
+        begins = np.full(len(FACES), k % 4 == 0)
         faces = FACES + np.outer(np.arange(len(FACES)) == 5, (0, 0, 0, moving * (k > frames / 2)))
         planes = [seen(random, f, truth, own) for f, own in zip(faces, lasting, strict=True)]
-        adjustment.add(Sighting(told, planes, np.arange(1, len(FACES) + 1), view))
+        adjustment.add(sighting(told, planes, np.arange(1, len(FACES) + 1), begins))
         truths.append(truth)
     start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
     return adjustment.solve(start, {}), truths
@@ -128,8 +135,8 @@ def test_observations_count_for_what_their_planes_became():
     pose = Transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
     for number in (1, 7, 9):
         planes = [seen(random, FACES[0], pose, np.zeros(3))]
-        adjustment.add(Sighting(pose, planes, np.array([number]), np.eye(9)[[number - 1]]))
-    adjustment.add(Sighting(pose, [], np.zeros(0, int), np.zeros((0, 0))))
+        adjustment.add(sighting(pose, planes, np.array([number]), np.array([True])))
+    adjustment.add(sighting(pose, [], np.zeros(0, int), np.zeros(0, bool)))
     start = [map_plane(1, (0, 0, 1), (0, 0, 0), 0.01)]
     with_one = adjustment.solve(start, {}).covariance
     with_two = adjustment.solve(start, {9: 7, 7: 1}).covariance

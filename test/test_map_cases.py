@@ -9,7 +9,7 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
+from rangeseg_ros.core.mapping.plane_grid import HIT, MISS, PlaneGrid
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -108,7 +108,8 @@ def test_memory_is_bounded_however_long_one_walks(kind):
 def test_a_grid_is_bounded_however_far_a_plane_goes():
     grid = PlaneGrid(0.03)
     for x in range(60):
-        grid.see([[np.array([[x, 0], [x + 1.2, 0], [x + 1.2, 40], [x, 40.0]])]])
+        found = grid.fill([[np.array([[x, 0], [x + 1.2, 0], [x + 1.2, 40], [x, 40.0]])]])
+        grid.add(found, HIT)
     assert grid.odds.size <= 2**18 and grid.side == 0.12
     assert grid.area == pytest.approx(60.2 * 40, rel=0.01)
 
@@ -119,7 +120,7 @@ def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
     hole = np.array([[0.5, 0.3], [0.5, 0.7], [1.0, 0.7], [1.0, 0.3]])
     apart = square * 0.2 + (0, 1.5)
     for _ in range(3):
-        grid.see([[square @ turn.T, hole @ turn.T], [apart @ turn.T]])
+        grid.add(grid.fill([[square @ turn.T, hole @ turn.T], [apart @ turn.T]]), HIT)
     truth, border = 2 - 0.2 + 0.08, 6 + 1.8 + 1.2
     # A quarter of a cell along the borders.
     assert grid.area == grid.sure_area == pytest.approx(truth, abs=0.25 * grid.side * border)
@@ -133,13 +134,13 @@ def test_a_grid_has_the_area_and_the_outline_of_what_was_seen():
     assert found.symmetric_difference(wanted).area < 0.05 * truth
     # What is looked at in vain is gone after as many looks as it was sure.
     for _ in range(7):
-        grid.miss(grid.odds > 0)
+        grid.add(grid.odds > 0, MISS)
     assert grid.area == 0 and grid.polygons() == []
 
 
 def test_a_sliver_between_cells_is_seen():
     grid = PlaneGrid(0.1)
-    grid.see([[np.array([[0.01, 0.02], [0.05, 0.02], [0.05, 0.03]])]])
+    grid.add(grid.fill([[np.array([[0.01, 0.02], [0.05, 0.02], [0.05, 0.03]])]]), HIT)
     assert grid.area == pytest.approx(0.01)
     assert grid.distance(np.array([0.03, 0.02])) == 0
     assert grid.distance(np.array([0.05, 1.05])) == pytest.approx(1.0)

@@ -8,7 +8,8 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import HeldUp, Placement, find_placement, moved_planes
+from rangeseg_ros.core.mapping.map_planes import moved_planes
+from rangeseg_ros.core.mapping.placement import HeldUp, Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage

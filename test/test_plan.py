@@ -186,15 +186,13 @@ def test_right_angles_are_exact_only_where_the_covariance_allows_it():
     joint = block_diag(*(wall.covariance for wall in walls))
     squared = square_up(walls, joint, np.radians(10))
     assert [s.exact for s in squared] == ['square', 'square', 'plumb', 'square']
-    assert abs(squared[0].plane.normal @ squared[1].plane.normal) < 1e-12
-    assert abs(np.cross(squared[0].plane.normal, squared[3].plane.normal)).max() < 1e-12
+    assert abs(squared[0].normal @ squared[1].normal) < 1e-12
+    assert abs(np.cross(squared[0].normal, squared[3].normal)).max() < 1e-12
     for before, after in zip(walls, squared, strict=True):
         # It turns about where it is known best, and the outline lies on it.
-        assert after.plane.normal @ before.centroid + after.plane.distance == pytest.approx(
-            0, abs=1e-3
-        )
-        corners = after.plane.outline.hull
-        assert np.allclose(corners @ after.plane.normal + after.plane.distance, 0, atol=1e-9)
+        assert after.normal @ before.centroid + after.distance == pytest.approx(0, abs=1e-3)
+        corners = after.outline.hull
+        assert np.allclose(corners @ after.normal + after.distance, 0, atol=1e-9)
 
 
 def test_up_is_known_as_well_as_its_deviation_says():

@@ -71,13 +71,11 @@ def test_the_filter_knows_how_far_it_is_off(pattern):
             told = Transform(off @ pose.rotation, pose.shift + random.normal(0, NOISE.shift, 3))
             view = np.eye(15)[[k if pattern == 'changes' else 0]]
             seen = observations([plane], view, told, NOISE)
-            if filters is None:
-                filters = PlaneFilters.of(seen)
-            else:
-                first = np.array([0])
-                filters.update(filters.expected(first, seen, first), seen)
-        error = np.append(filters.normal[0], filters.distance[0]) - truth
-        values.append(error @ np.linalg.pinv(filters.plane_covariance[0], 1e-10) @ error / 3)
+            filters = filters or PlaneFilters.of(seen)
+            filters.update(np.array([0]), seen)
+        error = filters.planes.equations[0] - truth
+        covariance = filters.planes.covariances(filters.covariance)[0]
+        values.append(error @ np.linalg.pinv(covariance, 1e-10) @ error / 3)
         errors.append(np.linalg.norm(error[:3]))
     assert 0.7 < np.mean(values) < 1.5
     assert np.median(errors) < np.radians(0.4)

@@ -13,11 +13,15 @@ from numpy.typing import NDArray
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, Up, estimate_up, make_plan
-from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.adjustment import Adjustment
+from rangeseg_ros.core.mapping.floor_plan import (
+    Up,
+    estimate_up,
+    make_plan,
+    points_within,
+)
 from rangeseg_ros.core.mapping.observations import PoseNoise
-from rangeseg_ros.core.mapping.occupancy import points_within
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -36,17 +40,9 @@ PICTURE, PAGE = 'plan.svg', 'plan.html'
 class PlanOutcome:
     """What became of a recording.
 
-    Attributes
-    ----------
-    frames, located : int
-        Number of frames, and of those whose place was known.
-    frame : str
-        Fixed frame of the plan.
-    planes, walls, openings, squared : int
-        Numbers in the plan; of planes with exact right angles.
-    up : str
-        What tells which way is up.
-    warnings : list of str
+    Numbers of its frames and of those whose place was known, its fixed `frame`; numbers of planes,
+    walls, openings, and planes with exact right angles (`squared`) in the plan; what tells which
+    way is `up`.
     """
 
     frames: int
@@ -68,41 +64,25 @@ class _Stretch:
     the images, by the parameters and by the sensors.
     """
 
+    map: PlaneMap
     seen: Adjustment
     frames: list[int] = field(default_factory=list)
-    planes: list[MapPlane] = field(default_factory=list)
-    successors: dict[int, int] = field(default_factory=dict)
     looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
     told: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    def end(self, planes: list[MapPlane], successors: dict[int, int]) -> _Stretch:
-        """Take the planes that the map has now."""
-        self.planes, self.successors = planes, successors
-        return self
 
     @property
     def extent(self) -> tuple[float, int]:
         """Area of its planes, and number of frames."""
-        return sum(plane.area for plane in self.planes), len(self.frames)
+        return sum(plane.area for plane in self.map.planes), len(self.frames)
 
 
 @dataclass(frozen=True)
 class PlanTask:
     """The plan of one recording.
 
-    Attributes
-    ----------
-    recording, folder : Path
-    config : Config
-        Without `fixed_frame`, the frame that the recording's tf moves in counts, and without tf
-        that of the odometry.
-    headroom : float
-        Metres above the ground up to which things are in the way.
-    resolution : float
-        Side of a cell of the grid, metres.
-    overwrite : bool
-        Replace files of these names.
-    depth_topic, camera_topic : str or None
+    Without `fixed_frame` in the config, the frame that the recording's tf moves in counts, and
+    without tf that of the odometry. Things up to the headroom above the ground are in the way;
+    the resolution is the side of a cell of the grid, both in metres.
     """
 
     recording: Path
@@ -125,10 +105,7 @@ class PlanTask:
     def run(self, progress: Progress | None = None) -> PlanOutcome:
         """Map the recording and write the files.
 
-        Raises
-        ------
-        ValueError
-            As `check`; a recording in which no plane was found, or the camera's place is unknown.
+        ValueError as `check`, and where no plane was found or the camera's place is unknown.
         """
         self.check()
         config = self.config
@@ -143,13 +120,18 @@ class PlanTask:
                 f'{self.recording}: where the camera was in {config.map_frame!r} is not known for '
                 f'any of {frames} frames: {"; ".join(warnings) or "no tf"}'
             )
-        if not best.planes:
+        if not (planes := best.map.planes):
             raise BagError(f'{self.recording}: no planes in {len(best.frames)} frames')
-        solution = best.seen.solve(best.planes, best.successors)
+        solution = best.seen.solve(planes, best.map.successors)
         if solution.drifts:
             warnings.append(solution.drift_text())
         points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
-        plan = self._plan(best, solution, points, config)
+        up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
+        if best.told.any():
+            source = config.gravity_frame or 'the accelerometer'
+            up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
+        grid = self.headroom, self.resolution
+        plan = make_plan(solution, config.map_frame, up, points, config, *grid)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_picture(self.folder / PICTURE, plan)
@@ -161,7 +143,7 @@ class PlanTask:
             len(plan.planes),
             len(plan.walls),
             len(plan.openings),
-            sum(squared.exact == 'square' for squared in plan.planes),
+            sum(plane.exact == 'square' for plane in plan.planes),
             plan.up.source,
             warnings,
         )
@@ -172,15 +154,13 @@ class PlanTask:
         noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
 
         def begin() -> _Stretch:
-            return _Stretch(Adjustment(noise, odometry=not config.fixed_frame))
+            return _Stretch(sequence.map, Adjustment(noise, odometry=not config.fixed_frame))
 
-        stretches, frames, warnings, epoch = [begin()], 0, [], sequence.map.epoch
+        stretches, frames, warnings = [begin()], 0, []
         with self._open() as source, Locator(self.recording, config) as located:
             for number, *_ in segment_frames(source, sequence, located.place, progress):
                 frames += 1
-                if sequence.map.epoch != epoch:
-                    epoch = sequence.map.epoch
-                    stretches[-1].end(sequence.map.planes_before, sequence.map.successors_before)
+                if stretches[-1].map is not sequence.map:
                     warnings.append(f'frame {number}: {sequence.map.begun_anew}')
                     stretches.append(begin())
                 now = stretches[-1]
@@ -194,7 +174,6 @@ class PlanTask:
             warnings += [f'{n} frames without the {why}' for why, n in located.problems.items()]
             if source.damage:
                 warnings.append(source.damage)
-        stretches[-1].end(sequence.map.planes, sequence.map.successors)
         best = max(stretches, key=lambda stretch: stretch.extent)
         return frames, best, warnings + sequence.map.doubts
 
@@ -214,29 +193,6 @@ class PlanTask:
             # What comes after the damage has no poses.
             except DamagedBagError:
                 pass
-
-    def _plan(
-        self,
-        best: _Stretch,
-        solution: Solution,
-        points: Iterator[NDArray[np.float64]],
-        config: Config,
-    ) -> FloorPlan:
-        tolerance = np.radians(config.role_tolerance)
-        if best.told.any():
-            source = config.gravity_frame or 'the accelerometer'
-            up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
-        else:
-            up = estimate_up(solution.planes, best.looked, tolerance)
-        return make_plan(
-            solution,
-            config.map_frame,
-            up,
-            points,
-            config,
-            self.headroom,
-            self.resolution,
-        )
 
     @contextmanager
     def _open(self) -> Iterator[DepthBag]:

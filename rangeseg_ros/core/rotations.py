@@ -57,6 +57,12 @@ def rotation_by(turn: ArrayLike) -> NDArray[np.float64]:
     return rotation
 
 
+def turn_between(first: NDArray[np.float64], second: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The least rotation (3, 3) that takes a unit vector (3,) to another one, not its opposite."""
+    cross = cross_matrix(np.cross(first, second))
+    return np.eye(3) + cross + cross @ cross / (1 + first @ second)
+
+
 def cross_matrix(vector: ArrayLike) -> NDArray[np.float64]:
     """Matrix (3, 3) of cross products: cross_matrix(a) @ b = a x b."""
     x, y, z = np.asarray(vector, np.float64)

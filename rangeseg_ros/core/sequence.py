@@ -13,9 +13,9 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
 from rangeseg_ros.core.ground.survey import Survey, grid_options
+from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
-from rangeseg_ros.core.mapping.placement import moved_planes
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
@@ -63,7 +63,7 @@ class SequenceSegmenter:
         before, moved = self.config, config.map_frame != self.config.map_frame
         self._segmenter = Segmenter(config)
         if moved:
-            self.map.clear('its frame has changed')
+            self.map = self.map.anew('its frame has changed')
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config), None
@@ -113,7 +113,7 @@ class SequenceSegmenter:
         config = self.config
         if stamp < self._stamp:
             self._tracker.reset()
-            self.map.clear('time has gone back')
+            self.map = self.map.anew('time has gone back')
             self._ground.forget()
             self._pose = None
         # Errors and what is in sight follow from where the sensor is: all is seen from there.
@@ -134,7 +134,7 @@ class SequenceSegmenter:
             self.motion = found.of_origin(image.place)
             if not config.fixed_frame:
                 if not found.held and len(self.map):
-                    self.map.clear('no plane held the camera')
+                    self.map = self.map.anew('no plane held the camera')
                 pose = self.motion.pose.after(sensor)
         self.pose = pose.after(sensor.inverse()) if pose else None
         if pose:

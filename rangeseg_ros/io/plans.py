@@ -14,8 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED
+from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
@@ -24,6 +23,9 @@ from rangeseg_ros.io.meshes import write_mesh
 # Shades of map_server, and thresholds between them: 205 is unknown, as 1 - 205 / 255 lies between.
 _SHADES = {FREE: 254, OCCUPIED: 0}
 _UNKNOWN, _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 205, 0.65, 0.196
+
+# Layers of the drawing and their colours.
+_LAYERS = {'WALLS': 1, 'FACES': 8, 'OPENINGS': 5, 'FLOOR': 3, 'LEVEL': 30, 'PLANES': 9, 'TEXT': 7}
 
 
 def plan_files() -> dict[str, Callable[[Path, FloorPlan], None]]:
@@ -38,14 +40,9 @@ def plan_files() -> dict[str, Callable[[Path, FloorPlan], None]]:
     }
 
 
-def plane_rows(plan: FloorPlan) -> list[dict[str, Any]]:
-    """What is told of each plane of a plan: plain values, metres and degrees."""
-    return [_row(squared) for squared in plan.planes]
-
-
-def _row(squared: Squared) -> dict[str, Any]:
-    plane = squared.plane
-    corners = np.concatenate([ring for part in plane.outline.parts for ring in part])
+def plane_row(plane: Squared) -> dict[str, Any]:
+    """What is told of a plane of a plan: plain values, metres and degrees."""
+    heights = np.concatenate(plane.outline.rings)[:, 2]
     turn = np.degrees(np.sqrt(max(np.trace(plane.covariance[:3, :3]), 0)))
     return {
         'id': plane.id,
@@ -53,11 +50,11 @@ def _row(squared: Squared) -> dict[str, Any]:
         'area': round(plane.area, 4),
         'deviation': round(deviation_of(plane), 5),
         'deviation_degrees': round(float(turn), 4),
-        'exact': squared.exact,
-        'group': squared.group,
-        'turned_degrees': round(float(np.degrees(squared.turned)), 4),
-        'low': round(float(corners[:, 2].min()), 4),
-        'high': round(float(corners[:, 2].max()), 4),
+        'exact': plane.exact,
+        'group': plane.group,
+        'turned_degrees': round(float(np.degrees(plane.turned)), 4),
+        'low': round(float(heights.min()), 4),
+        'high': round(float(heights.max()), 4),
         'normal': [round(float(v), 6) for v in plane.normal],
         'distance': round(plane.distance, 5),
         'observations': plane.observations,
@@ -75,42 +72,29 @@ def write_dxf(path: Path, plan: FloorPlan) -> None:
 
     document = ezdxf.new('R2010', setup=True)
     document.units = units.M
-    for name, colour in zip(
-        ('WALLS', 'FACES', 'OPENINGS', 'FLOOR', 'LEVEL', 'PLANES', 'TEXT'),
-        (1, 8, 5, 3, 30, 9, 7),
-        strict=True,
-    ):
+    for name, colour in _LAYERS.items():
         document.layers.add(name, color=colour)
     space = document.modelspace()
     for wall in plan.walls:
-        plane = plan.planes[wall.plane].plane
+        plane = plan.planes[wall.plane]
+        layer = 'WALLS' if plane.role == 'wall' else 'FACES'
         for start, end in wall.segments:
-            layer = 'WALLS' if plane.role == 'wall' else 'FACES'
             space.add_line(start, end, dxfattribs={'layer': layer})
-        text = f'{plane.id}: +-{1e3 * deviation_of(plane):.1f} mm'
         if plane.role == 'wall':
-            space.add_text(text, height=0.08, dxfattribs={'layer': 'TEXT'}).set_placement(
-                wall.segments.reshape(-1, 2).mean(axis=0)
-            )
+            text = f'{plane.id}: +-{1e3 * deviation_of(plane):.1f} mm'
+            at = wall.segments.reshape(-1, 2).mean(axis=0)
+            space.add_text(text, height=0.08, dxfattribs={'layer': 'TEXT'}).set_placement(at)
     for opening in plan.openings:
-        space.add_line(
-            opening.ends[0],
-            opening.ends[1],
-            dxfattribs={'layer': 'OPENINGS', 'linetype': 'DASHED'},
-        )
-    for squared in plan.planes:
-        plane = squared.plane
-        for ring in (ring for part in plane.outline.parts for ring in part):
+        start, end = opening.ends
+        space.add_line(start, end, dxfattribs={'layer': 'OPENINGS', 'linetype': 'DASHED'})
+    for plane in plan.planes:
+        level = abs(plane.normal[2]) > 0.5 and plane.role != 'ceiling'
+        layer = 'FLOOR' if plane.role == 'floor' else 'LEVEL'
+        about = {'layer': layer, 'elevation': float(plane.centroid[2])}
+        for ring in plane.outline.rings:
             space.add_polyline3d(ring.tolist(), close=True, dxfattribs={'layer': 'PLANES'})
-            if abs(plane.normal[2]) > 0.5 and plane.role != 'ceiling':
-                space.add_lwpolyline(
-                    ring[:, :2].tolist(),
-                    close=True,
-                    dxfattribs={
-                        'layer': 'FLOOR' if plane.role == 'floor' else 'LEVEL',
-                        'elevation': float(plane.centroid[2]),
-                    },
-                )
+            if level:
+                space.add_lwpolyline(ring[:, :2].tolist(), close=True, dxfattribs=about)
     document.saveas(path)
 
 
@@ -121,29 +105,24 @@ def write_geojson(path: Path, plan: FloorPlan) -> None:
     of all parts in space.
     """
     features = []
-    upright = {wall.plane: wall for wall in plan.walls}
-    for k, squared in enumerate(plan.planes):
-        parts = [[_closed(ring) for ring in part] for part in squared.plane.outline.parts]
-        wall = upright.get(k)
-        if wall is not None:
-            geometry = {'type': 'MultiLineString', 'coordinates': _rounded(wall.segments)}
-        elif abs(squared.plane.normal[2]) < 0.1:
+    walls = {wall.plane: wall.segments for wall in plan.walls}
+    for k, plane in enumerate(plan.planes):
+        parts = [[_rounded(np.append(r, r[:1], 0)) for r in p] for p in plane.outline.parts]
+        if k in walls:
+            geometry = {'type': 'MultiLineString', 'coordinates': _rounded(walls[k])}
+        elif abs(plane.normal[2]) < 0.1:
             # Upright, and above or below all that a robot meets: its whole width.
-            along = [-squared.plane.normal[1], squared.plane.normal[0]]
-            corners = np.concatenate([r for part in squared.plane.outline.parts for r in part])
-            order = np.argsort(corners[:, :2] @ along)[[0, -1]]
-            ends = corners[order, :2]
-            geometry = {'type': 'MultiLineString', 'coordinates': [_rounded(ends)]}
+            corners = np.concatenate(plane.outline.rings)[:, :2]
+            order = np.argsort(corners @ [-plane.normal[1], plane.normal[0]])[[0, -1]]
+            geometry = {'type': 'MultiLineString', 'coordinates': [_rounded(corners[order])]}
         else:
-            flat = [[_rounded(r[:, :2]) for r in part] for part in parts]
+            flat = [[[corner[:2] for corner in ring] for ring in part] for part in parts]
             geometry = {'type': 'MultiPolygon', 'coordinates': flat}
-        properties = {**_row(squared), 'parts': [[_rounded(r) for r in part] for part in parts]}
-        features.append(_feature(geometry, properties))
+        features.append((geometry, {**plane_row(plane), 'parts': parts}))
     for opening in plan.openings:
-        geometry = {'type': 'LineString', 'coordinates': _rounded(opening.ends)}
-        properties = {'role': 'opening', 'width': round(opening.width, 4)}
-        properties['wall'] = plan.planes[opening.plane].plane.id
-        features.append(_feature(geometry, properties))
+        about = {'role': 'opening', 'width': round(opening.width, 4)}
+        about['wall'] = plan.planes[opening.plane].id
+        features.append(({'type': 'LineString', 'coordinates': _rounded(opening.ends)}, about))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = plan.motion
     collection = {
@@ -153,17 +132,12 @@ def write_geojson(path: Path, plan: FloorPlan) -> None:
         'units': 'metres',
         'up': {'direction': _rounded(plan.up.direction, 6), 'source': plan.up.source},
         'ground': round(plan.ground, 4),
-        'features': features,
+        'features': [
+            {'type': 'Feature', 'geometry': geometry, 'properties': about}
+            for geometry, about in features
+        ],
     }
     path.write_text(json.dumps(collection, indent=1), encoding='utf-8')
-
-
-def _feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
-    return {'type': 'Feature', 'geometry': geometry, 'properties': properties}
-
-
-def _closed(ring: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.concatenate([ring, ring[:1]])
 
 
 def _rounded(values: NDArray[np.float64], digits: int = 4) -> Any:
@@ -171,33 +145,32 @@ def _rounded(values: NDArray[np.float64], digits: int = 4) -> Any:
 
 
 def _write_pgm(path: Path, plan: FloorPlan) -> None:
-    shades = np.full(plan.grid.cells.shape, _UNKNOWN, np.uint8)
+    shades = np.full(plan.cells.shape, _UNKNOWN, np.uint8)
     for value, shade in _SHADES.items():
-        shades[plan.grid.cells == value] = shade
+        shades[plan.cells == value] = shade
     # Row 0 of the picture is at the greatest y.
     _, data = cv2.imencode('.pgm', shades[::-1])
     path.write_bytes(data.tobytes())
 
 
 def _write_yaml(path: Path, plan: FloorPlan) -> None:
-    x, y = plan.grid.origin
+    x, y = plan.origin
     path.write_text(
         'image: map.pgm\nmode: trinary\n'
-        f'resolution: {plan.grid.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
+        f'resolution: {plan.resolution:g}\norigin: [{x:.6g}, {y:.6g}, 0.0]\nnegate: 0\n'
         f'occupied_thresh: {_OCCUPIED_THRESHOLD}\nfree_thresh: {_FREE_THRESHOLD}\n'
     )
 
 
 def _write_ply(path: Path, plan: FloorPlan) -> None:
-    planes = [squared.plane for squared in plan.planes]
-    write_mesh(path, planes, colours([plane.id for plane in planes]))
+    write_mesh(path, plan.planes, colours([plane.id for plane in plan.planes]))
 
 
 def _write_glb(path: Path, plan: FloorPlan) -> None:
     import trimesh
 
     scene = trimesh.Scene()
-    for plane in (squared.plane for squared in plan.planes):
+    for plane in plan.planes:
         corners, faces = plane.mesh()
         material = trimesh.visual.material.PBRMaterial(
             baseColorFactor=[*colours([plane.id])[0].tolist(), 255],

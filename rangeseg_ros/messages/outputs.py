@@ -16,7 +16,7 @@ from rangeseg_ros.core.ground import points
 from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
-from rangeseg_ros.core.mapping.placement import moved_planes
+from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.range_image import RangeImage

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.floor_plan import FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.occupancy import FREE, OCCUPIED, Grid
+from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
 from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.plans import plane_rows
+from rangeseg_ros.io.plans import plane_row
 from rangeseg_ros.report.page import render, write_page
 
 # Deviations of walls, metres, up to which they have the colours of the legend.
@@ -24,42 +23,40 @@ _CLASSES = (
     (0.02, '#e66101'),
     (np.inf, '#b2182b'),
 )
-_FILLS = {'floor': '#eef3f8', 'table': '#e4d8c4', 'ceiling': 'none'}
+_FILLS = {'floor': '#eef3f8', 'table': '#e4d8c4'}
 # Around the plan, and below it for the legend, metres.
 _MARGIN, _LEGEND = 0.3, 1.3
 
 
 def svg(plan: FloorPlan) -> str:
     """The plan as an SVG picture, 100 units to the metre, y down."""
-    height, width = plan.grid.cells.shape
-    left, low = plan.grid.origin
-    side = plan.grid.resolution
+    height, width = plan.cells.shape
+    left, low = plan.origin
+    side = plan.resolution
     top = -low - height * side - _MARGIN
     down = height * side + 2 * _MARGIN + _LEGEND
     box = [left - _MARGIN, top, width * side + 2 * _MARGIN, down]
     level = []
-    for squared in plan.planes:
-        plane = squared.plane
+    for plane in plan.planes:
         if abs(plane.normal[2]) >= 0.5 and plane.role != 'ceiling':
-            rings = [ring[:, :2] * (1, -1) for part in plane.outline.parts for ring in part]
+            rings = [ring[:, :2] * (1, -1) for ring in plane.outline.rings]
             path = ''.join('M' + 'L'.join(f'{x:.3f} {y:.3f}' for x, y in r) + 'Z' for r in rings)
             fill = _FILLS.get(plane.role, '#ececec')
-            level.append((plane.role, fill, path, _title(squared)))
+            level.append((plane.role, fill, path, _title(plane)))
     walls = []
     for wall in plan.walls:
-        squared = plan.planes[wall.plane]
-        deviation = deviation_of(squared.plane)
-        colour = next(colour for most, colour in _CLASSES if deviation <= most)
+        plane = plan.planes[wall.plane]
+        colour = next(colour for most, colour in _CLASSES if deviation_of(plane) <= most)
         for ends in wall.segments:
-            title = f'{_title(squared)}, {np.linalg.norm(ends[1] - ends[0]):.3f} m long'
-            walls.append((squared.plane.role, ends.round(3).tolist(), colour, title))
+            title = f'{_title(plane)}, {np.linalg.norm(ends[1] - ends[0]):.3f} m long'
+            walls.append((plane.role, ends.round(3).tolist(), colour, title))
     return render(
         'plan.svg',
         plan=plan,
         box=np.round(box, 3).tolist(),
         side=side,
-        free=_runs(plan.grid, FREE),
-        occupied=_runs(plan.grid, OCCUPIED),
+        free=_runs(plan, FREE),
+        occupied=_runs(plan, OCCUPIED),
         level=level,
         walls=walls,
         openings=[(o.ends.round(3).tolist(), o.width) for o in plan.openings],
@@ -67,20 +64,19 @@ def svg(plan: FloorPlan) -> str:
     )
 
 
-def _title(squared: Squared) -> str:
-    plane, exact = squared.plane, f', {squared.exact}' if squared.exact else ''
-    deviation = 1e3 * deviation_of(plane)
+def _title(plane: Squared) -> str:
     name = f'{plane.role} {plane.id}: {plane.area:.2f} m2'
-    return f'{name}, standard deviation {deviation:.1f} mm{exact}'
+    exact = f', {plane.exact}' if plane.exact else ''
+    return f'{name}, standard deviation {1e3 * deviation_of(plane):.1f} mm{exact}'
 
 
-def _runs(grid: Grid, value: int) -> list[list[float]]:
+def _runs(plan: FloorPlan, value: int) -> list[list[float]]:
     """Runs of cells of a value along the rows: left end, upper side and width, y down."""
-    cells = np.pad((grid.cells == value).astype(np.int8), [(0, 0), (1, 1)])
+    cells = np.pad((plan.cells == value).astype(np.int8), [(0, 0), (1, 1)])
     row, ends = np.nonzero(np.diff(cells, axis=1))
-    start, end = ends.reshape(-1, 2).T * grid.resolution
-    upper = -grid.origin[1] - (row[::2] + 1) * grid.resolution
-    found: list[list[float]] = np.stack([grid.origin[0] + start, upper, end - start], 1).tolist()
+    start, end = ends.reshape(-1, 2).T * plan.resolution
+    upper = -plan.origin[1] - (row[::2] + 1) * plan.resolution
+    found: list[list[float]] = np.stack([plan.origin[0] + start, upper, end - start], 1).tolist()
     return [[round(v, 3) for v in run] for run in found]
 
 
@@ -91,17 +87,7 @@ def write_picture(path: Path, plan: FloorPlan) -> None:
 
 
 def write_plan_page(path: Path, name: str, plan: FloorPlan, warnings: Sequence[str] = ()) -> None:
-    """Write the page, which needs no other file.
-
-    Parameters
-    ----------
-    path : Path
-    name : str
-        Of the recording.
-    plan : FloorPlan
-    warnings : sequence of str
-        What is to be known of the recording.
-    """
+    """Write the page of a recording, which needs no other file, with what is to be known of it."""
     solids = [
         {
             'name': f'{plane.role} {plane.id}',
@@ -109,7 +95,7 @@ def write_plan_page(path: Path, name: str, plan: FloorPlan, warnings: Sequence[s
             'corners': np.round(corners, 4).tolist(),
             'faces': faces.tolist(),
         }
-        for plane in (squared.plane for squared in plan.planes)
+        for plane in plan.planes
         for corners, faces in [plane.mesh()]
     ]
     write_page(
@@ -122,7 +108,7 @@ def write_plan_page(path: Path, name: str, plan: FloorPlan, warnings: Sequence[s
         degrees=float(np.degrees(plan.up.deviation)),
         turned=not np.array_equal(plan.motion.rotation, np.eye(3)),
         drawing=svg(plan),
-        rows=sorted(plane_rows(plan), key=lambda row: -row['area']),
+        rows=sorted(map(plane_row, plan.planes), key=lambda row: -row['area']),
         openings=[round(opening.width, 3) for opening in plan.openings],
         solids=json.dumps(solids, separators=(',', ':')),
     )

@@ -48,18 +48,10 @@ class CalibrationError(ValueError):
 
 
 class Fold(NamedTuple):
-    """One block of frames left out.
+    """One block of frames, first and last, left out, and the field (K, G) of the others, 1/m.
 
-    Attributes
-    ----------
-    frames : (first, last) int
-        The block.
-    field : (K, G) float64
-        Of the other frames, 1/m.
-    before, after : float
-        Root mean square residual of the cells of the block, without and with the field, 1/m.
-    weight : float
-        Sum of the weights of these cells.
+    Root mean square residual of the cells of the block, without and with the field, 1/m, and the
+    sum of the weights of these cells.
     """
 
     frames: tuple[int, int]
@@ -69,55 +61,30 @@ class Fold(NamedTuple):
     weight: float
 
 
+_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
+
+
 class Calibration(NamedTuple):
     """What was learned.
 
-    Attributes
-    ----------
-    distortion : DistortionMap
-    views : (rows, columns) int
-        Different distances at which each cell was seen.
-    folds : list of Fold
-        The blocks left out.
+    `views` (rows, columns) are the different distances at which each cell was seen; `before` is
+    the root mean square residual of the cells of planes, 1/m, `after` that on frames left out,
+    with the map of the others.
     """
 
     distortion: DistortionMap
     views: NDArray[np.intp]
     folds: list[Fold]
-
-    @property
-    def before(self) -> float:
-        """Root mean square residual of the cells of planes, 1/m."""
-        return self._rms([fold.before for fold in self.folds])
-
-    @property
-    def after(self) -> float:
-        """The same on frames left out, with the map of the others, 1/m."""
-        return self._rms([fold.after for fold in self.folds])
-
-    def _rms(self, values: list[float]) -> float:
-        weight = [fold.weight for fold in self.folds]
-        return float(np.sqrt(np.average(np.square(values), weights=weight)))
+    before: float
+    after: float
 
 
 def calibrate(
     seen: Sightings, shape: tuple[int, int], camera: Camera | None = None
 ) -> Calibration:
-    """Learn the distortion of a sensor.
+    """Learn the distortion of a sensor from sightings in images of a shape, in the order of time.
 
-    Parameters
-    ----------
-    seen : Sightings
-        Of all frames, in the order of time.
-    shape : (int, int)
-        Of the images.
-    camera : Camera, optional
-        Whose images they are.
-
-    Raises
-    ------
-    CalibrationError
-        The recording does not hold the distortion; the message says what to record.
+    CalibrationError where the recording does not hold it; the message says what to record.
     """
     views = _views(seen, shape)
     _check(seen, views)
@@ -131,12 +98,12 @@ def calibrate(
 
     def best(tried: Sequence[tuple[float, ...]]) -> tuple[tuple[float, ...], list[Fold]]:
         folds = [_folds(seen, basis[: len(own)], blocks, grid, own) for own in tried]
-        return min(zip(tried, folds, strict=True), key=lambda pair: sum(map(_left, pair[1])))
+        return min(zip(tried, folds, strict=True), key=lambda pair: _left(pair[1]).sum())
 
     smoothness, folds = best(_SMOOTHNESS)
     sloped = best([(*smoothness, slope) for slope in _SLOPES])
     # The simpler model, unless the other is better by more than the standard error of that.
-    gain = np.array([_left(one) - _left(two) for one, two in zip(folds, sloped[1], strict=True)])
+    gain = _left(folds) - _left(sloped[1])
     if gain.mean() > gain.std(ddof=1) / np.sqrt(BLOCKS):
         smoothness, folds = sloped
     weight = _settled_weights(seen, grid)
@@ -148,20 +115,23 @@ def calibrate(
     known, flat = views > 0, field[0].reshape(grid)
     each = [fold.field[0].reshape(grid) for fold in folds]
     deviation = _deviation(each, rough[0].reshape(grid) - flat, known)
-    pixels = _in_pixels(known, shape)
+    size = cell_size(shape)
+    pixels = np.kron(known, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
     slope = None
     if len(field) > 1:
-        slope = np.where(pixels, _smooth_in_pixels(field[1].reshape(grid) / spread, shape), 0)
+        sloping = pixels * _smooth_in_pixels(field[1].reshape(grid) / spread, shape)
         # One slope everywhere scales all planes, and leaves them planes.
-        slope = (slope - pixels * slope[pixels].mean()).astype(np.float32)
+        slope = (sloping - pixels * sloping[pixels].mean()).astype(np.float32)
     distortion = DistortionMap(
         without_plane(_smooth_in_pixels(flat, shape), pixels).astype(np.float32),
-        np.where(pixels, _smooth_in_pixels(deviation, shape), 0).astype(np.float32),
+        (pixels * _smooth_in_pixels(deviation, shape)).astype(np.float32),
         slope,
         camera,
         0.0 if slope is None else reference,
     )
-    return Calibration(distortion, views, folds)
+    squares = np.square([(fold.before, fold.after) for fold in folds])
+    mean = np.sqrt(np.average(squares, axis=0, weights=[fold.weight for fold in folds]))
+    return Calibration(distortion, views, folds, float(mean[0]), float(mean[1]))
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -173,24 +143,22 @@ def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
 
 
 def _check(seen: Sightings, views: NDArray[np.intp]) -> None:
-    frames = len(np.unique(seen.frame))
+    frames, covered = len(np.unique(seen.frame)), float((views > 0).mean())
+    why = ''
     if frames < _FEWEST_FRAMES:
-        raise CalibrationError(
+        why = (
             f'too few planes: {frames} of {seen.frames} frames show one that is large enough, '
-            f'{_FEWEST_FRAMES} are needed; {ADVICE}'
+            f'{_FEWEST_FRAMES} are needed'
         )
-    covered = float((views > 0).mean())
-    if covered < 0.5:
-        raise CalibrationError(
-            f'too few positions: planes cover {covered:.0%} of the image, '
-            f'half of it is needed; {ADVICE}'
-        )
-    typical = int(np.median(views[views > 0]))
-    if typical < _FEWEST_VIEWS:
-        raise CalibrationError(
+    elif covered < 0.5:
+        why = f'too few positions: planes cover {covered:.0%} of the image, half of it is needed'
+    elif (typical := int(np.median(views[views > 0]))) < _FEWEST_VIEWS:
+        why = (
             f'too few ranges: most parts of the image see planes at no more than {typical} of the '
-            f'{_FEWEST_VIEWS} distances that tell the sensor from the shape of things; {ADVICE}'
+            f'{_FEWEST_VIEWS} distances that tell the sensor from the shape of things'
         )
+    if why:
+        raise CalibrationError(f'{why}; {ADVICE}')
 
 
 def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float64]:
@@ -200,12 +168,8 @@ def _settled_weights(seen: Sightings, grid: tuple[int, int]) -> NDArray[np.float
     return robust_weights(seen, field[seen.cell])
 
 
-_Block = tuple[NDArray[np.bool_], NDArray[np.float64]]
-"""Which planes (P,) are of a block of frames, and weights of the cells of all others."""
-
-
 def _blocks(seen: Sightings, grid: tuple[int, int]) -> list[_Block]:
-    """The blocks that are left out, and weights of the others that know nothing of them."""
+    """Which planes (P,) are of each block of frames, and weights of the cells of all others."""
     found = []
     for block in np.array_split(np.unique(seen.frame), BLOCKS):
         inside = (seen.frame >= block[0]) & (seen.frame <= block[-1])
@@ -220,24 +184,23 @@ def _folds(
     grid: tuple[int, int],
     smoothness: Sequence[float],
 ) -> list[Fold]:
-    """Each block of frames, and what the field of the others leaves of it."""
+    """The blocks of frames, each left out."""
     found = []
     for inside, weight in blocks:
         out = ~inside[seen.plane()]
-        train, test = seen.of_planes(~inside), seen.of_planes(inside)
-        field = solve(train, basis[:, out], weight, grid, smoothness)
+        test = seen.of_planes(inside)
+        field = solve(seen.of_planes(~inside), basis[:, out], weight, grid, smoothness)
         before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
-        share = residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
-        total = float(counts.sum())
-        rms = [float(np.sqrt(counts @ part**2 / total)) for part in (before, before - share)]
+        after = before - residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
+        rms = [float(np.sqrt(np.average(part**2, weights=counts))) for part in (before, after)]
         ends = int(test.frame.min()), int(test.frame.max())
-        found.append(Fold(ends, field, rms[0], rms[1], total))
+        found.append(Fold(ends, field, rms[0], rms[1], float(counts.sum())))
     return found
 
 
-def _left(fold: Fold) -> float:
-    """Sum of the squares of what the field leaves of the residuals of a block."""
-    return fold.weight * fold.after**2
+def _left(folds: Sequence[Fold]) -> NDArray[np.float64]:
+    """Sums of the squares of what the fields leave of the residuals of each block."""
+    return np.array([fold.weight * fold.after**2 for fold in folds])
 
 
 def _deviation(
@@ -260,11 +223,6 @@ def without_plane(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArr
     result = np.zeros_like(field)
     result[v, u] = field[v, u] - terms @ plane
     return result
-
-
-def _in_pixels(cells: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    size = cell_size(shape)
-    return np.kron(cells, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
 
 
 def _smooth_in_pixels(cells: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:

@@ -46,24 +46,10 @@ def solve(
     grid: tuple[int, int],
     smoothness: Sequence[float],
 ) -> NDArray[np.float64]:
-    """Coefficients of the field.
+    """Coefficients (K, rows * columns) of the field on the grid, 1/m for the basis 1.
 
-    Parameters
-    ----------
-    seen : Sightings
-        N cells.
-    basis : (K, N) float64
-        Factors of the coefficients.
-    weight : (N,) float64
-    grid : (int, int)
-        Rows and columns of cells.
-    smoothness : (K,) float
-        Weight of the squared differences, in sightings of a cell.
-
-    Returns
-    -------
-    (K, rows * columns) float64
-        1/m for the basis 1.
+    `basis` (K, N) are their factors at the N cells that were seen, `weight` (N,); `smoothness`
+    (K,) is the weight of the squared differences, in sightings of a cell.
     """
     size, count = grid[0] * grid[1], len(basis)
     columns = np.concatenate([seen.cell + k * size for k in range(count)])
@@ -96,14 +82,10 @@ def _roughness(grid: tuple[int, int], place: int) -> sparse.csr_matrix:
     (one_v, first_v, second_v), (one_u, first_u, second_u) = (
         [sparse.csr_matrix(np.diff(np.eye(n), order, axis=0)) for order in range(3)] for n in grid
     )
+    parts = [sparse.kron(first_v, one_u), sparse.kron(one_v, first_u)]
     if place == 0:
-        parts = [
-            sparse.kron(second_v, one_u),
-            sparse.kron(one_v, second_u),
-            np.sqrt(2) * sparse.kron(first_v, first_u),
-        ]
-    else:
-        parts = [sparse.kron(first_v, one_u), sparse.kron(one_v, first_u)]
+        parts = [sparse.kron(second_v, one_u), sparse.kron(one_v, second_u)]
+        parts.append(np.sqrt(2) * sparse.kron(first_v, first_u))
     rows = sparse.vstack(parts)
     return (rows.T @ rows).tocsr()
 

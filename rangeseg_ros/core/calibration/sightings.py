@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -24,20 +24,9 @@ _OUTLIER = 5.0
 class Sightings(NamedTuple):
     """Planes seen in frames of one size, P of them, of N cells together.
 
-    Attributes
-    ----------
-    frame : (P,) int
-        Number of the frame.
-    start : (P + 1,) int
-        Where the cells of each plane begin.
-    cell : (N,) int
-        Which cell of the image, row by row.
-    inverse : (N,) float64
-        Mean inverse depth 1/z, 1/m.
-    ray : (N, 3) float64
-        Mean ray, scaled to z = 1.
-    frames : int
-        Number of frames, with those that show no plane.
+    Each plane has the number of its `frame` (P,), of `frames` with those that show no plane, and
+    the cells from its `start` (P + 1,) on: which `cell` of the image (N,), row by row, its mean
+    inverse depth 1/z (N,), 1/m, and its mean ray (N, 3), scaled to z = 1.
     """
 
     frame: NDArray[np.intp]
@@ -78,14 +67,9 @@ def cell_grid(shape: tuple[int, int]) -> tuple[int, int]:
 
 
 def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
-    """Planes of one frame.
+    """Planes of one frame with these labels (H, W), 0 for no plane.
 
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        Regions, 0 for no plane.
-    image : RangeImage
-        (H, W); an inverse range along a unit ray is taken as the inverse depth it is.
+    An inverse range along a unit ray is taken as the inverse depth it is.
     """
     size, (rows, columns) = cell_size(labels.shape), cell_grid(labels.shape)
     height, width = labels.shape
@@ -120,13 +104,9 @@ def find_sightings(labels: NDArray[np.uint16], image: RangeImage) -> Sightings:
 
 def concatenate(frames: Sequence[Sightings]) -> Sightings:
     """Sightings of several frames, numbered one after the other."""
-    first = np.cumsum([0, *(part.frames for part in frames)]).tolist()
-    counts = np.concatenate([np.diff(part.start) for part in frames])
-    return Sightings(
-        np.concatenate([part.frame + at for part, at in zip(frames, first[:-1], strict=True)]),
-        np.concatenate([[0], np.cumsum(counts)]).astype(np.intp),
-        np.concatenate([part.cell for part in frames]),
-        np.concatenate([part.inverse for part in frames]),
-        np.concatenate([part.ray for part in frames]),
-        first[-1],
-    )
+    frame, start, cell, inverse, ray, count = zip(*frames, strict=True)
+    first = np.cumsum([0, *count])
+    cells = np.cumsum(np.concatenate([[0], *map(np.diff, start)]))
+    frame = np.concatenate(frame) + np.repeat(first[:-1], [len(part) for part in frame])
+    parts: list[NDArray[Any]] = [np.concatenate(part) for part in (cell, inverse, ray)]
+    return Sightings(frame, cells.astype(np.intp), parts[0], parts[1], parts[2], int(first[-1]))

@@ -84,7 +84,7 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
         ramp = (slope > 2 * config.up_sd) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
-            foot = np.abs(_corners(planes[k]) @ floor.normal + floor.distance).min()
+            foot = np.abs(corners_of(planes[k]) @ floor.normal + floor.distance).min()
             if foot <= config.role_height:
                 found[k] = 'ramp'
     return [str(role) for role in found]
@@ -112,7 +112,7 @@ def _floor(
         return largest[near[off[near].argmin()]] if len(near) else None
 
     def reach(plane: Plane) -> float:
-        corners = _corners(plane)
+        corners = corners_of(plane)
         depth = -corners @ up
         across = np.linalg.norm(corners + depth[:, None] * up, axis=1)
         return float((across / np.maximum(depth, 1e-3)).min())
@@ -139,7 +139,7 @@ def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
     return np.array([plane.centroid for plane in planes]) @ level.normal + level.distance
 
 
-def _corners(plane: Plane) -> NDArray[np.float64]:
+def corners_of(plane: Plane) -> NDArray[np.float64]:
     """(4, 3) corners of the rectangle around a plane."""
     axes = rotation_matrix(plane.orientation)[:, :2]
     half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2

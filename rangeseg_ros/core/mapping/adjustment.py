@@ -10,7 +10,7 @@ x_p the error of the plane, s_f that of the pose (a turn about the camera and a 
 of the sensor. The part of v that lasts (`observations`) is the same in the n frames of a run in
 which the plane is seen by the same pixels: it counts n times, so that the mean of the run has it
 once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f;
-those before a jump (`pose_jumps`) moreover by what the jump was taken for wrongly.
+those before a jump (`plane_filter`) moreover by what the jump was taken for wrongly.
 The errors of an odometry add up: e_f - e_(f-1) is its noise, and it has no other drift. A drift
 that is not significant is none.
 """
@@ -18,37 +18,23 @@ that is not significant is none.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import block_diag
-from scipy.sparse.linalg import SuperLU, splu
+from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.mapping.map_planes import MapPlane
-from rangeseg_ros.core.mapping.observations import (
-    Observations,
-    PoseNoise,
-    Sighting,
-    continuity,
-    observations,
-)
-from rangeseg_ros.core.mapping.pose_jumps import Jump
+from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
+from rangeseg_ros.core.mapping.observations import LASTING, PlaneSet, PoseNoise
+from rangeseg_ros.core.mapping.plane_filter import Jump
+from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import cross_matrix
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
-from rangeseg_ros.core.tracking.plane_errors import (
-    GATE,
-    by_motion,
-    congruent,
-    from_errors,
-    shifted,
-    tangents,
-    to_errors,
-)
+from rangeseg_ros.core.tracking.plane_errors import GATE, congruent, from_errors
 
 _ROUNDS = 6  # until weights settle
 _SYMMETRIC = {'SymmetricMode': True}
@@ -59,23 +45,11 @@ _LEAST = 1e-5
 
 
 class Solution(NamedTuple):
-    """Planes and poses as they were most probably.
+    """Planes, with outlines on them, and poses of the frames as they were most probably.
 
-    Attributes
-    ----------
-    planes : list of MapPlane
-        Their outlines are moved onto them.
-    covariance : (4 P, 4 P) float64
-        Of normal and distance of all planes in turn.
-    poses : list of Transform
-        Of the frames in turn.
-    drift : (3,) float64
-        Of the poses as they were told, metres per metre of the way.
-    drift_covariance : (3, 3) float64
-    way : float
-        Of the camera, metres.
-    drifts : bool
-        Whether the drift is larger than chance makes it (chi-squared, 0.999), and taken off.
+    `covariance` (4 P, 4 P) is of normal and distance of all planes in turn. `drift` (3,) is of the
+    poses as they were told, metres per metre of the `way` of the camera, metres; where it is more
+    than chance makes it (chi-squared, 0.999), the camera `drifts`, and it is taken off.
     """
 
     planes: list[MapPlane]
@@ -100,12 +74,8 @@ class Solution(NamedTuple):
 class Adjustment:
     """Collects what the frames of a recording show of the planes of its map.
 
-    Parameters
-    ----------
-    noise : PoseNoise
-        Of the poses that are told, or of their changes from frame to frame.
-    odometry : bool
-        Whether the errors of the poses add up.
+    `noise` is that of the poses that are told or, where their errors add up as those of an
+    odometry do, of their changes from frame to frame.
 
     Examples
     --------
@@ -114,77 +84,62 @@ class Adjustment:
     """
 
     def __init__(self, noise: PoseNoise, odometry: bool = False) -> None:
-        self._noise = np.repeat(np.maximum([noise.turn, noise.shift], _LEAST), 3)
+        self._noise = np.maximum(noise.deviations, _LEAST)
         self._odometry = odometry
         self._poses: list[Transform] = []
-        self._seen: list[Observations] = []
+        self._planes: list[PlaneSet] = []
+        self._covariance: list[NDArray[np.float64]] = []
         # Number of its frame, id of its plane and number of its run, for each observation.
         self._index: list[tuple[int, int, int]] = []
-        self._last: dict[int, tuple[NDArray[np.float64], int]] = {}
+        self._runs: dict[int, int] = {}
         # Number of the frame after each jump of the poses.
         self._jumps: list[tuple[int, Jump]] = []
 
-    def __len__(self) -> int:
-        return len(self._poses)
-
     def add(self, frame: Sighting) -> None:
-        """Take in a frame. Of parts of one plane the largest counts."""
+        """Take in a frame."""
         if frame.jump:
             self._poses = [frame.jump.motion.after(pose) for pose in self._poses]
             self._jumps.append((len(self._poses), frame.jump))
+        for number, begins in zip(frame.ids.tolist(), frame.begins.tolist(), strict=True):
+            if begins or number not in self._runs:
+                self._runs[number] = len(self._index)
+            self._index.append((len(self._poses), number, self._runs[number]))
         self._poses.append(frame.pose)
-        if not len(frame.ids):
-            return
-        size = np.array([plane.count for plane in frame.planes])
-        order = np.lexsort([-size, frame.ids])
-        chosen = order[np.unique(frame.ids[order], return_index=True)[1]]
-        view = frame.view[chosen]
-        planes = [frame.planes[k] for k in chosen.tolist()]
-        still = Transform.identity(), PoseNoise(0.0, 0.0)
-        self._seen.append(observations(planes, view, *still)._replace(view=view[:, :0]))
-        for number, own in zip(frame.ids[chosen].tolist(), view, strict=True):
-            before, run = self._last.get(number, (own[:0], 0))
-            if before.shape != own.shape or continuity(before[None], own[None])[0] < 1:
-                before, run = own, len(self._index)
-                self._last[number] = before, run
-            self._index.append((len(self._poses) - 1, number, run))
+        # As the camera sees them.
+        self._planes.append(frame.seen.planes.moved(frame.pose.inverse()))
+        self._covariance.append(frame.seen.covariance)
 
     def solve(self, planes: Sequence[MapPlane], successors: Mapping[int, int]) -> Solution:
-        """Planes and poses of all frames.
+        """Planes and poses of all frames, of these planes of the map.
 
-        Parameters
-        ----------
-        planes : sequence of MapPlane
-            Of the map; observations of others do not count.
-        successors : mapping of int
-            Ids that planes have now, by those that they had when they were observed.
+        `successors` are the ids that planes have now, by those they had when they were observed.
         """
         number = {plane.id: k for k, plane in enumerate(planes)}
-        used, index = [], []
-        for i, (at, own, run) in enumerate(self._index):
+
+        def now(own: int) -> int:
             while own in successors:
                 own = successors[own]
-            if own in number:
-                used.append(i)
-                index.append((at, number[own], run))
-        seen = Observations(
-            *(np.concatenate(part)[used] for part in zip(*self._seen, strict=True))
-        )
-        frame, plane, times = np.array(index, np.intp).reshape(-1, 3).T
-        times = np.bincount(times)[times][:, None, None]
-        error = seen.fresh + times * congruent(seen.lasting, np.eye(3))
-        sightings = frame, plane, seen.plane, error
-        told = _State.of(planes, self._poses)
+            return number.get(own, -1)
+
+        index = [(at, now(own), run) for at, own, run in self._index]
+        frame, plane, runs = np.array(index, np.intp).reshape(-1, 3).T
+        used = plane >= 0
+        frame, plane, runs = frame[used], plane[used], runs[used]
+        times = np.bincount(runs)[runs]
+        seen = PlaneSet(*map(np.concatenate, zip(*self._planes, strict=True))).where(used)
+        error = np.concatenate(self._covariance)[used]
+        error *= (1 - LASTING + times * LASTING)[:, None, None]
+        told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
+        sightings = frame, plane, seen, error
         state, drift, covariance = self._solved(told, sightings, drifts=not self._odometry)
         drift_covariance = covariance[-3:, -3:]
         drifts = drift @ np.linalg.solve(drift_covariance, drift) > chi2_quantile(3)
         if not drifts:
             state, _, covariance = self._solved(told, sightings, drifts=False)
-        jacobian = block_diag(*from_errors(state.axes, state.point))
+        jacobian = block_diag(*from_errors(state.planes.axes, state.planes.point))
         joint = jacobian @ covariance[:-3, :-3] @ jacobian.T
-        equations = np.column_stack([state.normal, -(state.normal * state.point).sum(axis=1)])
         return Solution(
-            moved_onto(planes, equations, joint),
+            moved_onto(planes, state.planes.equations, joint),
             joint,
             [Transform(*pose) for pose in zip(state.turn, state.shift, strict=True)],
             drift,
@@ -196,17 +151,17 @@ class Adjustment:
     def _solved(
         self,
         told: _State,
-        sightings: tuple[NDArray, NDArray, NDArray, NDArray],
+        sightings: tuple[NDArray[np.intp], NDArray[np.intp], PlaneSet, NDArray[np.float64]],
         drifts: bool,
     ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
         """The most probable state and drift, and the covariance of all planes and the drift."""
         state, weight = told, np.ones(len(sightings[0]))
         # What jumps were taken for wrongly, and the drift.
         rest = np.zeros(6 * len(self._jumps) + 3)
-        first, last = 3 * len(told.normal), 3 * len(told.normal) + 6 * len(told.turn)
+        first, last = 3 * len(told.planes.normal), 3 * len(told.planes.normal) + 6 * len(told.turn)
         prior = self._prior(first, drifts)
         for _ in range(_ROUNDS):
-            design, gap = _equations(state, *sightings, len(rest))
+            design, gap = state.equations(*sightings, len(rest))
             known = np.concatenate([np.zeros(first), state.pose_errors(told), rest])
             scale = np.repeat(np.sqrt(weight), 3)
             rows = sparse.vstack([sparse.diags_array(scale) @ design, prior]).tocsr()
@@ -216,13 +171,17 @@ class Adjustment:
             left = ((gap - design @ step).reshape(-1, 3) ** 2).sum(axis=1)
             weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(left, 1e-12)))
             state, rest = state.corrected(step[:first], step[first:last]), rest + step[last:]
-        size = len(step)
-        covariance = _part_of_inverse(factors, np.r_[:first, size - 3 : size])
+        # Of the inverse, what is of the planes and the drift.
+        chosen = np.r_[:first, len(step) - 3 : len(step)]
+        unit = sparse.eye_array(len(step), format='csc')
+        blocks = np.split(chosen, range(_COLUMNS, len(chosen), _COLUMNS))
+        parts = [factors.solve(unit[:, block].toarray())[chosen] for block in blocks]
+        covariance, of_drift = np.hstack(parts), factors.solve(unit[:, -3:].toarray())
         # What planes disagree by, each with all of its errors: a cluster-robust variance (Liang
         # and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
-        of_drift = factors.solve(np.eye(size, 3, 3 - size))
-        part = scale[:, None] * (design @ of_drift) * (scale * (gap - design @ step))[:, None]
-        each = np.zeros((len(told.normal), 3))
+        left = scale**2 * (gap - design @ step)
+        part = (design @ of_drift) * left[:, None]
+        each = np.zeros((len(told.planes.normal), 3))
         np.add.at(each, np.repeat(sightings[1], 3), part)
         covariance[-3:, -3:] += each.T @ each
         return state, rest[-3:], covariance
@@ -264,18 +223,9 @@ class Adjustment:
 class _State(NamedTuple):
     """Planes and poses as they are estimated."""
 
-    normal: NDArray[np.float64]
-    point: NDArray[np.float64]
-    axes: NDArray[np.float64]
+    planes: PlaneSet
     turn: NDArray[np.float64]
     shift: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, planes: Sequence[MapPlane], poses: Sequence[Transform]) -> _State:
-        normal = np.array([plane.normal for plane in planes]).reshape(-1, 3)
-        point = np.array([plane.centroid for plane in planes]).reshape(-1, 3)
-        turn, shift = (np.array(part) for part in zip(*poses, strict=True))
-        return cls(normal, point, tangents(normal), turn, shift)
 
     def pose_errors(self, told: _State) -> NDArray[np.float64]:
         """(6 F,) what poses that were told err by."""
@@ -285,79 +235,32 @@ class _State(NamedTuple):
     def corrected(self, planes: NDArray[np.float64], poses: NDArray[np.float64]) -> _State:
         """Without these errors, (3 P,) and (6 F,)."""
         turn, shift = np.split(poses.reshape(-1, 6), 2, axis=1)
-        moved = shifted(self.normal, self.point, self.axes, planes.reshape(-1, 3))
         back = Rotation.from_rotvec(-turn).as_matrix()
-        return _State(*moved, back @ self.turn, self.shift - shift)
-
-
-def _equations(
-    state: _State,
-    frame: NDArray[np.intp],
-    plane: NDArray[np.intp],
-    seen: NDArray[np.float64],
-    error: NDArray[np.float64],
-    rest: int,
-) -> tuple[sparse.csr_array, NDArray[np.float64]]:
-    """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
-
-    The last `rest` unknowns are of the poses only.
-    """
-    turn, shift = state.turn[frame], state.shift[frame]
-    normal, point, axes = (part[plane] for part in state[:3])
-    to_world = np.zeros((len(turn), 4, 4))
-    to_world[:, :3, :3], to_world[:, 3, 3] = turn, 1
-    to_world[:, 3, :3] = -np.einsum('ni,nij->nj', shift, turn)
-    local = to_errors(axes, point) @ to_world
-    whiten = np.linalg.inv(np.linalg.cholesky(congruent(local, error)))
-    motion = -by_motion(normal, axes, point - shift)
-    values = np.concatenate([whiten, whiten @ motion], axis=2)
-    first = 3 * len(state.normal)
-    places = [3 * plane[:, None] + np.arange(3), first + 6 * frame[:, None] + np.arange(6)]
-    columns = np.repeat(np.concatenate(places, axis=1), 3, axis=0)
-    begin = np.arange(0, columns.size + 1, columns.shape[1])
-    shape = len(columns), first + 6 * len(state.turn) + rest
-    design = sparse.csr_array((values.ravel(), columns.ravel(), begin), shape)
-    return design, (whiten @ local @ seen[..., None]).ravel()
-
-
-def _part_of_inverse(factors: SuperLU, chosen: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Rows and columns `chosen` of the inverse of a factored matrix."""
-    parts = []
-    for some in np.split(chosen, range(_COLUMNS, len(chosen), _COLUMNS)):
-        unit = np.zeros((factors.shape[0], len(some)))
-        unit[some, np.arange(len(some))] = 1
-        parts.append(factors.solve(unit)[chosen])
-    return np.concatenate(parts, axis=1)
-
-
-def moved_onto(
-    planes: Sequence[MapPlane],
-    equations: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> list[MapPlane]:
-    """Planes with other equations (P, 4) and their joint covariance (4 P, 4 P).
-
-    Their outlines are moved onto them.
-    """
-    found = []
-    for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
-        normal, distance = equation[:3], float(equation[3])
-
-        def onto(
-            points: NDArray[np.float64],
-            normal: NDArray[np.float64] = normal,
-            distance: float = distance,
-        ) -> NDArray[np.float64]:
-            return points - (points @ normal + distance)[..., None] * normal
-
-        found.append(
-            replace(
-                plane,
-                normal=normal,
-                distance=distance,
-                covariance=covariance[4 * k : 4 * k + 4, 4 * k : 4 * k + 4],
-                centroid=onto(plane.centroid),
-                outline=plane.outline.moved(onto),
-            )
+        return _State(
+            self.planes.without(planes.reshape(-1, 3)), back @ self.turn, self.shift - shift
         )
-    return found
+
+    def equations(
+        self,
+        frame: NDArray[np.intp],
+        plane: NDArray[np.intp],
+        seen: PlaneSet,
+        error: NDArray[np.float64],
+        rest: int,
+    ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
+        """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
+
+        The last `rest` unknowns are of the poses only.
+        """
+        pose = Transform(self.turn[frame], self.shift[frame])
+        planes = self.planes.where(plane)
+        gap, turned = planes.apart(seen.moved(pose))
+        whiten = np.linalg.inv(np.linalg.cholesky(congruent(turned, error)))
+        values = np.concatenate([whiten, -whiten @ planes.by_motion(pose.shift)], axis=2)
+        first = 3 * len(self.planes.normal)
+        places = [3 * plane[:, None] + np.arange(3), first + 6 * frame[:, None] + np.arange(6)]
+        columns = np.repeat(np.concatenate(places, axis=1), 3, axis=0)
+        begin = np.arange(0, columns.size + 1, columns.shape[1])
+        shape = len(columns), first + 6 * len(self.turn) + rest
+        design = sparse.csr_array((values.ravel(), columns.ravel(), begin), shape)
+        return design, (whiten @ gap[..., None]).ravel()

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -12,19 +13,21 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.description.shapes import Shape
+from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
-from rangeseg_ros.core.rotations import quaternions
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import quaternions, rotation_matrix, turn_between
+from rangeseg_ros.core.tracking.plane_errors import moved_plane
+
+AnyPlane = TypeVar('AnyPlane', bound=Plane)
 
 
 @dataclass(frozen=True, eq=False)
 class MapOutline:
-    """Parts of a plane that were seen, in the fixed frame.
+    """Parts of a plane that were seen, in the fixed frame, largest first.
 
-    Attributes
-    ----------
-    parts : list of list of (N, 3) float64
-        For each part, largest first, its border, counter-clockwise seen from where the
-        plane was seen, and the borders of its holes, clockwise.
+    For each its border (N, 3), counter-clockwise seen from where the plane was seen, and the
+    borders of its holes, clockwise.
     """
 
     parts: list[list[NDArray[np.float64]]]
@@ -39,6 +42,11 @@ class MapOutline:
         """Borders (N, 3) of the holes in the largest part."""
         return self.parts[0][1:] if self.parts else []
 
+    @property
+    def rings(self) -> list[NDArray[np.float64]]:
+        """All borders (N, 3)."""
+        return [ring for part in self.parts for ring in part]
+
     def moved(self, motion: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> MapOutline:
         """The outline with its corners (N, 3) moved."""
         return MapOutline([[motion(ring) for ring in part] for part in self.parts])
@@ -52,15 +60,8 @@ class MapPlane(Plane):
     seen from. `extents`, `centre` and `orientation` are those of the least rectangle around all
     parts, `count` is the number of pixels of all observations, `rms` and `confidence` are means
     over them, `probability` is the largest, and `role` is what most observations found.
-
-    Attributes
-    ----------
-    observations : int
-        Number of regions that were fused.
-    age : float
-        Seconds between the first and the last sight of it.
-    first_stamp, last_stamp : int
-        Of these, nanoseconds.
+    `observations` is the number of regions that were fused, `age` the seconds from the first
+    stamp, nanoseconds, to the last one.
     """
 
     outline: MapOutline  # type: ignore[assignment]
@@ -108,48 +109,30 @@ class Record:
         self.id = min(self.id, other.id)
         self.first, self.last = min(self.first, other.first), max(self.last, other.last)
         self.seen = max(self.seen, other.seen)
-        self.observations += other.observations
-        self.pixels += other.pixels
-        self.squares += other.squares
-        self.confidence += other.confidence
         self.probability = max(self.probability, other.probability)
-        self.roles += other.roles
+        for name in ('observations', 'pixels', 'squares', 'confidence', 'roles'):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
-def describe(
-    record: Record,
-    normal: NDArray[np.float64],
-    point: NDArray[np.float64],
-    axes: NDArray[np.float64],
-    covariance: NDArray[np.float64],
-) -> MapPlane:
-    """The plane of a record.
+def describe(record: Record, plane: PlaneSet, covariance: NDArray[np.float64]) -> MapPlane:
+    """The plane of a record: one of the fixed frame, with the axes of its grid.
 
-    Parameters
-    ----------
-    record : Record
-    normal, point : (3,) float64
-        In the fixed frame.
-    axes : (2, 3) float64
-        Those of its grid.
-    covariance : (4, 4) float64
-        Of normal and distance.
+    `covariance` (4, 4) is that of normal and distance.
     """
-    grid = record.grid
+    grid, normal = record.grid, plane.normal[0]
     cells = grid.centres()
     middle, size, angle = cv2.minAreaRect(cells.astype(np.float32))
     along = np.radians(angle if size[0] >= size[1] else angle + 90)
-    major = np.array([np.cos(along), np.sin(along)]) @ axes
+    major = np.array([np.cos(along), np.sin(along)]) @ plane.axes[0]
     frame = np.stack([major, np.cross(normal, major), normal], axis=1)
-    rings = MapOutline([list(part) for part in grid.polygons()])
     return MapPlane(
         label=record.id,
         id=record.id,
         surface=record.id,
         normal=normal.copy(),
-        distance=float(-normal @ point),
+        distance=float(plane.distance[0]),
         covariance=covariance,
-        centroid=point + cells.mean(axis=0) @ axes,
+        centroid=plane.points(cells.mean(axis=0)[None])[0],
         count=record.pixels,
         rms=float(np.sqrt(record.squares / record.pixels)),
         confidence=record.confidence / record.pixels,
@@ -157,13 +140,58 @@ def describe(
         shape=Shape(
             area=grid.area,
             extents=np.sort(size)[::-1] + grid.side,
-            centre=point + np.array(middle) @ axes,
+            centre=plane.points(np.array([middle]))[0],
             orientation=quaternions(frame),
         ),
-        outline=rings.moved(lambda ring: point + ring @ axes),
+        outline=MapOutline([list(part) for part in grid.polygons()]).moved(plane.points),
         role=record.roles.most_common(1)[0][0],
         observations=record.observations,
         age=(record.last - record.first) * 1e-9,
         first_stamp=record.first,
         last_stamp=record.last,
     )
+
+
+def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane]:
+    """Planes in the frame that `motion` leads to; normals stay on the side of the sensor."""
+    turn, shift = motion
+    jacobian = moved_plane(turn, shift)
+    moved = []
+    for plane in planes:
+        normal = turn @ plane.normal
+        shape = Shape(
+            area=plane.area,
+            extents=plane.extents,
+            centre=turn @ plane.centre + shift,
+            orientation=quaternions(turn @ rotation_matrix(plane.orientation)),
+        )
+        outline = MapOutline(plane.outline.parts).moved(lambda ring: ring @ turn.T + shift)
+        moved.append(
+            replace(
+                plane,
+                normal=normal,
+                distance=float(plane.distance - normal @ shift),
+                covariance=jacobian @ plane.covariance @ jacobian.T,
+                centroid=turn @ plane.centroid + shift,
+                shape=shape,
+                outline=outline,  # type: ignore[arg-type]
+            )
+        )
+    return moved
+
+
+def moved_onto(
+    planes: Sequence[MapPlane], equations: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> list[MapPlane]:
+    """Planes turned about their centroids onto other equations (P, 4).
+
+    `covariance` (4 P, 4 P) is that of all of these.
+    """
+    found = []
+    for k, (plane, equation) in enumerate(zip(planes, equations, strict=True)):
+        turn = turn_between(plane.normal, equation[:3])
+        foot = plane.centroid - (equation @ [*plane.centroid, 1]) * equation[:3]
+        (moved,) = moved_planes([plane], Transform(turn, foot - turn @ plane.centroid))
+        own = np.s_[4 * k : 4 * k + 4]
+        found.append(replace(moved, covariance=covariance[own, own]))
+    return found

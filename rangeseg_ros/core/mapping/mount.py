@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.odometry import level
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
@@ -20,19 +21,9 @@ _STEEPEST = np.radians(60.0)
 class Mount(NamedTuple):
     """Where a camera is above the floor, the floor's frame below it with x forward, z up.
 
-    Attributes
-    ----------
-    roll, pitch : float
-        About the optical axis, positive where the camera's right side is lower, and downwards,
-        radians.
-    height : float
-        Metres.
-    sigma : (3,) float64
-        Standard deviations of these three.
-    rotation : (3, 3) float64
-        The floor's frame from the optical one.
-    doubts : list of str
-        Why the floor is not sure.
+    Roll about the optical axis is positive where the camera's right side is lower, pitch
+    downwards, radians; height is in metres, and `sigma` (3,) are standard deviations of the three.
+    `rotation` takes the optical frame to the floor's; `doubts` say why the floor is not sure.
     """
 
     roll: float
@@ -55,24 +46,11 @@ class Mount(NamedTuple):
 
 
 def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount | None:
-    """The mount by the floor among planes that were fused in the frame of the camera.
+    """The mount by the floor among planes that were fused in the optical frame.
 
     The floor is the largest plane that faces up; of a robot that drives on a flat floor, it alone
-    stays where it is.
-
-    Parameters
-    ----------
-    planes : sequence of MapPlane
-        In the optical frame.
-    frames : int
-        Number of frames they are from.
-    tolerance : float
-        Angle by which a floor is told from other planes, degrees: the parameter `role_tolerance`.
-
-    Returns
-    -------
-    Mount or None
-        None when nothing faces up.
+    stays where it is. None when nothing faces up. `frames` is the number of frames the planes are
+    from, `tolerance` the parameter `role_tolerance`, degrees.
     """
     facing = [plane for plane in planes if -plane.normal[1] > np.cos(_STEEPEST)]
     weight = [plane.area * plane.observations for plane in facing]
@@ -82,14 +60,12 @@ def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount
     floor = facing[order[0]]
     up = floor.normal
     roll, pitch = float(np.arctan2(-up[0], -up[1])), float(np.arcsin(np.clip(-up[2], -1, 1)))
-    level = up[0] ** 2 + up[1] ** 2
+    across = up[0] ** 2 + up[1] ** 2
     jacobian = np.zeros((3, 4))
-    jacobian[0, :2] = up[1] / level, -up[0] / level
+    jacobian[0, :2] = up[1] / across, -up[0] / across
     jacobian[1, 2] = -1 / np.sqrt(max(1 - up[2] ** 2, 1e-12))
     jacobian[2, 3] = 1
     sigma = np.sqrt(np.diag(jacobian @ floor.covariance @ jacobian.T))
-    forward = np.array([0, 0, 1.0]) - up[2] * up
-    forward /= np.linalg.norm(forward)
     doubts = []
     if 2 * floor.observations < frames:
         doubts.append(f'it was found in {floor.observations} of {frames} frames')
@@ -98,5 +74,4 @@ def mount_of(planes: Sequence[MapPlane], frames: int, tolerance: float) -> Mount
         doubts.append(f'a plane {other.distance:.2f} m below the camera may be the floor as well')
     if OUTLIER * sigma[:2].max() > np.radians(tolerance):
         doubts.append(f'its direction is known to {np.degrees(sigma[:2].max()):.1f} degrees only')
-    frame = np.stack([forward, np.cross(up, forward), up])
-    return Mount(roll, pitch, floor.distance, sigma, frame, doubts)
+    return Mount(roll, pitch, floor.distance, sigma, level(up, np.eye(3)), doubts)

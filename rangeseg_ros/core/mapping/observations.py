@@ -8,26 +8,23 @@ observation to the next as much as both were of the same pixels. The rest is new
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import length_of_distortion
 from rangeseg_ros.core.tracking.plane_errors import (
     by_motion,
     congruent,
     from_errors,
-    moved_plane,
+    shifted,
     tangents,
+    to_errors,
 )
-
-if TYPE_CHECKING:
-    from rangeseg_ros.core.mapping.pose_jumps import Jump
 
 # Share of the variance of planes that lasts while the same pixels see them: of the smooth
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
@@ -37,139 +34,131 @@ LASTING = 0.8
 _SAMPLES = 16
 
 
+class PlaneSet(NamedTuple):
+    """N planes, unit normals and points on them, metres; the errors x are those of `plane_errors`.
+
+    The tangents `axes` turn with their plane: a motion leaves its error x = (a, b, c) as it is.
+    """
+
+    normal: NDArray[np.float64]
+    point: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, planes: Sequence[Plane]) -> PlaneSet:
+        """Planes with the points next to their centroids."""
+        normal = np.array([plane.normal for plane in planes], np.float64).reshape(-1, 3)
+        centroid = np.array([plane.centroid for plane in planes], np.float64).reshape(-1, 3)
+        offset = (normal * centroid).sum(axis=1) + [plane.distance for plane in planes]
+        return cls(normal, centroid - offset[:, None] * normal, tangents(normal))
+
+    @property
+    def distance(self) -> NDArray[np.float64]:
+        """(N,) of normal . p + distance = 0, metres."""
+        return -(self.normal * self.point).sum(axis=1)
+
+    @property
+    def equations(self) -> NDArray[np.float64]:
+        """(N, 4) normals and distances."""
+        return np.column_stack([self.normal, self.distance])
+
+    def where(self, chosen: NDArray[Any] | list[int]) -> PlaneSet:
+        """Some of them."""
+        return PlaneSet(*(part[chosen] for part in self))
+
+    def joined(self, others: PlaneSet) -> PlaneSet:
+        """These planes followed by others."""
+        return PlaneSet(*(np.concatenate(pair) for pair in zip(self, others, strict=True)))
+
+    def moved(self, motion: Transform) -> PlaneSet:
+        """The planes in another frame; or each by a motion of its own, stacked (N, 3, 3)."""
+        turn, shift = motion
+        normal, point = ((turn @ part[..., None])[..., 0] for part in self[:2])
+        return PlaneSet(normal, point + shift, self.axes @ np.swapaxes(turn, -1, -2))
+
+    def without(self, errors: NDArray[np.float64]) -> PlaneSet:
+        """The planes without these errors (N, 3)."""
+        return PlaneSet(*shifted(*self, errors))
+
+    def by_motion(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 3, 6) what a turn about `place` (3,) or (N, 3) and a shift of planes change."""
+        return by_motion(self.normal, self.axes, self.point - place)
+
+    def apart(self, others: PlaneSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """What others differ by, (N, 3), as errors of these, and (N, 3, 3) that by their own."""
+        local = to_errors(self.axes, self.point)
+        gap = (local @ others.equations[..., None])[..., 0]
+        return gap, local @ from_errors(others.axes, others.point)
+
+    def covariances(self, errors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 4, 4) of normals and distances, of rank 3, for those of errors (N, 3, 3)."""
+        return congruent(from_errors(self.axes, self.point), errors)
+
+    def coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(N, 2) of a point (N, 3) on each plane, along its axes from its own point."""
+        return np.asarray((self.axes * (points - self.point)[:, None]).sum(axis=2))
+
+    def points(self, at: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) at coordinates (N, 2) on each plane."""
+        return self.point + at[:, :1] * self.axes[:, 0] + at[:, 1:] * self.axes[:, 1]
+
+
 class PoseNoise(NamedTuple):
     """Standard deviations of the pose of a camera: metres and radians, about each axis."""
 
     shift: float
     turn: float
 
-
-class Sighting(NamedTuple):
-    """What a frame shows of the planes of a map.
-
-    Attributes
-    ----------
-    pose : Transform
-        Fixed frame from the frame of the image.
-    planes : sequence of Plane
-        M of them, in the frame of the image.
-    ids : (M,) int
-        Of the planes of the map that they are.
-    view : (M, C) float64
-        See `views`.
-    jump : Jump or None
-        Of the fixed frame since the frame before.
-    """
-
-    pose: Transform
-    planes: Sequence[Plane]
-    ids: NDArray[np.int64]
-    view: NDArray[np.float64]
-    jump: Jump | None = None
+    @property
+    def deviations(self) -> NDArray[np.float64]:
+        """(6,) of the turn about three axes and of the shift."""
+        return np.repeat([self.turn, self.shift], 3)
 
 
 class Observations(NamedTuple):
-    """M planes of a frame in the fixed frame.
+    """M planes of a frame in the fixed frame, their points next to the centroids.
 
-    Attributes
-    ----------
-    plane : (M, 4) float64
-        Normal and distance.
-    lasting : (M, 4, 3) float64
-        Square root of the covariance of the error that lasts, of (normal, distance).
-    fresh : (M, 4, 4) float64
-        Covariance of the error that is new in this frame.
-    by_pose : (M, 4, 6) float64
-        Square root of that part of it which is of the pose: by the turn of the camera about
-        itself and by its shift, each over its standard deviation.
-    centroid : (M, 3) float64
-    range : (M,) float64
-        Distance of the centroid from the camera, metres.
-    view : (M, C) float64
-        Unit vectors: how many pixels of each cell of the image the plane had.
+    `covariance` (M, 3, 3) is of what the sensor makes them err by: `LASTING` of it lasts, the rest
+    is new. `by_pose` (M, 3, 6) is what they err by with the pose: with the turn of the camera
+    about itself and with its shift, each over its standard deviation. `view` (M, C) see `views`.
     """
 
-    plane: NDArray[np.float64]
-    lasting: NDArray[np.float64]
-    fresh: NDArray[np.float64]
+    planes: PlaneSet
+    covariance: NDArray[np.float64]
     by_pose: NDArray[np.float64]
-    centroid: NDArray[np.float64]
-    range: NDArray[np.float64]
     view: NDArray[np.float64]
 
-    def where(self, chosen: ArrayLike) -> Observations:
-        """Some of them, by their numbers."""
-        index = np.array(chosen, np.intp)
-        return Observations(*(part[index] for part in self))
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """(M, 3, 3) covariance of all of their errors."""
+        return self.covariance + congruent(self.by_pose, np.eye(6))
 
-    def covariance(self) -> NDArray[np.float64]:
-        """(M, 4, 4) of all of the error."""
-        return self.fresh + congruent(self.lasting, np.eye(3))
-
-    def tangent_frame(self) -> tuple[NDArray[np.float64], ...]:
-        """Normals (M, 3), their tangents (M, 2, 3), and points (M, 3) on the planes."""
-        normal = self.plane[:, :3]
-        offset = (normal * self.centroid).sum(axis=1) + self.plane[:, 3]
-        return normal, tangents(normal), self.centroid - offset[:, None] * normal
+    def where(self, chosen: NDArray[Any] | list[int]) -> Observations:
+        """Some of them."""
+        return Observations(self.planes.where(chosen), *(part[chosen] for part in self[1:]))
 
 
 def observations(
     planes: Sequence[Plane], view: NDArray[np.float64], pose: Transform, noise: PoseNoise
 ) -> Observations:
     """Planes of a frame, with their errors and those of the camera's pose, in the fixed frame."""
-    normal = np.array([p.normal for p in planes], np.float64).reshape(-1, 3)
-    distance = np.array([p.distance for p in planes], np.float64)
-    centroid = np.array([p.centroid for p in planes], np.float64).reshape(-1, 3)
-    covariance = np.array([p.covariance for p in planes], np.float64).reshape(-1, 4, 4)
-    covariance = RESIDUE * covariance + _unexplained(planes, normal, centroid)
-    # In the form theta . ray = 1 / z the pattern of the image is the same at any distance.
-    back = np.zeros((len(planes), 3, 4))
-    back[:, :, :3] = -np.eye(3) / distance[:, None, None]
-    back[:, :, 3] = normal / distance[:, None] ** 2
-    values, vectors = np.linalg.eigh(congruent(back, covariance))
-    # The symmetric root, as beta is to mean the same in every frame.
-    root = (vectors * np.sqrt(np.maximum(values, 0))[:, None]) @ vectors.transpose(0, 2, 1)
-    to_world = moved_plane(*pose)
-    lasting = to_world @ plane_jacobians(normal, distance) @ root
-    world, place = normal @ pose.rotation.T, centroid @ pose.rotation.T
-    axes = tangents(world)
-    by_pose = from_errors(axes, place + pose.shift) @ by_motion(world, axes, place)
-    by_pose *= np.repeat([noise.turn, noise.shift], 3)
-    fresh = (1 - LASTING) * congruent(lasting, np.eye(3))
-    return Observations(
-        np.column_stack([normal, distance]) @ to_world.T,
-        np.sqrt(LASTING) * lasting,
-        fresh + congruent(by_pose, np.eye(6)),
-        by_pose,
-        place + pose.shift,
-        np.asarray(np.linalg.norm(centroid, axis=1)),
-        view,
-    )
-
-
-def _unexplained(
-    planes: Sequence[Plane], normal: NDArray[np.float64], centroid: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Covariances (M, 4, 4) of planes by what else is in their regions.
-
-    Pixels that a plane does not explain, 1 - confidence of them, are of another surface or a bent
-    one, and may shift and tilt it by their share of the residual.
-    """
-    share = np.array([(1 - p.confidence) * p.rms**2 for p in planes])
-    area = np.maximum([p.area for p in planes], 1e-4) / np.pi
-    variance = share[:, None] * np.stack([1 / area, 1 / area, np.ones(len(area))], axis=1)
-    jacobian = from_errors(tangents(normal), centroid)
-    return congruent(jacobian * np.sqrt(variance)[:, None], np.eye(3))
+    seen = PlaneSet.of(planes)
+    covariance = np.array([plane.covariance for plane in planes], np.float64).reshape(-1, 4, 4)
+    covariance = RESIDUE * congruent(to_errors(seen.axes, seen.point), covariance)
+    # Pixels that a plane does not explain are of another surface or a bent one, and may shift and
+    # tilt it by their share of the residual.
+    share = np.array([(1 - plane.confidence) * plane.rms**2 for plane in planes])
+    tilt = share * np.pi / np.maximum([plane.area for plane in planes], 1e-4)
+    covariance[:, range(3), range(3)] += np.stack([tilt, tilt, share], axis=1)
+    seen = seen.moved(pose)
+    by_pose = seen.by_motion(pose.shift) * noise.deviations
+    return Observations(seen, covariance, by_pose, view)
 
 
 def continuity(before: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Correlation (K,) of the error that lasts with that of the observation before.
+    """Correlation (K,) of the errors that last of planes with views (K, C) before and now.
 
-    Parameters
-    ----------
-    before, now : (K, C) float64
-        Views of planes. Where most of the pixels are the same it is 1: small motions to and fro
-        are no new looks.
+    Where most of the pixels are the same it is 1: small motions to and fro are no new looks.
     """
     alike = np.clip((before * now).sum(axis=1), 0, 1)
     return np.where(alike >= 0.5, 1.0, alike)
@@ -178,31 +167,23 @@ def continuity(before: NDArray[np.float64], now: NDArray[np.float64]) -> NDArray
 def views(
     labels: NDArray[np.uint16], planes: Sequence[Plane], stated: float
 ) -> NDArray[np.float64]:
-    """Where in the image planes are: pixels in each square cell, as unit vectors.
+    """Where in the image planes are: pixels in each of its square cells, as unit vectors (M, C).
 
-    Parameters
-    ----------
-    labels : (H, W) uint16
-    planes : sequence of Plane
-    stated : float
-        The parameter `distortion_length`, pixels over which the errors of the sensor hang
-        together: cells are twice as large.
-
-    Returns
-    -------
-    (M, C) float64
+    Cells are twice as large as the pixels over which the errors of the sensor hang together, as
+    the parameter `distortion_length` has `stated`.
     """
     length = length_of_distortion(stated, labels.shape)
     step = max(int(2 * length // _SAMPLES), 1)
     coarse = labels[::step, ::step]
     side = max(int(2 * length / step), 1)
     rows, columns = (np.arange(size) // side for size in coarse.shape)
-    count = int(rows[-1] + 1) * int(columns[-1] + 1)
+    cell = rows[:, None] * (columns[-1] + 1) + columns
+    count = int(cell[-1, -1]) + 1
     listed = np.array([plane.label for plane in planes], np.intp)
-    first = np.zeros(max(int(listed.max(initial=0)), int(coarse.max(initial=0))) + 1, np.intp)
-    first[listed] = count * np.arange(1, len(planes) + 1)
-    place = first[coarse] + (rows[:, None] * (columns[-1] + 1) + columns)
-    pixels = np.bincount(place.ravel(), minlength=count * (len(planes) + 1))
-    found = pixels.reshape(-1, count)[1:].astype(np.float64)
-    norm: NDArray[np.float64] = np.linalg.norm(found, axis=1, keepdims=True)
-    return found / np.maximum(norm, 1)
+    number = np.zeros(max(int(listed.max(initial=0)), int(coarse.max(initial=0))) + 1, np.intp)
+    number[listed] = np.arange(1, len(planes) + 1)
+    pixels = np.bincount(
+        (number[coarse] * count + cell).ravel(), minlength=(len(planes) + 1) * count
+    )
+    found = pixels.reshape(-1, count)[1:]
+    return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1))

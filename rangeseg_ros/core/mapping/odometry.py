@@ -33,27 +33,22 @@ from scipy.linalg import block_diag
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.mapping.observations import (
+    LASTING,
     Observations,
+    PlaneSet,
     PoseNoise,
     continuity,
     observations,
 )
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import cross_matrix, rotation_by
-from rangeseg_ros.core.tracking.plane_errors import (
-    GATE,
-    by_motion,
-    congruent,
-    mahalanobis,
-    shifted,
-    to_errors,
-)
+from rangeseg_ros.core.tracking.plane_errors import GATE, congruent, mahalanobis
 from rangeseg_ros.core.tracking.tracker import NOMINAL, PERSISTENCE
 
 # Planes that count, the largest in the image: with 16 the motion is no better, and less is known
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
-_ROUNDS = 3
+_ROUNDS = 4
 # Errors of the pose and of the velocity come first in the state, then three of each plane.
 _CAMERA = 12
 
@@ -61,20 +56,11 @@ _CAMERA = 12
 class Motion(NamedTuple):
     """Where the camera is and how it moves.
 
-    Attributes
-    ----------
-    frame : str
-        Name of the frame of the odometry: x forward where the camera looked first, z up, its
-        origin where the camera was then.
-    pose : Transform
-        From the frame of the image to that one.
-    covariance : (6, 6) float64
-        Of the pose: shift, then turn about the fixed axes, metres and radians.
-    velocity : (6,) float64
-        In the frame of the image: metres per second, then radians per second.
-    velocity_covariance : (6, 6) float64
-    held : int
-        Number of planes that tell how the camera moved since the frame before.
+    The pose takes the frame of the image to that of the odometry, `frame`: x forward where the
+    camera looked first, z up, its origin where the camera was then. Its covariance (6, 6) is of
+    the shift, then the turn about the fixed axes, metres and radians. The velocity (6,), metres
+    per second, then radians per second, is in the frame of the image. `held` is the number of
+    planes that tell how the camera moved since the frame before.
     """
 
     frame: str
@@ -101,10 +87,7 @@ class Motion(NamedTuple):
 class PlaneOdometry:
     """Follows a camera by the planes it sees.
 
-    Parameters
-    ----------
-    config : Config, optional
-        `odometry_frame`, `camera_turn` and `camera_speed`.
+    Of the parameters, `odometry_frame`, `camera_turn` and `camera_speed` count.
 
     Examples
     --------
@@ -118,8 +101,7 @@ class PlaneOdometry:
         self._pose: Transform | None = None
         self._velocity = np.zeros(6)
         self._id = np.zeros(0, np.int64)
-        self._normal = self._point = np.zeros((0, 3))
-        self._axes = np.zeros((0, 2, 3))
+        self._planes = PlaneSet.of([])
         self._view = np.zeros((0, 0))
         self._covariance = np.diag(np.concatenate([np.zeros(6), self._spread**2]))
 
@@ -136,177 +118,134 @@ class PlaneOdometry:
         up: ArrayLike,
         axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
     ) -> Motion:
-        """Take in the next frame.
+        """Take in the planes of the next frame, tracked, with their `views`.
 
-        Parameters
-        ----------
-        planes : sequence of Plane
-            In the frame of the image, tracked.
-        view : (M, C) float64
-            See `views`.
-        stamp : int
-            Nanoseconds; when it does not tell, as much as is common has passed.
-        up : (3,) float
-            In the frame of the image; counts for the first one.
-        axes : (3, 3) float
-            What is right, down and forward in the image; the identity in an optical frame.
+        When stamps, nanoseconds, do not tell, as much time as is common has passed. Of the first
+        frame, `up` (3,) counts, and the `axes` (3, 3) that are right, down and forward in the
+        image, both in the frame of the image as the planes are.
         """
-        if self._pose is None:
-            self._pose = Transform(_level(np.array(up, np.float64), np.array(axes)), np.zeros(3))
-        else:
+        pose = self._pose or Transform(level(np.array(up, float), np.array(axes)), np.zeros(3))
+        if self._pose:
             elapsed = (stamp - self._stamp) * 1e-9 if stamp > self._stamp > 0 else NOMINAL
-            self._predict(elapsed)
+            pose = self._predict(pose, elapsed)
         self._stamp = stamp
         largest = np.argsort([-plane.count for plane in planes], kind='stable')[:_PLANES]
         chosen = [planes[k] for k in largest]
-        still = PoseNoise(0.0, 0.0)
-        seen = observations(chosen, view[largest], Transform.identity(), still)
+        seen = observations(chosen, view[largest], Transform.identity(), PoseNoise(0.0, 0.0))
         ids = np.array([plane.id for plane in chosen], np.int64)
         self._keep(np.isin(self._id, ids))
-        order = {number: m for m, number in enumerate(ids.tolist())}
-        self._update(seen.where([order[number] for number in self._id.tolist()]))
-        held = len(self._id)
-        new = np.flatnonzero(~np.isin(ids, self._id))
-        self._append(seen.where(new), ids[new])
-        return self._motion(held)
-
-    def _motion(self, held: int) -> Motion:
-        assert self._pose is not None
+        if len(self._id):
+            order = {number: m for m, number in enumerate(ids.tolist())}
+            pose = self._update(pose, seen.where([order[own] for own in self._id.tolist()]))
+        held, new = len(self._id), ~np.isin(ids, self._id)
+        self._append(pose, seen.where(new), ids[new])
+        self._pose = pose
         swap = np.zeros((6, 6))
-        swap[:3, 3:], swap[3:, :3] = np.eye(3), self._pose.rotation
+        swap[:3, 3:], swap[3:, :3] = np.eye(3), pose.rotation
         # Velocities: turning and going change places only.
         places = np.r_[9:12, 6:9]
         return Motion(
             self.config.odometry_frame,
-            self._pose,
+            pose,
             swap @ self._covariance[:6, :6] @ swap.T,
             np.roll(self._velocity, 3),
             self._covariance[np.ix_(places, places)],
             held,
         )
 
-    def _predict(self, elapsed: float) -> None:
+    def _predict(self, pose: Transform, elapsed: float) -> Transform:
         """Go on with the velocity, which fades."""
-        assert self._pose is not None
-        turn, shift = self._pose
+        turn, shift = pose
         part = elapsed / PERSISTENCE
         kept, reach = np.exp(-part), PERSISTENCE * -np.expm1(-part)
-        twist = rotation_by(reach * self._velocity[:3])
-        change = np.eye(_CAMERA)
+        twist, going = rotation_by(reach * self._velocity[:3]), self._velocity[3:]
+        change = np.eye(len(self._covariance))
         change[:3, :3] = twist.T
-        change[3:6, :3] = -reach * turn @ cross_matrix(self._velocity[3:])
+        change[3:6, :3] = -reach * turn @ cross_matrix(going)
         # From the velocity to the pose: the turn is in the camera's axes, the shift is not.
         outwards = block_diag(np.eye(3), turn)
-        change[:6, 6:] = reach * outwards
-        change[6:, 6:] *= kept
+        change[:6, 6:_CAMERA] = reach * outwards
+        change[6:_CAMERA, 6:_CAMERA] *= kept
         # Of the path and the velocity, for unit variance; the axes are alike, so that no rotation
         # counts.
         path = PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
         both, speed = PERSISTENCE * (1 - kept) ** 2 * outwards, 1 - kept**2
         variance = np.diag(self._spread**2)
-        noise = np.block(
+        self._covariance = change @ self._covariance @ change.T
+        self._covariance[:_CAMERA, :_CAMERA] += np.block(
             [[path * variance, both @ variance], [variance @ both.T, speed * variance]]
         )
-        self._pose = Transform(turn @ twist, shift + reach * turn @ self._velocity[3:])
         self._velocity = kept * self._velocity
-        change = block_diag(change, np.eye(len(self._covariance) - _CAMERA))
-        self._covariance = change @ self._covariance @ change.T
-        self._covariance[:_CAMERA, :_CAMERA] += noise
+        return Transform(turn @ twist, shift + reach * turn @ going)
 
-    def _update(self, seen: Observations) -> None:
+    def _update(self, pose: Transform, seen: Observations) -> Transform:
         """Take in observations of all planes; those that do not fit are forgotten."""
-        count, size = len(self._id), len(self._covariance)
-        if not count:
-            return
-        design, local = self._design()
-        self._change_views(seen, local)
-        noise = congruent(local, seen.fresh)
-        gap = (local @ seen.plane[..., None])[..., 0]
-        spread = congruent(design, self._covariance) + noise
-        fits = mahalanobis(gap, spread) < GATE
+        there = self._planes.moved(pose.inverse())
+        gap, turned = there.apart(seen.planes)
+        error = congruent(turned, seen.covariance)
+        # Planes seen by other pixels show another part of the error that lasts.
+        same = continuity(self._view, seen.view)
+        change = (2 * (1 - same) * LASTING)[:, None, None] * error
+        self._covariance[_CAMERA:, _CAMERA:] += block_diag(*change)
+        self._view[same < 1] = seen.view[same < 1]
+        noise, own = (1 - LASTING) * error, np.eye(3 * len(gap)).reshape(len(gap), 3, -1)
+        design = np.concatenate([_by_camera(there, pose), own], axis=2)
+        fits = mahalanobis(gap, congruent(design, self._covariance) + noise) < GATE
         if fits.any():
-            flat, gap = design[fits].reshape(-1, size), gap[fits]
-            noise, expected = noise[fits], flat @ self._covariance
+            flat, gap, noise = np.concatenate(design[fits]), gap[fits], noise[fits]
+            expected = flat @ self._covariance
             weight = value = np.ones(len(gap))
             # Huber's weights: planes that move by themselves are not to move the camera.
             for _ in range(_ROUNDS):
                 error = block_diag(*(noise / weight[:, None, None]))
-                total = expected @ flat.T + error
+                gain = np.linalg.solve(expected @ flat.T + error, expected).T
+                step = gain @ gap.ravel()
                 # What the state leaves of the gaps.
-                rest = error @ np.linalg.solve(total, gap.ravel())
-                value = mahalanobis(rest.reshape(-1, 3), noise)
+                value = mahalanobis(gap - (flat @ step).reshape(-1, 3), noise)
                 weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(value, 1e-12)))
-            error = block_diag(*(noise / weight[:, None, None]))
-            gain = np.linalg.solve(expected @ flat.T + error, expected).T
-            left = np.eye(size) - gain @ flat
+            left = np.eye(len(gain)) - gain @ flat
             covariance = left @ self._covariance @ left.T + gain @ error @ gain.T
             self._covariance = (covariance + covariance.T) / 2
-            self._correct(gain @ gap.ravel())
+            turn, shift = pose
+            pose = Transform(turn @ rotation_by(step[:3]), shift + step[3:6])
+            self._velocity = self._velocity + step[6:_CAMERA]
+            self._planes = self._planes.without(step[_CAMERA:].reshape(-1, 3))
             fits[fits] = value < GATE
         self._keep(fits)
+        return pose
 
-    def _change_views(self, seen: Observations, local: NDArray[np.float64]) -> None:
-        """Planes seen by other pixels show another part of the error that lasts."""
-        same = continuity(self._view, seen.view)
-        change = 2 * (1 - same)[:, None, None] * congruent(local @ seen.lasting, np.eye(3))
-        self._covariance[_CAMERA:, _CAMERA:] += block_diag(*change)
-        other = same < 1
-        self._view[other] = seen.view[other]
-
-    def _design(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Derivatives (N, 3, D) of observations by the state, and planes (N, 3, 4) to errors."""
-        assert self._pose is not None
-        turn, shift = self._pose
-        axes, normal = self._axes @ turn, self._normal @ turn
-        point = (self._point - shift) @ turn
-        design = np.zeros((len(normal), 3, len(self._covariance)))
-        design[:, :, :6] = by_motion(normal, axes, point)
-        # The shift is in the fixed frame.
-        design[:, 2, 3:6] = self._normal
-        for k in range((len(self._covariance) - _CAMERA) // 3):
-            at = _CAMERA + 3 * k
-            design[k, :, at : at + 3] = np.eye(3)
-        return design, to_errors(axes, point)
-
-    def _correct(self, step: NDArray[np.float64]) -> None:
-        """Take the estimated errors off the state."""
-        assert self._pose is not None
-        turn, shift = self._pose
-        self._pose = Transform(turn @ rotation_by(step[:3]), shift + step[3:6])
-        self._velocity = self._velocity + step[6:12]
-        own = step[_CAMERA:].reshape(-1, 3)
-        planes = shifted(self._normal, self._point, self._axes, own)
-        self._normal, self._point, self._axes = planes
-
-    def _append(self, seen: Observations, ids: NDArray[np.int64]) -> None:
+    def _append(self, pose: Transform, seen: Observations, ids: NDArray[np.int64]) -> None:
         """Planes seen for the first time: x = -(what the pose errs by) - v."""
-        assert self._pose is not None
-        turn, shift = self._pose
-        old = len(self._id)
-        normal, axes, point = seen.tangent_frame()
+        self._view = np.concatenate(
+            [self._view.reshape(len(self._id), seen.view.shape[1]), seen.view]
+        )
         self._id = np.concatenate([self._id, ids])
-        self._normal = np.concatenate([self._normal, normal @ turn.T])
-        self._point = np.concatenate([self._point, point @ turn.T + shift])
-        self._axes = np.concatenate([self._axes, axes @ turn.T])
-        self._view = np.concatenate([self._view.reshape(old, seen.view.shape[1]), seen.view])
-        design, local = (part[old:] for part in self._design())
+        self._planes = self._planes.joined(seen.planes.moved(pose))
         before = len(self._covariance)
-        change = np.concatenate([np.eye(before), -design.reshape(-1, before)])
+        change = np.eye(before + 3 * len(ids), before)
+        change[before:, :_CAMERA] = -_by_camera(seen.planes, pose).reshape(-1, _CAMERA)
         self._covariance = change @ self._covariance @ change.T
-        if len(ids):
-            self._covariance[before:, before:] += block_diag(*congruent(local, seen.fresh))
+        fresh = block_diag(*((1 - LASTING) * seen.covariance))
+        self._covariance[before:, before:] += fresh
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         """Forget the other planes."""
-        if chosen.all():
-            return
         states = np.concatenate([np.ones(_CAMERA, bool), np.repeat(chosen, 3)])
         self._covariance = self._covariance[np.ix_(states, states)]
-        for name in ('_id', '_normal', '_point', '_axes', '_view'):
-            setattr(self, name, getattr(self, name)[chosen])
+        self._planes = self._planes.where(chosen)
+        self._id, self._view = self._id[chosen], self._view[chosen]
 
 
-def _level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _by_camera(planes: PlaneSet, pose: Transform) -> NDArray[np.float64]:
+    """(N, 3, 12) derivatives of planes (N,) that a camera sees by its pose and its velocity."""
+    design = np.zeros((len(planes.normal), 3, _CAMERA))
+    design[:, :, :6] = planes.by_motion(np.zeros(3))
+    # The shift is in the fixed frame.
+    design[:, 2, 3:6] = planes.normal @ pose.rotation.T
+    return design
+
+
+def level(up: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotation from a camera that sees `up` to x forward and z up."""
     up = up / np.linalg.norm(up)
     # Straight up or down, forward is where the top of the image is.

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TypeVar
+from collections.abc import Callable
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.description.shapes import Shape
-from rangeseg_ros.core.mapping.map_planes import MapOutline
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
-from rangeseg_ros.core.rotations import quaternions, rotation_matrix
-from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 Lookup = Callable[[str, str], Transform]
 """(target, source) -> the motion between two frames at the stamp of an image; TransformError."""
-
-AnyPlane = TypeVar('AnyPlane', bound=Plane)
 
 PARAMETERS = 'the parameters up_x, up_y, up_z'
 
@@ -29,20 +21,11 @@ PARAMETERS = 'the parameters up_x, up_y, up_z'
 class Placement:
     """What is known of a camera at the stamp of an image.
 
-    Attributes
-    ----------
-    pose, target : Transform or None
-        `fixed_frame` and `target_frame` from the frame of the image.
-    up : (3,) float64 or None
-        In the frame of the image; None for the parameters.
-    height : float or None
-        Of the origin of the frame of the image above z = 0 of `gravity_frame`, metres.
-    sources : dict of str
-        What 'up', 'fixed frame' and 'target frame' come from, or why they are not known.
-    missing : dict of str
-        Why frames that parameters name are not known, without times.
-    may_come : bool
-        Whether they may be known later.
+    `pose` and `target` take the frame of the image to `fixed_frame` and `target_frame`. `up` (3,)
+    is in the frame of the image, None for that of the parameters; `height`, metres, is that of its
+    origin above z = 0 of `gravity_frame`. `sources` tell what 'up', 'fixed frame' and 'target
+    frame' come from, or why they are not known; `missing` why frames that parameters name are not,
+    without times, and `may_come` whether they may be known later.
     """
 
     pose: Transform | None = None
@@ -60,20 +43,10 @@ def find_placement(
     lookup: Lookup,
     acceleration: tuple[str, NDArray[np.float64]] | None = None,
 ) -> Placement:
-    """Look up what the parameters ask for.
+    """Look up what the parameters ask for at an image in `frame`.
 
-    Up is that of `gravity_frame`; where it is not known, that of an accelerometer at rest, in
-    whatever frame it is, or else that of the parameters.
-
-    Parameters
-    ----------
-    config : Config
-        `gravity_frame`, `fixed_frame`, `target_frame`.
-    frame : str
-        Of the image.
-    lookup : callable
-    acceleration : (str, (3,) float64), optional
-        Frame and measurement of an accelerometer.
+    Up is that of `gravity_frame`; where it is not known, that of an accelerometer at rest, its
+    frame and measurement (3,), whatever frame it is, or else that of the parameters.
     """
     found = Placement()
 
@@ -118,14 +91,8 @@ class HeldUp:
     def hold(self, found: Placement, stamp: int, patience: float) -> str:
         """Where up is not known, take the last one; why there is none, or empty.
 
-        Parameters
-        ----------
-        found : Placement
-            Of an image; its up and height are set.
-        stamp : int
-            When the image was taken, nanoseconds.
-        patience : float
-            Seconds for which the last one holds.
+        The up and height of what was `found` at a stamp, nanoseconds, are set to those known up to
+        `patience` seconds before.
         """
         if found.up is not None:
             self._last = stamp, found.up, found.height
@@ -139,30 +106,3 @@ class HeldUp:
                 found.sources['up'] = f'held for {age:.1f} s: {why}'
                 return ''
         return f'no terrain, as up is not known: {why}'
-
-
-def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane]:
-    """Planes in the frame that `motion` leads to; normals stay on the side of the sensor."""
-    turn, shift = motion
-    jacobian = moved_plane(turn, shift)
-    moved = []
-    for plane in planes:
-        normal = turn @ plane.normal
-        outline = MapOutline(plane.outline.parts).moved(lambda ring: ring @ turn.T + shift)
-        moved.append(
-            replace(
-                plane,
-                normal=normal,
-                distance=float(plane.distance - normal @ shift),
-                covariance=jacobian @ plane.covariance @ jacobian.T,
-                centroid=turn @ plane.centroid + shift,
-                shape=Shape(
-                    area=plane.area,
-                    extents=plane.extents,
-                    centre=turn @ plane.centre + shift,
-                    orientation=quaternions(turn @ rotation_matrix(plane.orientation)),
-                ),
-                outline=outline,  # type: ignore[arg-type]
-            )
-        )
-    return moved

@@ -9,183 +9,112 @@ what that information has grown by.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.observations import Observations, continuity
+from rangeseg_ros.core.mapping.observations import (
+    LASTING,
+    Observations,
+    PlaneSet,
+    PoseNoise,
+    continuity,
+)
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.rotations import rotation_by
+from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import (
     GATE,
-    by_motion,
     candidates,
     congruent,
-    from_errors,
     mahalanobis,
-    shifted,
-    to_errors,
     with_floor,
 )
 
-_IDENTITY = np.eye(3)
+_ROUNDS = 5  # until the motion and the weights settle
+# Inverse variance of jumps beforehand, in every direction: of a hundred times the noise of poses.
+_PRIOR = 1e-4
+_GATE = chi2_quantile(6)
 
 
-class Step(NamedTuple):
-    """Observations and what they tell of their planes when they come.
+class PlaneFilters(NamedTuple):
+    """N planes of the fixed frame, with the covariances (N, 3, 3) of their errors.
 
-    Attributes
-    ----------
-    plane, observation : (K,) int
-        Their numbers.
-    looks : (K,) int
-        Frames of the run, this one included.
-    information : (K, 3, 3) float64
-        What they add.
-    spread : (K, 3, 3) float64
-        Covariance of z.
-    gap : (K, 3) float64
-        z.
+    `view` (N, C) is that of the first observation of a run, `looks` (N,) how many it has.
     """
 
-    plane: NDArray[np.intp]
-    observation: NDArray[np.intp]
-    looks: NDArray[np.intp]
-    information: NDArray[np.float64]
-    spread: NDArray[np.float64]
-    gap: NDArray[np.float64]
-
-    def where(self, chosen: NDArray) -> Step:
-        """Some of them."""
-        return Step(*(part[chosen] for part in self))
-
-
-@dataclass
-class PlaneFilters:
-    """N planes of the fixed frame and what is known of them.
-
-    Attributes
-    ----------
-    normal, point : (N, 3) float64
-        The plane.
-    axes : (N, 2, 3) float64
-        Tangents e1, e2.
-    covariance : (N, 3, 3) float64
-        Of x.
-    view : (N, C) float64
-        Of the first observation of this run.
-    looks : (N,) int
-        Observations of this run.
-    """
-
-    normal: NDArray[np.float64]
-    point: NDArray[np.float64]
-    axes: NDArray[np.float64]
+    planes: PlaneSet
     covariance: NDArray[np.float64]
     view: NDArray[np.float64]
     looks: NDArray[np.intp]
 
     @classmethod
     def of(cls, seen: Observations) -> PlaneFilters:
-        """Planes seen for the first time."""
-        normal, axes, point = seen.tangent_frame()
-        covariance = congruent(to_errors(axes, point), seen.covariance())
-        return cls(normal, point, axes, covariance, seen.view, np.ones(len(normal), np.intp))
+        """Planes where they are seen for the first time, of which nothing else is known yet."""
+        # Kilometres, beside which the first observation is all that counts.
+        unknown = np.tile(1e6 * np.eye(3), (len(seen.view), 1, 1))
+        return cls(seen.planes, unknown, 0 * seen.view, np.zeros(len(seen.view), np.intp))
 
-    @property
-    def distance(self) -> NDArray[np.float64]:
-        """(N,) distance of the planes in normal . p + distance = 0, metres."""
-        return -(self.normal * self.point).sum(axis=1)
-
-    @property
-    def plane_covariance(self) -> NDArray[np.float64]:
-        """(N, 4, 4) covariance of (normal, distance), of rank 3."""
-        return congruent(from_errors(self.axes, self.point), self.covariance)
-
-    def where(self, chosen: NDArray) -> PlaneFilters:
+    def where(self, chosen: NDArray[Any] | list[int]) -> PlaneFilters:
         """Some of the planes."""
-        return PlaneFilters(*(getattr(self, f.name)[chosen] for f in fields(self)))
+        parts: list[Any] = [part[chosen] for part in self[1:]]
+        return PlaneFilters(self.planes.where(chosen), *parts)
+
+    def moved(
+        self, motion: Transform, place: NDArray[np.float64], error: NDArray[np.float64]
+    ) -> PlaneFilters:
+        """The planes in another frame; the motion errs by a turn about `place` and a shift.
+
+        `error` (6, 6) is the covariance of these.
+        """
+        planes = self.planes.moved(motion)
+        by_motion = congruent(planes.by_motion(place), error)
+        return self._replace(planes=planes, covariance=self.covariance + by_motion)
 
     def joined(self, others: PlaneFilters) -> PlaneFilters:
         """These planes followed by others."""
-        pairs = ((getattr(self, f.name), getattr(others, f.name)) for f in fields(self))
-        return PlaneFilters(*(np.concatenate(pair) for pair in pairs))
+        pairs = zip(self[1:], others[1:], strict=True)
+        parts: list[Any] = [np.concatenate(pair) for pair in pairs]
+        return PlaneFilters(self.planes.joined(others.planes), *parts)
 
-    def moved(self, motion: Transform) -> PlaneFilters:
-        """The planes moved with all that is known of them."""
-        turn, shift = motion
-        normal, point = self.normal @ turn.T, self.point @ turn.T + shift
-        return replace(self, normal=normal, point=point, axes=self.axes @ turn.T)
+    def alike(
+        self, others: PlaneSet, covariance: NDArray[np.float64], camera: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.float64]]:
+        """Which of these planes and of M others may be one by what is known of both.
 
-    def with_motion_error(
-        self, covariance: NDArray[np.float64], place: NDArray[np.float64]
-    ) -> PlaneFilters:
-        """The planes with the error (6, 6) of a motion: a turn about `place` (3,), a shift."""
-        design = by_motion(self.normal, self.axes, self.point - place)
-        return replace(self, covariance=self.covariance + congruent(design, covariance))
+        Numbers (K,) of these and (K,) of the others, and chi-squared (K,) of three degrees of
+        freedom; `covariance` (M, 3, 3) is of the errors of the others, `camera` (3,) where they
+        are looked at from.
+        """
+        reach = np.linalg.norm(others.point - camera, axis=1)
+        own = self.planes.normal, self.planes.distance
+        k, m = np.nonzero(candidates(own, (others.normal, others.point), reach))
+        planes, others = self.planes.where(k), others.where(m)
+        gap, turned = planes.apart(others)
+        # Where the other one is.
+        there = np.tile(np.eye(3), (len(k), 1, 1))
+        there[:, 2, :2] = planes.coordinates(others.point)
+        spread = congruent(there, self.covariance[k] + congruent(turned, covariance[m]))
+        value = mahalanobis((there @ gap[..., None])[..., 0], with_floor(spread, reach[m]))
+        fits = value < GATE
+        return k[fits], m[fits], value[fits]
 
-    def coordinates(
-        self, index: NDArray[np.intp], points: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """(K, 2) of points (K, 3) on the planes of that `index` (K,), along their axes."""
-        result: NDArray[np.float64]
-        result = np.einsum('kai,ki->ka', self.axes[index], points - self.point[index])
-        return result
-
-    def points(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (K, 3) at coordinates (K, 2) of planes."""
-        along: NDArray[np.float64] = np.einsum('ka,kai->ki', at, self.axes[index])
-        return self.point[index] + along
-
-    def expected(
-        self, index: NDArray[np.intp], seen: Observations, which: NDArray[np.intp]
-    ) -> Step:
-        """What observations, of the numbers `which` (K,), are to planes `index` (K,)."""
-        same = continuity(self.view[index], seen.view[which]) == 1
+    def update(self, index: NDArray[np.intp], seen: Observations) -> NDArray[np.bool_]:
+        """Take in what is seen of the planes `index` (K,), each at most once; which runs begin."""
+        planes = self.planes.where(index)
+        gap, turned = planes.apart(seen.planes)
+        same = continuity(self.view[index], seen.view) == 1
         looks = np.where(same, self.looks[index] + 1, 1)
-        local = to_errors(self.axes[index], self.point[index])
-        fresh = congruent(local, seen.fresh[which])
-        lasting = congruent(local @ seen.lasting[which], _IDENTITY)
+        lasting = LASTING * congruent(turned, seen.covariance)
+        fresh = congruent(turned, seen.spread) - lasting
         k = looks[:, None, None]
         before = np.linalg.inv(fresh / np.maximum(k - 1, 1) + lasting) * (k > 1)
-        information = np.linalg.inv(fresh / k + lasting) - before
-        gap = (local @ seen.plane[which][..., None])[..., 0]
-        spread = self.covariance[index] + fresh + lasting
-        return Step(index, which, looks, information, spread, gap)
-
-    def gate(self, step: Step, seen: Observations) -> NDArray[np.float64]:
-        """Chi-squared (K,), of three degrees of freedom, of observations being of planes."""
-        which = step.observation
-        at = self.coordinates(step.plane, seen.centroid[which])
-        return _gate_at(at, step.gap, step.spread, seen.range[which])
-
-    def update(self, step: Step, seen: Observations) -> None:
-        """Take in observations, each plane at most one, that are `expected` as it is now."""
-        index, gain = step.plane, step.information
+        gain = np.linalg.inv(fresh / k + lasting) - before
         covariance = np.linalg.inv(np.linalg.inv(self.covariance[index]) + gain)
-        self.covariance[index], self.looks[index] = covariance, step.looks
-        first = step.looks == 1
-        self.view[index[first]] = seen.view[step.observation[first]]
-        self._shift(index, (covariance @ gain @ step.gap[..., None])[..., 0])
-
-    def alike(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> list[tuple[int, int]]:
-        """Pairs of one of `some` planes (K,) and another that may be it by what is known of both.
-
-        `camera` (3,) is where they are looked at from.
-        """
-        reach = np.linalg.norm(self.point - camera, axis=1)
-        planes = self.normal[some], self.distance[some]
-        close = candidates(planes, (self.normal, self.point), reach)
-        close[np.arange(len(some)), some] = False
-        number, m = np.nonzero(close)
-        k = some[number]
-        if not len(m):
-            return []
-        gap, spread = self._apart(k, m)
-        at = self.coordinates(k, self.point[m])
-        fits = _gate_at(at, gap, spread, reach[m]) < GATE
-        return list(zip(k[fits].tolist(), m[fits].tolist(), strict=True))
+        self._correct(index, covariance, gain @ gap[..., None])
+        self.looks[index], self.view[index[~same]] = looks, seen.view[~same]
+        return ~same
 
     def absorb(self, k: int, m: int) -> None:
         """Have the plane `k` take in what is known of the plane `m`.
@@ -193,16 +122,21 @@ class PlaneFilters:
         Both were seen by one sensor, and how their errors hang together is not known: covariance
         intersection (Julier and Uhlmann 1997), weighted as by Niehsen (2002).
         """
-        index = np.array([k])
-        gap, spread = self._apart(index, np.array([m]))
-        own = self.covariance[k]
-        other = spread[0] - own
-        sizes = np.cbrt([np.linalg.det(other), np.linalg.det(own)])
-        weight = sizes / sizes.sum()
-        information = [w * np.linalg.inv(c) for w, c in zip(weight, (own, other), strict=True)]
-        self.covariance[k] = np.linalg.inv(information[0] + information[1])
+        gap, turned = self.planes.where([k]).apart(self.planes.where([m]))
+        both = np.stack([self.covariance[k], turned[0] @ self.covariance[m] @ turned[0].T])
+        weight = np.cbrt(np.linalg.det(both))[::-1, None, None]
+        own, other = weight / weight.sum() * np.linalg.inv(both)
+        self._correct(np.array([k]), np.linalg.inv(own + other)[None], other @ gap[..., None])
         self.view[k] = 0
-        self._shift(index, (self.covariance[k] @ information[1] @ gap[0])[None])
+
+    def _correct(
+        self, index: NDArray[np.intp], covariance: NDArray[np.float64], told: NDArray[np.float64]
+    ) -> None:
+        """Take the errors that covariance @ told (K, 3, 1) is off the planes `index` (K,)."""
+        moved = self.planes.where(index).without((covariance @ told)[..., 0])
+        for whole, part in zip(self.planes, moved, strict=True):
+            whole[index] = part
+        self.covariance[index] = covariance
 
     def variances(self, index: NDArray[np.intp], at: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances (K,), across the planes `index` (K,), at coordinates (K, 2)."""
@@ -211,31 +145,55 @@ class PlaneFilters:
         variance = np.einsum('ki,kij,kj->k', lever, self.covariance[index], lever)
         return variance
 
-    def _apart(
-        self, k: NDArray[np.intp], m: NDArray[np.intp]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """What planes `m` differ by from planes `k`, (K, 3), and its covariance (K, 3, 3)."""
-        local = to_errors(self.axes[k], self.point[k])
-        other = np.column_stack([self.normal[m], self.distance[m]])
-        turned = local @ from_errors(self.axes[m], self.point[m])
-        spread = congruent(turned, self.covariance[m]) + self.covariance[k]
-        return (local @ other[..., None])[..., 0], spread
 
-    def _shift(self, index: NDArray[np.intp], step: NDArray[np.float64]) -> None:
-        """Take errors off planes."""
-        moved = shifted(self.normal[index], self.point[index], self.axes[index], step)
-        self.normal[index], self.point[index], self.axes[index] = moved
+class Jump(NamedTuple):
+    """What the fixed frame has moved by against the planes.
+
+    `motion` leads from the fixed frame as it was to what it is; `error` (6,) is that motion as a
+    turn about where the `camera` (3,) was told to be, radians, and a shift, metres. Its covariance
+    is large in directions that the planes do not tell.
+    """
+
+    motion: Transform
+    camera: NDArray[np.float64]
+    error: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def __str__(self) -> str:
+        turn, shift = np.linalg.norm(self.error.reshape(2, 3), axis=1)
+        return (
+            f'the planes contradict the pose by {1e3 * shift:.0f} mm and '
+            f'{np.degrees(turn):.1f} degrees'
+        )
 
 
-def _gate_at(
-    at: NDArray[np.float64],
-    gap: NDArray[np.float64],
-    spread: NDArray[np.float64],
-    reach: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Chi-squared (K,) of differences of planes `gap` (K, 3), at coordinates `at` (K, 2)."""
-    there = np.broadcast_to(_IDENTITY, spread.shape).copy()
-    there[:, 2, :2] = at
-    return mahalanobis(
-        (there @ gap[..., None])[..., 0], with_floor(congruent(there, spread), reach)
-    )
+def find_jump(
+    known: PlaneFilters, seen: Observations, camera: NDArray[np.float64], noise: PoseNoise
+) -> Jump | None:
+    """Test the pose of a frame by K planes of the map that it shows, in the same order.
+
+    A pose that errs by s, in standard deviations, shows each plane off by z = -B s + v. With
+    L = sum B^T R^-1 B the estimate of s has the covariance L^-1 + I, so that s^T L (L + I)^-1 s
+    is chi-squared with six degrees of freedom: None where it is chance. Planes that move by
+    themselves have less weight (Cauchy). `camera` (3,) is where the pose that was told has it.
+    """
+    deviations = noise.deviations
+    motion, error, weight = Transform.identity(), np.zeros(6), np.ones(len(seen.view))
+    for _ in range(_ROUNDS):
+        gap, turned = known.planes.moved(motion).apart(seen.planes)
+        root = turned @ seen.by_pose
+        spread = known.covariance + congruent(turned, seen.covariance)
+        weighted = weight[:, None, None] * np.linalg.solve(spread, root)
+        information = np.einsum('kia,kib->ab', weighted, root)
+        right = np.einsum('kia,ki->a', weighted, gap) + _PRIOR * error
+        change = -np.linalg.solve(information + _PRIOR * np.eye(6), right)
+        weight = 1 / (1 + mahalanobis(gap + root @ change, spread) / 4)
+        error = error + change
+        if error @ np.linalg.solve(information + np.eye(6), information @ error) < _GATE:
+            return None
+        turn, shift = np.split(error * deviations, 2)
+        rotation = rotation_by(turn)
+        motion = Transform(rotation, camera + shift - rotation @ camera)
+    covariance = np.linalg.inv(information + _PRIOR * np.eye(6)) + np.eye(6)
+    scaled = np.outer(deviations, deviations) * covariance
+    return Jump(motion, camera, error * deviations, scaled)

@@ -1,4 +1,4 @@
-"""Where a plane of a map is: an occupancy grid on the plane.
+"""Where a plane of a map is, or where the ground is free: occupancy grids.
 
 References
 ----------
@@ -8,11 +8,18 @@ A. Hornung et al., "OctoMap", Autonomous Robots 2013: log-odds with bounds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.observations import PlaneSet
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.significance import OUTLIER
 
 HIT, MISS, SURE, LEAST = 0.85, -0.4, 2.0, -2.0
 """Log-odds of a look that finds the plane in a cell and of one that does not, from which on a cell
@@ -24,28 +31,23 @@ _CELLS = 2**18
 # Fractional bits of coordinates in OpenCV's polygons.
 _BITS = 8
 
+# Least cosine of incidence: 3 degrees, where rays run along what they could pass through.
+_GRAZING = 0.05
+
 Polygon = Sequence[NDArray[np.float64]]
 """Border (N, 2) and borders of holes, metres along the axes of a plane."""
 
 
 class PlaneGrid:
-    """Log-odds that a plane is there, in square cells along its axes.
+    """Log-odds that a plane is there, in square cells of a side, metres, along its axes.
 
-    Parameters
-    ----------
-    side : float
-        Of a cell, metres.
-
-    Attributes
-    ----------
-    odds : (V, U) float32
-        0 where nothing is known; rows along the second axis of the plane.
-    first : (2,) int
-        Numbers of the first cell along both axes.
+    `odds` (V, U) float32 are 0 where nothing is known, rows along the second axis; `first` (2,)
+    are the numbers of the first cell along both axes. From `most` cells on, they become twice as
+    large.
     """
 
-    def __init__(self, side: float) -> None:
-        self.side = side
+    def __init__(self, side: float, most: float = _CELLS) -> None:
+        self.side, self._most = side, most
         self.odds = np.zeros((0, 0), np.float32)
         self.first = np.zeros(2, np.intp)
 
@@ -71,40 +73,40 @@ class PlaneGrid:
 
     def distance(self, point: NDArray[np.float64]) -> float:
         """From a point (2,) to the next cell where the plane is, metres; 0 inside."""
-        u, v = np.floor(point / self.side).astype(np.intp) - self.first
+        (v,), (u,) = self.cells(point[None])
         height, width = self.odds.shape
         if 0 <= u < width and 0 <= v < height and self.odds[v, u] > 0:
             return 0.0
-        away = self.centres() - point
-        return float(np.sqrt((away**2).sum(axis=1).min(initial=np.inf)))
+        return float(np.hypot(*(self.centres() - point).T).min(initial=np.inf))
 
-    def see(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
-        """Take in the parts of the plane that a frame has found; their cells (V, U)."""
-        corners = np.concatenate([ring for part in parts for ring in part])
-        self._reach(corners)
+    def cells(self, points: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows (K,) and columns (K,) of the cells that points (K, 2) are in."""
+        u, v = (np.floor(points / self.side).astype(np.intp) - self.first).T
+        return v, u
+
+    def fill(self, parts: Sequence[Polygon]) -> NDArray[np.bool_]:
+        """Cells (V, U) all of whose corners are in a polygon; of slivers, one in their middle."""
+        if not parts:
+            return np.zeros(self.odds.shape, np.bool_)
+        self.reach(np.concatenate([ring for part in parts for ring in part]))
         height, width = self.odds.shape
-        # Samples at the corners of cells; a cell is seen where all four of its corners are.
         lattice = np.zeros((height + 1, width + 1), np.uint8)
         for part in parts:
             rings = [np.rint((r / self.side - self.first) * 2**_BITS).astype(int) for r in part]
             cv2.fillPoly(lattice, [ring.astype(np.int32) for ring in rings], 1, shift=_BITS)
         inside = cv2.erode(lattice, np.ones((2, 2), np.uint8), anchor=(0, 0))[:-1, :-1] > 0
         if not inside.any():
-            # A sliver between the corners of cells.
-            u, v = np.floor(corners.mean(axis=0) / self.side).astype(np.intp) - self.first
-            inside[v, u] = True
-        self._add(inside, HIT)
+            inside[self.cells(np.mean(parts[0][0], axis=0, keepdims=True))] = True
         return inside
 
-    def miss(self, cells: NDArray[np.bool_]) -> None:
-        """Take in cells (V, U) that were looked at without finding the plane."""
-        self._add(cells, MISS)
+    def add(self, cells: NDArray[np.bool_], change: float) -> None:
+        """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
+        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
 
     def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
-        self._reach(centres)
-        u, v = (np.floor(centres / self.side).astype(np.intp) - self.first).T
-        np.maximum.at(self.odds, (v, u), odds)
+        self.reach(centres)
+        np.maximum.at(self.odds, self.cells(centres), odds)
 
     def polygons(self) -> list[Polygon]:
         """Outlines of the parts, largest first, counter-clockwise, holes clockwise."""
@@ -126,11 +128,8 @@ class PlaneGrid:
             if parents[k] < 0
         ]
 
-    def _add(self, cells: NDArray[np.bool_], change: float) -> None:
-        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
-
-    def _reach(self, points: NDArray[np.float64]) -> None:
-        """Have cells for points (N, 2)."""
+    def reach(self, points: NDArray[np.float64]) -> None:
+        """Have cells for points (N, 2), one at least."""
         least, most = points.min(axis=0), points.max(axis=0)
         low, high = (np.floor(end / self.side).astype(np.intp) for end in (least, most))
         last = self.first + self.odds.shape[::-1]
@@ -139,9 +138,9 @@ class PlaneGrid:
         before, after = np.maximum(self.first - low, 0), np.maximum(high + 1 - last, 0)
         if not (before.any() or after.any()):
             return
-        if np.prod(last + after - self.first + before) > _CELLS:
+        if np.prod(last + after - self.first + before) > self._most:
             self._coarsen()
-            return self._reach(points)
+            return self.reach(points)
         self.odds = np.pad(self.odds, list(zip(before[::-1], after[::-1], strict=True)))
         self.first = self.first - before
 
@@ -153,3 +152,67 @@ class PlaneGrid:
         height, width = odds.shape
         self.odds = odds.reshape(height // 2, 2, width // 2, 2).max(axis=(1, 3))
         self.first, self.side = self.first // 2, 2 * self.side
+
+
+def may_be_in_sight(
+    centres: NDArray[np.float64], radii: NDArray[np.float64], camera: Camera
+) -> NDArray[np.bool_]:
+    """Whether spheres, centres (K, 3) and radii (K,) metres, reach into what a camera looks at."""
+    # A cone around the optical axis, through the farthest corner.
+    right = max(camera.cx + 0.5, camera.width - 0.5 - camera.cx) / camera.fx
+    down = max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy
+    slope = float(np.hypot(right, down))
+    x, y, z = (centres @ camera.axes).T
+    outside: NDArray[np.float64] = np.hypot(x, y) - slope * z
+    return (outside <= radii * np.hypot(1, slope)) & (z >= -radii)
+
+
+def seen_cells(
+    grid: PlaneGrid, own: PlaneSet, plane: Plane, labels: NDArray[np.uint16], camera: Camera
+) -> NDArray[np.bool_]:
+    """Cells (V, U) of a plane of the map, one in the frame of the image, where a frame found it.
+
+    The plane that the frame found lies over the cells, which pixels of its label look at. Cells
+    behind the camera get pixels beyond the horizon, which are never of the plane.
+    """
+    # From column, row and 1 to coordinates, points, points on the plane, and pixels.
+    u, v = grid.side * (grid.first + 0.5)
+    points = own.axes[0].T @ np.array([[grid.side, 0, u], [0, grid.side, v]])
+    points[:, 2] += own.point[0]
+    points -= np.outer(plane.normal, plane.normal @ points + [0, 0, plane.distance])
+    pixels, size = camera.matrix @ camera.axes.T @ points, grid.odds.shape[::-1]
+    flags = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpPerspective(labels, pixels, size, flags=flags) == plane.label)
+
+
+def passed_through(
+    points: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    variance: Callable[[NDArray[np.intp]], NDArray[np.float64]],
+    image: RangeImage,
+    sensor: SensorModel,
+) -> NDArray[np.bool_]:
+    """Whether rays pass through points (K, 3) of planes; they do not where they end before.
+
+    Points are in the frame of the image, which is that of a camera: of a cloud, nobody knows which
+    pixel looks where. `offset` (K,) are the distances of their planes from it, metres; `variance`
+    gives those of the points of some numbers, across their planes, square metres.
+    """
+    passed, camera = np.zeros(len(points), np.bool_), image.camera
+    assert camera is not None
+    pixel = camera.matrix @ camera.axes.T @ points.T
+    ahead = np.flatnonzero(pixel[2] > 0)
+    depth = pixel[2, ahead]
+    column, row = np.rint(pixel[:2, ahead] / depth).astype(np.intp)
+    height, width = image.shape
+    shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    ahead, depth = ahead[shown], depth[shown]
+    measured = image.inverse[row[shown], column[shown]].astype(np.float64)
+    behind = (measured > 0) & (measured * depth < 1)
+    k, excess, squared = ahead[behind], 1 / depth[behind] - measured[behind], depth[behind] ** -2
+    error = random_variance(sensor, squared) + systematic_variance(sensor, squared)
+    # Along the ray, the inverse depth changes by 1 / z for every n . p.
+    error += variance(k) * squared / offset[k] ** 2
+    steep = np.abs(offset[k]) > _GRAZING * np.linalg.norm(points[k], axis=1)
+    passed[k] = steep & (excess > OUTLIER * np.sqrt(error))
+    return passed

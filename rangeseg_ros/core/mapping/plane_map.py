@@ -3,32 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.ground.roles import corners_of
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
-from rangeseg_ros.core.mapping.observations import (
-    Observations,
-    PoseNoise,
-    Sighting,
-    observations,
-    views,
+from rangeseg_ros.core.mapping.observations import Observations, PoseNoise, observations, views
+from rangeseg_ros.core.mapping.plane_filter import Jump, PlaneFilters, find_jump
+from rangeseg_ros.core.mapping.plane_grid import (
+    HIT,
+    MISS,
+    PlaneGrid,
+    may_be_in_sight,
+    passed_through,
+    seen_cells,
 )
-from rangeseg_ros.core.mapping.plane_filter import PlaneFilters, Step
-from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
-from rangeseg_ros.core.mapping.pose_jumps import Jump, find_jump
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.mapping.visibility import THROUGH, in_image, may_be_in_sight, ray_evidence
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.tracking.plane_errors import GATE, candidates
 from rangeseg_ros.core.tracking.tracker import NOMINAL
 
+_NOWHERE = Transform.identity(), PoseNoise(0.0, 0.0)
 # Jumps of the poses that are told one by one.
 _TOLD = 10
+
+
+class Sighting(NamedTuple):
+    """What a frame shows of the planes of a map: M planes, of parts of one the largest.
+
+    `pose` takes the frame of the image to the fixed frame, `ids` (M,) are of the planes of the
+    map, and `begins` (M,) tells whether other pixels than before see them. `jump` is that of the
+    fixed frame since the frame before.
+    """
+
+    pose: Transform
+    seen: Observations
+    ids: NDArray[np.int64]
+    begins: NDArray[np.bool_]
+    jump: Jump | None = None
 
 
 class PlaneMap:
@@ -37,15 +53,9 @@ class PlaneMap:
     Attributes
     ----------
     begun_anew : str
-        Why the map was begun anew; empty when it was not.
-    epoch : int
-        How often it was begun, the first time included.
-    planes_before : list of MapPlane
-        What was known when it was begun anew.
-    successors_before : dict of int
-        `successors` then.
+        Why this map was begun after another one; empty when it was not.
     jumps : list of (int, Jump)
-        Stamps of frames whose poses the planes contradict, and by how much.
+        Stamps of frames whose poses the planes contradict, and by how much, of all maps.
     sighting : Sighting or None
         What the last frame shows of it.
     successors : dict of int
@@ -60,91 +70,23 @@ class PlaneMap:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        self._next = 1
-        self.epoch = 0
+        self.begun_anew = ''
         self.jumps: list[tuple[int, Jump]] = []
-        self.clear()
-
-    def clear(self, why: str = '') -> None:
-        """Begin anew; ids are not given twice."""
-        self.begun_anew = why
-        self.planes_before = self.planes if self.epoch else []
-        self.successors_before = self.successors if self.epoch else {}
-        self.epoch += 1
         self.sighting: Sighting | None = None
         self.successors: dict[int, int] = {}
         self._records: list[Record] = []
-        self._filters: PlaneFilters | None = None
-        self._stamp = self._time = 0
+        self._filters = PlaneFilters.of(observations([], np.zeros((0, 0)), *_NOWHERE))
+        self._next = 1
+        self._stamp = self._time = self._frames = 0
+
+    def anew(self, why: str) -> PlaneMap:
+        """An empty map that follows this one: ids are not given twice."""
+        other = PlaneMap(self.config)
+        other.begun_anew, other.jumps, other._next = why, self.jumps, self._next
+        return other
 
     def __len__(self) -> int:
         return sum(map(self._told, self._records))
-
-    def add(
-        self,
-        labels: NDArray[np.uint16],
-        planes: Sequence[Plane],
-        image: RangeImage,
-        pose: Transform,
-        stamp: int,
-    ) -> None:
-        """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
-
-        Parameters
-        ----------
-        labels : (H, W) uint16
-        planes : sequence of Plane
-            Of these labels, in the frame of the image, tracked and with their roles.
-        image : RangeImage
-            What was measured: its rays tell which planes are gone.
-        pose : Transform
-            Fixed frame from the frame of the image.
-        stamp : int
-            Nanoseconds.
-        """
-        config = self.config
-        noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
-        self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
-        self._stamp = stamp
-        self.sighting = Sighting(pose, [], np.zeros(0, np.int64), np.zeros((0, 0)))
-        match = np.zeros(0, np.intp)
-        if planes:
-            view = views(labels, planes, config.distortion_length)
-            known = self._filters
-            if known is not None and known.view.shape[1] != view.shape[1]:
-                # Of images of another size, what comes is of other pixels than before.
-                known.view = np.zeros((len(self._records), view.shape[1]))
-            seen = observations(planes, view, pose, noise)
-            jump = self._jump(planes, seen, pose, noise)
-            match, step = self._associate(planes, seen)
-            if step:
-                self._update(planes, seen, step)
-            self._fuse(planes, seen, match, stamp)
-            ids = np.array([self._records[k].id for k in match.tolist()])
-            self.sighting = Sighting(pose, planes, ids, view, jump)
-        self._look(self._outlines(planes, match, pose), image, pose, noise)
-        if len(match):
-            self._merge(np.unique(match), pose.shift)
-        self._forget()
-
-    def _jump(
-        self, planes: Sequence[Plane], seen: Observations, pose: Transform, noise: PoseNoise
-    ) -> Jump | None:
-        """Find a jump of the fixed frame by planes that were followed through it; follow it."""
-        known = {record.track: k for k, record in enumerate(self._records)}
-        both = [m for m, plane in enumerate(planes) if plane.id in known]
-        # Odometry never jumps.
-        odometry = self.config.odometry and not self.config.fixed_frame
-        if self._filters is None or not both or odometry:
-            return None
-        index = np.array([known[planes[m].id] for m in both])
-        jump = find_jump(self._filters.where(index), seen.where(both), pose.shift, noise)
-        if jump:
-            self.jumps.append((self._stamp, jump))
-            self._filters = self._filters.moved(jump.motion).with_motion_error(
-                jump.covariance, pose.shift
-            )
-        return jump
 
     @property
     def doubts(self) -> list[str]:
@@ -157,12 +99,10 @@ class PlaneMap:
     @property
     def planes(self) -> list[MapPlane]:
         """The planes whose sure parts are no clutter, in the order of their ids."""
-        if self._filters is None:
-            return []
-        filters = self._filters
-        covariance = filters.plane_covariance
+        planes = self._filters.planes
+        covariance = planes.covariances(self._filters.covariance)
         found = [
-            describe(record, filters.normal[k], filters.point[k], filters.axes[k], covariance[k])
+            describe(record, planes.where([k]), covariance[k])
             for k, record in enumerate(self._records)
             if self._told(record)
         ]
@@ -172,175 +112,176 @@ class PlaneMap:
         """Whether there is enough of a plane to tell it: no clutter."""
         return record.grid.sure_area > self.config.map_area
 
-    def _associate(
-        self, planes: Sequence[Plane], seen: Observations
-    ) -> tuple[NDArray[np.intp], Step | None]:
-        """Find out which planes of the map the planes of a frame are.
+    def add(
+        self,
+        labels: NDArray[np.uint16],
+        planes: Sequence[Plane],
+        image: RangeImage,
+        pose: Transform,
+        stamp: int,
+    ) -> None:
+        """Take in a frame. Where the fixed frame jumps, planes move along as far as they tell.
 
-        Returns
-        -------
-        (M,) int
-            Numbers of the planes of the map, -1 for none.
-        Step or None
-            Of those that are known.
+        The planes, of these labels (H, W), are in the frame of the image, tracked and with their
+        roles; what was measured in the image tells which planes are gone. The pose takes that
+        frame to the fixed one; the stamp is in nanoseconds.
         """
-        match = np.full(len(planes), -1)
-        filters = self._filters
-        if filters is None:
-            return match, None
-        planes_known = filters.normal, filters.distance
-        close = candidates(planes_known, (seen.plane[:, :3], seen.centroid), seen.range)
-        index, which = np.nonzero(close)
-        if not len(index):
-            return match, None
-        step = filters.expected(index, seen, which)
-        value = filters.gate(step, seen)
-        fits = np.flatnonzero(value < GATE)
-        index, which, value = index[fits], which[fits], value[fits]
-        at = filters.coordinates(index, seen.centroid[which])
-        away = np.array(
-            [self._records[k].grid.distance(p) for k, p in zip(index.tolist(), at, strict=True)]
-        )
-        reach = np.array([np.hypot(*planes[m].extents) / 2 for m in which.tolist()])
-        # The one it lies on, or else the likeliest.
-        order = np.lexsort([value, away > 0])
-        # What one frame finds on two surfaces is not one plane, however badly its pose is known.
-        surface: dict[int, int] = {}
-        taken = []
-        for n in order[away[order] <= 2 * reach[order]].tolist():
-            k, m = int(index[n]), int(which[n])
-            if match[m] < 0 and surface.setdefault(k, planes[m].surface) == planes[m].surface:
-                match[m] = k
-                taken.append(n)
-        return match, step.where(fits[taken]) if taken else None
+        config, camera = self.config, pose.shift
+        noise = PoseNoise(config.pose_noise, np.radians(config.pose_turn_noise))
+        self._time += stamp - self._stamp if stamp > self._stamp > 0 else round(NOMINAL * 1e9)
+        self._stamp, self._frames = stamp, self._frames + 1
+        seen = observations(planes, views(labels, planes, config.distortion_length), pose, noise)
+        if self._filters.view.shape[1] != seen.view.shape[1]:
+            # Of images of another size, what comes is of other pixels than before.
+            view = np.zeros((len(self._records), seen.view.shape[1]))
+            self._filters = self._filters._replace(view=view)
+        jump = self._followed(planes, seen, camera, noise)
+        match = self._associate(planes, seen, camera)
+        new = match < 0
+        match[new] = len(self._records) + np.arange(np.count_nonzero(new))
+        self._filters = self._filters.joined(PlaneFilters.of(seen.where(new)))
+        for _ in range(np.count_nonzero(new)):
+            self._records.append(Record(self._next, stamp, PlaneGrid(config.map_resolution)))
+            self._next += 1
+        for plane, k in zip(planes, match.tolist(), strict=True):
+            self._records[k].add(plane, stamp, self._time)
+        # Of parts of one plane, the largest decides on it.
+        order = np.argsort([-plane.count for plane in planes], kind='stable')
+        index, first = np.unique(match[order], return_index=True)
+        largest = order[first]
+        begins = self._filters.update(index, seen.where(largest))
+        ids = np.array([self._records[k].id for k in index.tolist()], np.int64)
+        self.sighting = Sighting(pose, seen.where(largest), ids, begins, jump)
+        self._find(labels, planes, match, image, pose, noise)
+        self._merge(index, camera)
+        self._forget()
 
-    def _update(self, planes: Sequence[Plane], seen: Observations, step: Step) -> None:
-        """Take in planes that are known: of parts of one plane, the largest decides on it."""
-        assert self._filters is not None
-        count = np.array([planes[m].count for m in step.observation.tolist()])
-        order = np.lexsort([step.observation, -count, step.plane])
-        largest = order[np.unique(step.plane[order], return_index=True)[1]]
-        self._filters.update(step.where(largest), seen)
-
-    def _fuse(
+    def _followed(
         self,
         planes: Sequence[Plane],
         seen: Observations,
-        match: NDArray[np.intp],
-        stamp: int,
-    ) -> None:
-        """Keep what planes of a frame are known by, and begin new ones."""
-        new = np.flatnonzero(match < 0)
-        if len(new):
-            match[new] = len(self._records) + np.arange(len(new))
-            first = PlaneFilters.of(seen.where(new))
-            self._filters = self._filters.joined(first) if self._filters else first
-            for _ in new:
-                grid = PlaneGrid(self.config.map_resolution)
-                self._records.append(Record(self._next, stamp, grid))
-                self._next += 1
-        for plane, k in zip(planes, match.tolist(), strict=True):
-            self._records[k].add(plane, stamp, self._time)
+        camera: NDArray[np.float64],
+        noise: PoseNoise,
+    ) -> Jump | None:
+        """Find a jump of the fixed frame by planes that were followed through it; follow it."""
+        known = {record.track: k for k, record in enumerate(self._records)}
+        both = [m for m, plane in enumerate(planes) if plane.id in known]
+        # Odometry never jumps.
+        if not both or (self.config.odometry and not self.config.fixed_frame):
+            return None
+        same = self._filters.where([known[planes[m].id] for m in both])
+        jump = find_jump(same, seen.where(both), camera, noise)
+        if jump:
+            self.jumps.append((self._stamp, jump))
+            self._filters = self._filters.moved(jump.motion, jump.camera, jump.covariance)
+        return jump
 
-    def _outlines(
-        self, planes: Sequence[Plane], match: NDArray[np.intp], pose: Transform
-    ) -> dict[int, NDArray[np.bool_]]:
-        """Cells of the planes of the map that a frame has found."""
-        found = {}
-        for k in np.unique(match).tolist():
-            parts = []
-            for m in np.flatnonzero(match == k).tolist():
-                rings = [planes[m].hull, *planes[m].holes]
-                parts.append([self._flat(k, r @ pose.rotation.T + pose.shift) for r in rings])
-            found[k] = self._records[k].grid.see([part for part in parts if len(part[0]) > 2])
-        return found
+    def _associate(
+        self, planes: Sequence[Plane], seen: Observations, camera: NDArray[np.float64]
+    ) -> NDArray[np.intp]:
+        """Numbers (M,) of the planes of the map that the planes of a frame are, -1 for none."""
+        index, which, value = self._filters.alike(seen.planes, seen.spread, camera)
+        at = self._filters.planes.where(index).coordinates(seen.planes.point[which])
+        away = [self._records[k].grid.distance(p) for k, p in zip(index.tolist(), at, strict=True)]
+        match = np.full(len(planes), -1)
+        # What one frame finds on two surfaces is not one plane, however badly its pose is known.
+        surface: dict[int, int] = {}
+        # The one it lies on, or else the likeliest.
+        for n in np.lexsort([value, np.array(away) > 0]).tolist():
+            k, m = int(index[n]), int(which[n])
+            near = match[m] < 0 and away[n] <= np.hypot(*planes[m].extents)
+            if near and surface.setdefault(k, planes[m].surface) == planes[m].surface:
+                match[m] = k
+        return match
 
-    def _flat(self, k: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Coordinates (N, 2) of points (N, 3) on a plane."""
-        assert self._filters is not None
-        return self._filters.coordinates(np.full(len(points), k), points)
-
-    def _look(
+    def _find(
         self,
-        found: dict[int, NDArray[np.bool_]],
+        labels: NDArray[np.uint16],
+        planes: Sequence[Plane],
+        match: NDArray[np.intp],
         image: RangeImage,
         pose: Transform,
         noise: PoseNoise,
     ) -> None:
-        """Take in that cells were looked at, and no plane was found there."""
-        filters = self._filters
-        if filters is None or not self._records:
+        """Take in the cells of planes of the map that a frame finds, and those it sees through."""
+        camera, records = image.camera, self._records
+        seen = self._filters.moved(pose.inverse(), np.zeros(3), np.diag(noise.deviations**2))
+        found = {}
+        for k in np.unique(match).tolist():
+            own, grid = seen.planes.where([k]), records[k].grid
+            parts = [planes[m] for m in np.flatnonzero(match == k).tolist()]
+            # Through a lens, or in a cloud, no homography leads from cells to pixels.
+            if camera and not camera.distortion_model:
+                grid.reach(own.coordinates(np.concatenate([corners_of(part) for part in parts])))
+                each = [seen_cells(grid, own, part, labels, camera) for part in parts]
+                found[k] = np.any(each, axis=0)
+            else:
+                borders = [[part.hull, *part.holes] for part in parts if len(part.hull) > 2]
+                found[k] = grid.fill([[own.coordinates(r) for r in rings] for rings in borders])
+            grid.add(found[k], HIT)
+        # Of a cloud, nobody knows which pixel looks where.
+        if not camera or not records:
             return
-        circles = [record.grid.circle() for record in self._records]
+        circles = [record.grid.circle() for record in records]
         middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
-        middles = filters.points(np.arange(len(middles)), middles)
-        middles = (middles - pose.shift) @ pose.rotation
-        shown = np.flatnonzero(may_be_in_sight(middles, reaches, image)).tolist()
-        cells = [self._records[k].grid.odds > 0 for k in shown]
-        for k, own in zip(shown, cells, strict=True):
-            own &= ~found.get(k, np.False_)
-        at = [self._records[k].grid.centres(own) for k, own in zip(shown, cells, strict=True)]
-        owner = np.repeat(shown, list(map(len, at))).astype(np.intp)
-        place = np.concatenate([np.zeros((0, 2)), *at])
-        points = (filters.points(owner, place) - pose.shift) @ pose.rotation
-        within = np.flatnonzero(in_image(points, image))
-        variance = filters.variances(owner[within], place[within])
-        variance += noise.shift**2 + noise.turn**2 * (points[within] ** 2).sum(axis=1)
-        normals = (filters.normal @ pose.rotation)[owner[within]]
-        sensor = SensorModel.from_config(self.config)
-        through = np.zeros(len(owner), np.bool_)
-        through[within] = ray_evidence(points[within], normals, variance, image, sensor) == THROUGH
-        for k, own in zip(shown, cells, strict=True):
-            own[own] = through[owner == k]
-            self._records[k].grid.miss(own)
+        near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
+        # In turns, every second frame: what is gone is seldom, and to look for it takes long.
+        shown = [k for k in np.flatnonzero(near).tolist() if (records[k].id + self._frames) % 2]
+        others, centres, points = [], [np.zeros((0, 2))], [np.zeros((0, 3))]
+        for k in shown:
+            grid = records[k].grid
+            others.append((grid.odds > 0) & ~found.get(k, np.False_))
+            centres.append(grid.centres(others[-1]))
+            points.append(seen.planes.where([k]).points(centres[-1]))
+        owner = np.repeat(shown, [len(own) for own in centres[1:]]).astype(np.intp)
+        at, sensor = np.concatenate(centres), SensorModel.from_config(self.config)
+        passed = passed_through(
+            np.concatenate(points),
+            seen.planes.distance[owner],
+            lambda some: seen.variances(owner[some], at[some]),
+            image,
+            sensor,
+        )
+        for k, cells in zip(shown, others, strict=True):
+            cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
+            records[k].grid.add(cells, 2 * MISS)
 
     def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
-        """Unite planes of the map that turn out to be one with some of this frame."""
+        """Unite planes of the map that turn out to be one with `some` of this frame."""
         filters = self._filters
-        assert filters is not None
-        gone: list[int] = []
-        for k, m in filters.alike(some, camera):
-            if m in gone or k in gone or self._distinct(k, m):
+        number, others, _ = filters.where(some).alike(filters.planes, filters.covariance, camera)
+        kept = np.ones(len(self._records), np.bool_)
+        for k, m in zip(some[number].tolist(), others.tolist(), strict=True):
+            a, b = self._records[k], self._records[m]
+            # Not what this frame finds on two surfaces.
+            distinct = a.seen == b.seen == self._time and a.surface != b.surface
+            if k == m or distinct or not (kept[k] and kept[m]):
                 continue
-            kept, lost = sorted((k, m), key=lambda n: -self._records[n].observations)
-            cells = self._records[lost].grid
-            odds = cells.odds[cells.odds > 0]
-            own = cells.centres()
-            centres = self._flat(kept, filters.points(np.full(len(own), lost), own))
-            reach = cells.circle()[1]
-            if not len(own) or self._records[kept].grid.distance(centres.mean(axis=0)) > 2 * reach:
+            (k, a), (m, b) = sorted(((k, a), (m, b)), key=lambda pair: -pair[1].observations)
+            own = filters.planes.where([m]).points(b.grid.centres())
+            centres = filters.planes.where([k]).coordinates(own)
+            if not len(own) or a.grid.distance(centres.mean(axis=0)) > 2 * b.grid.circle()[1]:
                 continue
-            self._records[kept].grid.absorb(centres, odds)
-            filters.absorb(kept, lost)
-            first, second = sorted(self._records[n].id for n in (kept, lost))
+            a.grid.absorb(centres, b.grid.odds[b.grid.odds > 0])
+            first, second = sorted((a.id, b.id))
             self.successors[second] = first
-            self._records[kept].absorb(self._records[lost])
-            gone.append(lost)
-        if gone:
-            self._keep(np.isin(np.arange(len(self._records)), gone, invert=True))
-
-    def _distinct(self, k: int, m: int) -> bool:
-        """Whether this frame has found planes on two surfaces."""
-        a, b = self._records[k], self._records[m]
-        return a.seen == b.seen == self._time and a.surface != b.surface
+            a.absorb(b)
+            filters.absorb(k, m)
+            kept[m] = False
+        self._keep(kept)
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
-        assert self._filters is not None
-        self._filters = self._filters.where(chosen)
-        self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
+        if not chosen.all():
+            self._filters = self._filters.where(chosen)
+            self._records = [r for r, kept in zip(self._records, chosen, strict=True) if kept]
 
     def _forget(self) -> None:
         """Drop planes of which nothing is left, clutter out of sight, and what is too much."""
-        records, trial = self._records, 1e9 * self.config.track_time
-        kept = np.array(
-            [r.grid.area > 0 and (self._told(r) or self._time - r.seen <= trial) for r in records],
-            np.bool_,
-        )
+        trial = self._time - 1e9 * self.config.track_time
+        kept = [r.grid.area > 0 and (self._told(r) or r.seen >= trial) for r in self._records]
         # Those out of sight the longest are forgotten first, and of these the ones hardly seen.
-        order = sorted(
-            range(len(records)), key=lambda k: (-records[k].seen, -records[k].observations)
-        )
-        surplus = [k for k in order if kept[k]][self.config.map_planes :]
-        kept[surplus] = False
-        if not kept.all():
-            self._keep(kept)
+        rank = [(-r.seen, -r.observations) for r in self._records]
+        order = sorted(np.flatnonzero(kept).tolist(), key=rank.__getitem__)
+        chosen = np.zeros(len(kept), np.bool_)
+        chosen[order[: self.config.map_planes]] = True
+        self._keep(chosen)

@@ -8,31 +8,23 @@ about where it is known best, and two that become parallel share what they turn 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.adjustment import moved_onto
-from rangeseg_ros.core.mapping.map_planes import MapPlane
+from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
 from rangeseg_ros.core.significance import chi2_quantile
 
 
-class Squared(NamedTuple):
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Squared(MapPlane):
     """A plane and what was made exact of it.
 
-    Attributes
-    ----------
-    plane : MapPlane
-    group : int
-        Number of the walls that it is parallel or at right angles to, 1...; 0 for none.
-    exact : str
-        'level', 'plumb', 'square' (plumb, and of a group), or ''.
-    turned : float
-        Angle by which it was turned, radians.
+    `exact` is 'level', 'plumb', 'square' (plumb, and of the walls of a `group`, 1..., that are
+    parallel or at right angles), or ''; `turned` is the angle it was turned by, radians.
     """
 
-    plane: MapPlane
     group: int
     exact: str
     turned: float
@@ -43,19 +35,9 @@ def square_up(
 ) -> list[Squared]:
     """Make planes level or plumb, and walls parallel or at right angles to each other.
 
-    Parameters
-    ----------
-    planes : sequence of MapPlane
-        P of them, in a frame whose z is up.
-    covariance : (4 P, 4 P) float64
-        Of the normals and distances of all of them.
-    tolerance : float
-        Largest angle to the horizontal or vertical of a plane that may be meant so, radians.
-
-    Returns
-    -------
-    list of Squared
-        In the order of the planes. Outlines are moved onto their planes.
+    The P planes are in a frame whose z is up, with the covariance (4 P, 4 P) of the normals and
+    distances of all of them; they stay in order, their outlines moved onto them. Planes within
+    `tolerance`, radians, of the horizontal or vertical may be meant so.
     """
     known = _Conditions(planes, covariance)
     exact, group = [''] * len(planes), [0] * len(planes)
@@ -83,10 +65,11 @@ def square_up(
             normal = _exact(exact[k], equations[k], equations[seeds.get(k, k)])
             equations[k, 3] += (equations[k, :3] - normal) @ plane.centroid
             equations[k, :3] = normal
-    moved = moved_onto(planes, equations, known.covariance)
-    cosines = [a.normal @ b.normal for a, b in zip(planes, moved, strict=True)]
-    turned = np.arccos(np.clip(cosines, -1, 1)).tolist()
-    return list(map(Squared, moved, group, exact, turned))
+    found = []
+    for k, moved in enumerate(moved_onto(planes, equations, known.covariance)):
+        turned = float(np.arccos(np.clip(planes[k].normal @ moved.normal, -1, 1)))
+        found.append(Squared(**vars(moved), group=group[k], exact=exact[k], turned=turned))
+    return found
 
 
 class _Conditions:

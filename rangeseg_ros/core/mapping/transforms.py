@@ -8,7 +8,7 @@ quaternion curves", SIGGRAPH 1985 (slerp). REP 105 for the frames of mobile robo
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from bisect import bisect_left
 from operator import itemgetter
 from typing import NamedTuple
 
@@ -25,14 +25,9 @@ _RIGID = 0.01
 
 
 class TransformError(ValueError):
-    """A transform that is not known, in words.
+    """A transform that is not known: its `reason` in words, the same for all times.
 
-    Attributes
-    ----------
-    reason : str
-        What is wrong, the same for all times.
-    may_come : bool
-        Whether it may be known later: a frame not heard of yet, or a time ahead of the last one.
+    It `may_come` later: a frame not heard of yet, or a time ahead of the last one.
     """
 
     def __init__(self, reason: str, detail: str = '', may_come: bool = False) -> None:
@@ -61,13 +56,7 @@ class Transform(NamedTuple):
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
-        """Motion of a 4x4 matrix, its rotation the nearest one.
-
-        Raises
-        ------
-        TransformError
-            Values that are not finite, or no rigid motion.
-        """
+        """Motion of a 4x4 matrix, its rotation the nearest one; TransformError if not rigid."""
         values = np.asarray(matrix, np.float64)
         if values.shape != (4, 4):
             raise TransformError(f'not a 4x4 matrix: shape {values.shape}')
@@ -90,14 +79,12 @@ class Transform(NamedTuple):
 
 
 class _Sample(NamedTuple):
+    """Where a frame is in its parent: a unit quaternion x, y, z, w and a shift."""
+
     stamp: int
     parent: str
     rotation: NDArray[np.float64]
-    """Unit quaternion x, y, z, w."""
     shift: NDArray[np.float64]
-
-    def transform(self) -> Transform:
-        return Transform(rotation_matrix(self.rotation), self.shift)
 
 
 _stamp = itemgetter(0)
@@ -132,26 +119,12 @@ class TransformBuffer:
         shift: ArrayLike,
         static: bool = False,
     ) -> None:
-        """Take in where a frame is in its parent.
+        """Take in where a frame is in its parent at a stamp, nanoseconds.
 
-        Parameters
-        ----------
-        parent, child : str
-            Names of the frames; a leading slash does not count.
-        stamp : int
-            Nanoseconds.
-        rotation : (4,) float
-            Quaternion x, y, z, w that turns the child's coordinates to the parent's.
-        shift : (3,) float
-            The child's origin in the parent, metres.
-        static : bool
-            Holds at any time, and replaces what was known of the child.
-
-        Raises
-        ------
-        TransformError
-            No name, a frame in itself, values that are not finite, or a quaternion far from
-            unit length.
+        The quaternion x, y, z, w turns the child's coordinates to the parent's, the shift is of
+        the child's origin in the parent, metres. What is static holds at any time, and replaces
+        what was known of the child. Names may have a leading slash. TransformError for no name, a
+        frame in itself, values that are not finite, or a quaternion far from unit length.
         """
         parent, child = parent.removeprefix('/'), child.removeprefix('/')
         name = f'transform from {parent!r} to {child!r}'
@@ -175,7 +148,7 @@ class TransformBuffer:
             samples.clear()
         at = bisect_left(samples, stamp, key=_stamp)
         if at == len(samples) or samples[at].stamp != stamp:
-            insort(samples, sample, key=_stamp)
+            samples.insert(at, sample)
             del samples[: bisect_left(samples, samples[-1].stamp - CACHE_TIME, key=_stamp)]
 
     def clear(self) -> None:
@@ -183,57 +156,54 @@ class TransformBuffer:
         self._moving.clear()
 
     def lookup(self, target: str, source: str, stamp: int) -> Transform:
-        """The motion that takes coordinates in `source` to those in `target`.
+        """The motion that takes coordinates in the frame `source` to those in `target`.
 
-        Parameters
-        ----------
-        target, source : str
-            Names of frames.
-        stamp : int
-            Nanoseconds; 0 for the last time at which all of the chain is known, as in tf2.
-
-        Raises
-        ------
-        TransformError
-            A frame that is not known, frames that are not connected, a loop, or a time outside
-            what is known.
+        `stamp` is in nanoseconds, 0 for the last time at which all of the chain is known, as in
+        tf2. TransformError for a frame that is not known, frames that are not connected, a loop,
+        or a time outside what is known.
         """
         target, source = target.removeprefix('/'), source.removeprefix('/')
         for frame in (target, source):
             if frame not in self._frames:
                 raise TransformError(f'frame {frame!r} is not known', may_come=True)
-        stamp = stamp or self._latest_common_time(target, source)
         up, up_ends = self._ancestors(source, stamp)
         down, down_ends = self._ancestors(target, stamp)
-        for frame, motion in down.items():
-            if frame in up:
-                return motion.inverse().after(up[frame])
-        failed = up_ends or down_ends
-        if failed:
-            raise failed
-        raise TransformError(f'frames {target!r} and {source!r} are not connected', may_come=True)
+        common = next((frame for frame in down if frame in up), None)
+        if common is None:
+            detail = f'frames {target!r} and {source!r} are not connected'
+            raise up_ends or down_ends or TransformError(detail, may_come=True)
+        (first, known), (second, also_known) = up[common], down[common]
+        if not stamp and min(known, also_known) < np.inf:
+            return self.lookup(target, source, int(min(known, also_known)))
+        return second.inverse().after(first)
 
     def _ancestors(
         self, frame: str, stamp: int
-    ) -> tuple[dict[str, Transform], TransformError | None]:
-        """Motions from a frame to itself and all above it, and why it goes no higher."""
-        found = {frame: Transform.identity()}
+    ) -> tuple[dict[str, tuple[Transform, float]], TransformError | None]:
+        """Motions from a frame to itself and all above it, and why it goes no higher.
+
+        With each motion, the last time at which all of it is known.
+        """
+        motion, known = Transform.identity(), np.inf
+        found = {frame: (motion, known)}
         while frame in self._static or frame in self._moving:
             try:
-                sample = self._at(frame, stamp)
+                sample = self._static.get(frame) or self._at(frame, stamp)
             except TransformError as error:
                 return found, error
             if sample.parent in found:
                 raise TransformError(f'frames form a loop: {" -> ".join([*found, sample.parent])}')
-            found[sample.parent] = sample.transform().after(found[frame])
+            motion = Transform(rotation_matrix(sample.rotation), sample.shift).after(motion)
+            known = known if frame in self._static else min(known, self._moving[frame][-1].stamp)
             frame = sample.parent
+            found[frame] = motion, known
         return found, None
 
     def _at(self, frame: str, stamp: int) -> _Sample:
-        """Where a frame is in its parent at a time."""
-        if frame in self._static:
-            return self._static[frame]
+        """Where a moving frame is in its parent at a time; at last for 0."""
         samples = self._moving[frame]
+        if not stamp:
+            return samples[-1]
         after = bisect_left(samples, stamp, key=_stamp)
         if after < len(samples) and samples[after].stamp == stamp:
             return samples[after]
@@ -241,10 +211,8 @@ class TransformBuffer:
             behind = (samples[0].stamp - stamp) * 1e-9
             raise TransformError(f'{frame!r} is not known that early', f': {behind:.3f} s before')
         if after == len(samples):
-            ahead = (stamp - samples[-1].stamp) * 1e-9
-            raise TransformError(
-                f'{frame!r} is not known that late', f': {ahead:.3f} s after the last', True
-            )
+            late = f': {(stamp - samples[-1].stamp) * 1e-9:.3f} s after the last'
+            raise TransformError(f'{frame!r} is not known that late', late, True)
         first, second = samples[after - 1 : after + 1]
         if first.parent != second.parent:
             return first
@@ -252,30 +220,6 @@ class TransformBuffer:
         from scipy.spatial.transform import Rotation, Slerp
 
         share = (stamp - first.stamp) / (second.stamp - first.stamp)
-        turns = Rotation.from_quat([first.rotation, second.rotation])
-        return _Sample(
-            stamp,
-            first.parent,
-            Slerp([0, 1], turns)(share).as_quat(),
-            first.shift + share * (second.shift - first.shift),
-        )
-
-    def _latest_common_time(self, target: str, source: str) -> int:
-        """Last time at which all moving transforms between two frames are known; 0 for none."""
-        chains = []
-        for frame in (target, source):
-            chain: dict[str, int | None] = {}
-            while frame not in chain:
-                samples = self._moving.get(frame)
-                sample = self._static.get(frame) or (samples[-1] if samples else None)
-                chain[frame] = sample.stamp if samples and sample else None
-                frame = sample.parent if sample else frame
-            chains.append(chain)
-        common = set(chains[0]) & set(chains[1])
-        times = []
-        for chain in chains:
-            for frame, time in chain.items():
-                if frame in common:
-                    break
-                times.append(time)
-        return min((time for time in times if time is not None), default=0)
+        turn = Slerp([0, 1], Rotation.from_quat([first.rotation, second.rotation]))(share)
+        shift = first.shift + share * (second.shift - first.shift)
+        return _Sample(stamp, first.parent, turn.as_quat(), shift)
