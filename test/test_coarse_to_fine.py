@@ -1,10 +1,5 @@
 """The fast minimiser against the full expansion on the same energy."""
 
-import json
-import os
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -91,18 +86,3 @@ def test_pixels_without_normal_belong_to_their_side_of_a_jump():
     grid.right[:, 34] = 0
     found = coarse_to_fine.minimise(normals, DIRECTIONS, grid, 100.0)
     assert (found[:, :35] == 5).all() and (found[:, 35:] == 40).all()
-
-
-def labels_of_a_small_problem():
-    arguments, _ = problem(3, 60, 60)
-    return coarse_to_fine.minimise(*arguments).ravel().tolist()
-
-
-def test_compiled_code_gives_the_labels_of_the_plain_python():
-    environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), 'NUMBA_DISABLE_JIT': '1'}
-    text = subprocess.check_output([sys.executable, __file__], env=environment, text=True)
-    assert json.loads(text) == labels_of_a_small_problem()
-
-
-if __name__ == '__main__':
-    print(json.dumps(labels_of_a_small_problem()))
