@@ -66,17 +66,6 @@ def test_where_nothing_can_be_kept_kernels_last_as_long_as_the_process(tmp_path)
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize(
-    'variable, folder',
-    [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')],
-)
-def test_folders_that_the_user_names_come_first(tmp_path, variable, folder):
-    named = tmp_path / 'named'
-    run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
-    assert (run.returncode, run.stderr) == (0, '')
-    assert list((named / folder).rglob('*.nbi'))
-
-
 @pytest.mark.parametrize('start', ['rangeseg', 'segment_planes'])
 def test_where_nothing_can_be_written_one_line_says_so(start):
     code = f"sys.argv[1:] = ['compile']\nfrom rangeseg_ros.start import {start}; {start}()"
@@ -86,11 +75,18 @@ def test_where_nothing_can_be_written_one_line_says_so(start):
     assert 'NUMBA_CACHE_DIR' in run.stderr
 
 
-@pytest.mark.parametrize('mode', [0o777, 0o1777, 0o755])
 @pytest.mark.parametrize(
-    ('variable', 'within'), [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')]
+    ('variable', 'within', 'mode'),
+    [
+        ('NUMBA_CACHE_DIR', '', 0o777),
+        ('NUMBA_CACHE_DIR', '', 0o1777),
+        ('NUMBA_CACHE_DIR', '', 0o755),
+        ('XDG_CACHE_HOME', 'rangeseg_ros', 0o777),
+    ],
 )
-def test_nothing_is_taken_from_where_others_can_write(tmp_path, variable, within, mode):
+def test_folders_that_the_user_names_come_first_but_where_others_can_write(
+    tmp_path, variable, within, mode
+):
     """What is unpickled from there is executed."""
     named = tmp_path / 'named'
     run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})

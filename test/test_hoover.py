@@ -18,12 +18,6 @@ def overlap(*runs):
     return Overlap.between(truth[None], labels[None])
 
 
-@pytest.mark.parametrize('tolerance', [0.5, 1.01, -1.0, float('nan')])
-def test_tolerance_out_of_range(tolerance):
-    with pytest.raises(ComparisonError, match='tolerance'):
-        classify(overlap((1, 1, 4)), tolerance)
-
-
 def test_images_that_cannot_be_compared():
     with pytest.raises(ComparisonError, match='size'):
         Overlap.between(np.zeros((2, 2), int), np.zeros((2, 3), int))

@@ -100,24 +100,6 @@ def test_every_option_finds_the_corner(options):
     assert (angles.min(axis=0) < 2).all()
 
 
-@pytest.mark.parametrize('method', ['normals', 'planes'])
-@pytest.mark.parametrize(
-    'depth',
-    [
-        np.zeros((48, 64), np.uint16),
-        np.full((48, 64), np.nan),
-        np.full((48, 64), np.inf),
-        np.full((48, 64), -1.0),
-        np.where(np.eye(48, 64) > 0, 1.0, np.inf),
-    ],
-    ids=['zero', 'nan', 'infinite', 'negative', 'diagonal'],
-)
-def test_frames_without_a_plane_say_why(depth, method):
-    result = segment(depth, Config(method=method))
-    assert result.planes == [] and not result.labels.any()
-    assert result.reason
-
-
 @pytest.mark.parametrize('config', [Config(min_pixels=100), NORMALS], ids=['planes', 'normals'])
 def test_a_result_can_be_pickled_with_its_energy(config):
     result = segment(corner(), config)
