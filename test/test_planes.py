@@ -8,6 +8,8 @@ import pytest
 from clouds import cloud_of
 from planes_of_labels import fit_planes
 
+from rangeseg_ros.core.fitting.region_sums import sum_regions
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -184,6 +186,49 @@ def test_areas_and_rectangles_are_those_of_the_pixels(seed, form):
         low, high = along.min(axis=0), along.max(axis=0)
         np.testing.assert_allclose(plane.extents, high - low, atol=1e-4)
         np.testing.assert_allclose(plane.centre @ axes[:, :2], (low + high) / 2, atol=1e-4)
+
+
+@pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
+def test_sums_of_regions_are_those_over_their_pixels(form):
+    """Without what is four deviations off the plane of the blocks that a region fills."""
+    draw = np.random.default_rng(7)
+    camera = Camera(72, 60, 90.0, 95.0, 30.0, 33.0)
+    sensor = SensorModel(0.001, 0, 1.0, 0, 0.0005, 0, 35)
+    theta = np.array([[0, 0, 0.4], [0.1, 0.05, 0.5], [-0.1, 0.2, 0.7], [0.05, -0.1, 0.6]])
+    labels = draw.permutation(np.arange(30) % 4).reshape(5, 6).repeat(12, 0).repeat(12, 1)
+    inverse = (theta[labels] * camera.rays).sum(axis=2)
+    # Half of the third region is off: it is then no plane, or another sensor.
+    inverse += draw.normal(0, np.where(labels == 3, 0.05, 0.0005))
+    inverse += 0.1 * draw.choice([-1, 0, 1], labels.shape, p=[0.01, 0.98, 0.01])
+    labels = (labels * (draw.random(labels.shape) > 0.01)).astype(np.uint16)
+    inverse[draw.random(labels.shape) < 0.01] = 0
+    exact = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    image = form(exact)
+    sums, total = sum_regions(labels, image, Blocks.of(image), sensor)
+    whole = labels.reshape(15, 4, 18, 4).transpose(0, 2, 1, 3).reshape(15, 18, 16)
+    whole = (whole == whole[..., :1]).all(axis=2).repeat(4, 0).repeat(4, 1)
+    for label in (1, 2, 3):
+        mask = (labels == label) & image.valid
+        rays, y = image.rays.astype(float), image.inverse.astype(float)
+        plane = np.linalg.lstsq(rays[mask & whole], y[mask & whole], rcond=None)[0]
+        outlier = mask & ((y - rays @ plane) ** 2 > 16 * (1e-6 + 0.25e-6))
+        assert (sums.pixels[label], sums.outliers[label]) == (mask.sum(), outlier.sum())
+        assert (2 * outlier.sum() > mask.sum()) == (label == 3)
+        kept = mask if label == 3 else mask & ~outlier
+        r, y = rays[kept], y[kept]
+        w = np.full(len(y), 1e6) if image.camera else 1 / y**2
+        p, rows_columns, upper = r / y[:, None], np.argwhere(kept), np.triu_indices(3)
+        expected = [*((w[:, None] * r).T @ r)[upper], *(w * y) @ r, w @ y**2, len(y), *w @ r]
+        expected += [w @ y, w.sum(), *p.sum(axis=0), *(p.T @ p)[upper]]
+        expected += [*rows_columns.sum(axis=0), *(rows_columns**2).sum(axis=0)]
+        # Of whole blocks of a camera, the middle stands for points and places.
+        rtol = 3e-3 if image.camera else 1e-6
+        np.testing.assert_allclose(total[label], expected, rtol=rtol, atol=rtol * w.sum())
+        cells = sums.cells[sums.start[label] : sums.start[label + 1]]
+        np.testing.assert_allclose(cells.sum(axis=0), total[label], rtol=1e-9, atol=1e-6)
+        assert 16 < len(cells) <= 64
+        first, after = np.argwhere(labels == label).min(0), np.argwhere(labels == label).max(0) + 1
+        np.testing.assert_array_equal(sums.box[label], [*first, *after])
 
 
 def test_a_plane_by_another_name_is_the_same_plane():
