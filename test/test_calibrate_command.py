@@ -4,22 +4,16 @@ import numpy as np
 import pytest
 import yaml
 from calibration_frames import CAMERA, frames, rms, true_map
-from click.testing import CliRunner
 from message_classes import cloud
 from rosbags.typesys import Stores
 
 from rangeseg_ros import Config, RangeImage
-from rangeseg_ros.cli.calibrate import command
 from rangeseg_ros.core.calibration.sightings import find_sightings
 from rangeseg_ros.io.bag_writer import BagWriter, DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.io.message_types import CLOUD, message_types
-
-
-def run(*arguments):
-    return CliRunner().invoke(command, [str(argument) for argument in arguments])
 
 
 @pytest.fixture(scope='module')
@@ -36,12 +30,14 @@ def folder(tmp_path_factory):
     return path
 
 
-def test_command_writes_map_parameters_and_report(folder, tmp_path):
+def test_command_writes_map_parameters_and_report(folder, tmp_path, run):
     output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
     camera = ['--camera', folder / 'camera.yaml', '--jobs', 1]
-    result = run(folder / 'depth', *camera, '--output', output, '--params', params)
-    assert result.exit_code == 0, result.output
-    assert 'less' in result.output
+    code, said, error = run(
+        'calibrate', folder / 'depth', *camera, '--output', output, '--params', params
+    )
+    assert code == 0, error
+    assert 'less' in said
     distortion = read_distortion(output)
     assert distortion.camera == CAMERA
     assert rms(distortion.offset - true_map(0.004)) < 0.4 * rms(true_map(0.004))
@@ -55,12 +51,12 @@ def test_command_writes_map_parameters_and_report(folder, tmp_path):
     ]  # fmt: skip
 
     # The same from a bag, in place of the one before.
-    result = run(folder / 'bag', '--output', output, '--jobs', 1)
-    assert result.exit_code == 0, result.output
+    code, _, error = run('calibrate', folder / 'bag', '--output', output, '--jobs', 1)
+    assert code == 0, error
     assert read_distortion(output).offset == pytest.approx(distortion.offset, abs=1e-6)
 
 
-def test_bags_of_clouds_give_the_map_that_images_give(tmp_path):
+def test_bags_of_clouds_give_the_map_that_images_give(tmp_path, run):
     images = [image for _, image in frames(22, true_map(0.004), noise=0.0006)]
     store = message_types(Stores.ROS2_JAZZY)
     (tmp_path / 'depth').mkdir()
@@ -72,11 +68,15 @@ def test_bags_of_clouds_give_the_map_that_images_give(tmp_path):
             bag.write(topic, number, store.serialize_cdr(cloud(points), CLOUD))
             depth = np.ascontiguousarray(points[..., 2])
             write_image(tmp_path / 'depth' / f'{number:02d}.tiff', depth)
-    result = run(tmp_path / 'bag', '--output', tmp_path / 'clouds.tiff', '--jobs', 1)
-    assert result.exit_code == 0, result.output
+    code, _, error = run(
+        'calibrate', tmp_path / 'bag', '--output', tmp_path / 'clouds.tiff', '--jobs', 1
+    )
+    assert code == 0, error
     camera = ['--camera', tmp_path / 'camera.yaml', '--jobs', 1]
-    result = run(tmp_path / 'depth', *camera, '--output', tmp_path / 'images.tiff')
-    assert result.exit_code == 0, result.output
+    code, _, error = run(
+        'calibrate', tmp_path / 'depth', *camera, '--output', tmp_path / 'images.tiff'
+    )
+    assert code == 0, error
     one, other = (read_distortion(tmp_path / f'{name}.tiff') for name in ('clouds', 'images'))
     # Points tell the camera that took them.
     np.testing.assert_allclose(one.camera.matrix, CAMERA.matrix, atol=2e-3)
@@ -87,7 +87,7 @@ def test_bags_of_clouds_give_the_map_that_images_give(tmp_path):
     assert rms(1 / corrected.points[..., 2] - (1 / points[..., 2] - one.offset)) < 1e-5
 
 
-def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
+def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch, run):
     output = tmp_path / 'map.tiff'
     arguments = [folder / 'depth', '--camera', folder / 'camera.yaml', '--output', output]
     segmented = []
@@ -100,10 +100,10 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
         return real(labels, image)
 
     monkeypatch.setattr('rangeseg_ros.batch.calibration.find_sightings', counting)
-    assert run(*arguments, '--jobs', 1).exit_code != 0
+    assert run('calibrate', *arguments, '--jobs', 1)[0] == 130
     assert not output.exists()
-    result = run(*arguments, '--jobs', 1)
-    assert result.exit_code == 0, result.output
+    code, _, error = run('calibrate', *arguments, '--jobs', 1)
+    assert code == 0, error
     # Of the first part of ten frames nothing is done again.
     assert len(segmented) == 15 + 12
     assert not list(tmp_path.glob('.*'))
@@ -119,7 +119,7 @@ def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch):
         ('few', 'too few planes'),
     ],
 )
-def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, kind, words):
+def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, kind, words, run):
     output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
     recording, camera = folder / 'depth', ['--camera', folder / 'camera.yaml']
     if kind == 'no camera':
@@ -134,7 +134,8 @@ def test_bad_input_ends_in_one_line_and_writes_nothing(folder, tmp_path, kind, w
     elif kind == 'foreign params':
         params.write_text('noise: 0.1\n')
     before = {path: path.read_text() for path in (output, params) if path.exists()}
-    result = run(recording, *camera, '--output', output, '--params', params, '--jobs', 1)
-    assert result.exit_code != 0
-    assert words in (result.output + str(result.exception))
+    code, _, error = run(
+        'calibrate', recording, *camera, '--output', output, '--params', params, '--jobs', 1
+    )
+    assert code == 2 and words in error and error.count('\n') == 1
     assert {path: path.read_text() for path in (output, params) if path.exists()} == before

@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from rangeseg_ros.cli.simulate import command
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.render import simulate
@@ -143,9 +141,9 @@ def test_slopes_and_shadows_of_a_depth_image():
 
 
 @pytest.mark.parametrize('name', SENSORS)
-def test_rooms_command(tmp_path, name):
+def test_rooms_command(tmp_path, name, run):
     output = tmp_path / 'rooms'
-    options = ['rooms', '--sensor', name, '--scenes', '1', '--width', '80', '--height', '60']
-    result = CliRunner().invoke(command, [*options, '--output', str(output)])
-    assert result.exit_code == 0, result.output
+    size = '--width', 80, '--height', 60
+    words = 'simulate', 'rooms', '--sensor', name, '--scenes', 1, *size, '--output', output
+    assert run(*words)[0] == 0
     assert (read_depth(output / 'depth' / '000000.png') > 0).mean() > 0.4

@@ -6,13 +6,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from pytest import approx
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.batch.frame_files import write_frame
-from rangeseg_ros.cli.segment import command
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.stairs import (
     StairsCheck,
@@ -20,8 +18,6 @@ from rangeseg_ros.evaluation.stairs import (
     stairs_figures,
     stairs_line,
 )
-from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.images import write_image
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
 from rangeseg_ros.simulation.sensors.sensor import resize
@@ -114,7 +110,7 @@ def test_nothing_is_worked_out_unless_asked_for():
 
 
 @pytest.mark.parametrize('axis', [(1, 0, 0), (-1, 0, 0), (0, 0, 1)])
-def test_a_tilted_camera_is_noticed_and_said(axis, tmp_path):
+def test_a_tilted_camera_is_noticed_and_said(axis, segment_image):
     wall = Piece(box((1, 20, 6), np.eye(3), (3.5, 0, 0)), OBSTACLE, 3.0)
     terrain, _, straight = seen(Piece(FLOOR, GROUND), wall)
     assert straight.tilt is None
@@ -125,14 +121,8 @@ def test_a_tilted_camera_is_noticed_and_said(axis, tmp_path):
     apart = np.degrees(np.arccos(wrong @ terrain.up))
     assert tilt is not None and tilt.degrees == approx(apart, abs=2)
     assert tilt.up == approx(terrain.up, abs=0.03)
-    write_camera(tmp_path / 'camera.yaml', CAMERA)
-    write_image(tmp_path / 'depth.png', frame.depth)
-    text = ''.join(f'{name}: {value}\n' for name, value in up_of(wrong).items())
-    (tmp_path / 'params.yaml').write_text(text)
-    names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
-    paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
-    said = CliRunner().invoke(command, paths)
-    assert said.exit_code == 0 and 'the camera looks tilted by' in said.output
+    code, _, error = segment_image(frame.depth, CAMERA, **up_of(wrong))
+    assert code == 0 and 'the camera looks tilted by' in error
 
 
 def test_figures_of_stairs_are_those_counted_on_paper():
