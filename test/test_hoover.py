@@ -92,6 +92,10 @@ RUNS = st.lists(
 @example([(1, 1, 4), (2, 1, 3), (0, 1, 3)], 0.75)
 @example([(1, 1, 4), (1, 2, 3), (1, 0, 3)], 0.75)
 @example([(1, 1, 6), (1, 2, 3), (0, 2, 3)], 0.6)
+@example([(1, 1, 3), (0, 1, 1), (1, 2, 3), (0, 2, 1)], 0.75)
+@example([(1, 1, 3), (1, 2, 3), (1, 0, 2)], 0.75)
+@example([(1, 1, 3), (2, 1, 3), (0, 1, 2)], 0.75)
+@example([(1, 1, 3), (1, 0, 1), (2, 1, 3), (2, 0, 1)], 0.75)
 def test_classes_are_those_of_the_literal_counting(runs, tolerance):
     truth = np.concatenate([np.full(n, g) for g, _, n in runs])
     labels = np.concatenate([np.full(n, m) for _, m, n in runs])
