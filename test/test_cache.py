@@ -33,9 +33,8 @@ def mkdtemp(*arguments, **options):
 tempfile.mkdtemp = mkdtemp
 """
 KERNEL = """
-import numpy as np
-from rangeseg_ros.core.sensing.moments import fit_all
-fit_all(np.zeros((1, 10)))
+from rangeseg_ros.core.by_normals.angular_cost import degrees
+degrees(1.0)
 """
 
 
