@@ -11,6 +11,7 @@ from planes_of_labels import fit_planes
 from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera
@@ -234,7 +235,7 @@ def test_sums_of_regions_are_those_over_their_pixels(form):
         assert off[:POINT].max() < 3e-6 and off[POINT:].max() < (4e-4 if image.camera else 1e-6)
         cells = sums.cells[sums.start[label] : sums.start[label + 1]]
         np.testing.assert_allclose(cells.sum(axis=0), total[label], rtol=1e-9, atol=1e-6)
-        assert 16 < len(cells) <= 64
+        assert 16 < len(cells) <= 64 and (cells[:, COUNT] > 0).all()
         first, after = np.argwhere(labels == label).min(0), np.argwhere(labels == label).max(0) + 1
         np.testing.assert_array_equal(sums.box[label], [*first, *after])
 
