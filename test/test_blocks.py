@@ -8,7 +8,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid, weights
-from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit, fit_all
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, SLOPE, fit, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -26,15 +26,15 @@ def grid(height, width, seed=0):
     return inverse.astype(np.float32), rays, edges
 
 
-def whole(inverse, edges):
-    """Blocks of 4 pixels that surfaces are grown from."""
+def whole(inverse, edges, size=4):
+    """Blocks that surfaces are grown from."""
     rays = grid(*inverse.shape)[1]
-    blocks = Blocks.of(RangeImage(rays, inverse))
-    nodes = Nodes.of(inverse, edges, blocks, SensorModel.from_config(Config()), 4)
+    blocks = Blocks.of(RangeImage(rays, inverse), size)
+    nodes = Nodes.of(inverse, edges, blocks, SensorModel.from_config(Config()), size)
     return nodes.moments[..., COUNT] > 0
 
 
-@pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3)])
+@pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3), np.s_[4], np.s_[:, 4]])
 def test_slopes_do_not_need_the_rays_of_holes(hole):
     """Those in the middle of a block, which clouds do not have."""
     _, rays, _ = grid(8, 8)
@@ -67,11 +67,10 @@ def test_blocks_are_sums_over_their_pixels(shape, size):
         np.testing.assert_allclose(whole.moments[i, j], parts.sum(axis=0), rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ('shape', 'size'), [((120, 160), 2), ((240, 320), 3), ((480, 640), 4), ((720, 1280), 8)]
-)
-def test_larger_images_have_larger_blocks(shape, size):
-    assert block_size(shape) == size
+def test_larger_images_have_larger_blocks():
+    """From an eighth and half of VGA on, and above twice VGA."""
+    sizes = [block_size((120, width)) for width in (160, 319, 320, 1279, 1280, 5120, 5121)]
+    assert sizes == [2, 2, 3, 3, 4, 4, 8]
 
 
 def test_blocks_that_jumps_cross_are_left_out():
@@ -90,30 +89,34 @@ def test_blocks_that_jumps_cross_are_left_out():
     np.testing.assert_array_equal(whole(inverse, Grid(horizontal, vertical)), expected)
 
 
-@pytest.mark.parametrize(('missing', 'kept'), [(4, True), (5, False), (16, False)])
-def test_blocks_of_which_too_little_was_measured_are_left_out(missing, kept):
+@pytest.mark.parametrize(('size', 'most'), [(2, 1), (3, 2), (4, 4), (8, 19)])
+def test_blocks_of_which_too_little_was_measured_are_left_out(size, most):
     """30 % of 16 pixels are 4.8."""
-    inverse, _, edges = grid(4, 4)
-    inverse.ravel()[:missing] = 0
-    assert whole(inverse, edges)[0, 0] == kept
+    inverse, _, edges = grid(size, size)
+    for missing, kept in ((most, True), (most + 1, False), (size * size, False)):
+        inverse.ravel()[:missing] = 0
+        assert whole(inverse, edges, size)[0, 0] == kept
 
 
 @pytest.mark.parametrize('shape', [(12, 16), (11, 13), (9, 18), (1, 1), (1, 9), (9, 1), (3, 5)])
-def test_blocks_touch_along_half_of_their_border(shape):
+@pytest.mark.parametrize('size', [2, 3, 4, 8])
+def test_blocks_touch_along_half_of_their_border(shape, size):
     height, width = shape
     random = np.random.default_rng(sum(shape))
     horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
     vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
     inverse, rays, _ = grid(height, width)
-    blocks, sensor = Blocks.of(RangeImage(rays, inverse)), SensorModel.from_config(Config())
-    nodes = Nodes.of(inverse, Grid(horizontal, vertical), blocks, sensor, 4)
+    blocks, sensor = Blocks.of(RangeImage(rays, inverse), size), SensorModel.from_config(Config())
+    nodes = Nodes.of(inverse, Grid(horizontal, vertical), blocks, sensor, size)
     right, below = nodes.right, nodes.below
-    rows, columns = -(-height // 4), -(-width // 4)
+    rows, columns = -(-height // size), -(-width // size)
     assert right.shape == (rows, columns - 1) and below.shape == (rows - 1, columns)
     for i, j in np.ndindex(right.shape):
-        assert right[i, j] == (horizontal[4 * i : 4 * i + 4, 4 * j + 3].sum() >= 2)
+        border = horizontal[size * i : size * (i + 1), size * (j + 1) - 1]
+        assert right[i, j] == (border.sum() >= size / 2)
     for i, j in np.ndindex(below.shape):
-        assert below[i, j] == (vertical[4 * i + 3, 4 * j : 4 * j + 4].sum() >= 2)
+        border = vertical[size * (i + 1) - 1, size * j : size * (j + 1)]
+        assert below[i, j] == (border.sum() >= size / 2)
 
 
 def test_slopes_and_residuals_are_those_of_the_planes():
@@ -141,19 +144,23 @@ def test_an_exact_plane_leaves_no_more_than_float32_rounds(theta):
 
 
 def test_weights_count_in_variances_of_the_sensor():
+    """Chi-squared of 16 - 3 degrees of freedom each, in the mean of 400 blocks."""
     inverse, rays, edges = grid(80, 80, seed=4)
-    sensor = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
-    plain = Blocks.of(RangeImage(rays, inverse))
-    flat = np.zeros(plain.squared.shape)
-    facing = plain._replace(across=flat, down=flat)
-    nodes = Nodes.of(inverse, edges, facing, sensor, 4)
-    theta, residual = fit_all(nodes.moments.reshape(-1, SIZE))
-    unweighted, _ = fit_all(plain.moments.reshape(-1, SIZE))
-    np.testing.assert_allclose(theta, unweighted, rtol=1e-6, atol=1e-9)
-    # Chi-squared of 16 - 3 degrees of freedom each; 400 blocks: 2 % of standard error.
-    assert residual.mean() == pytest.approx(13, rel=0.08)
-    np.testing.assert_allclose(nodes.residual.ravel(), residual, rtol=1e-3)
-    np.testing.assert_allclose(nodes.moments[..., RATIO], 16 * 4.0, rtol=1e-5)
+    white = SensorModel.from_config(Config(noise=0.002, distortion=0.004))
+    white = white._replace(column_noise=0.0, row_noise=0.0)
+    blocks = Blocks.of(RangeImage(rays, inverse))
+    for sensor in (white, white._replace(range_noise=0.001, column_noise=0.3, row_noise=0.2)):
+        nodes = Nodes.of(inverse, edges, blocks, sensor, 4)
+        random = 4e-6 + (sensor.range_noise * blocks.squared) ** 2
+        tilt = sensor.column_noise**2 * blocks.across + sensor.row_noise**2 * blocks.down
+        weight = 1 / (random + tilt)
+        expected = weight[..., None] * blocks.moments
+        expected[..., COUNT], expected[..., RATIO] = 16, 16 * weight * 0.004**2
+        expected[..., SLOPE] = 16 * tilt / random
+        np.testing.assert_allclose(nodes.moments, expected, rtol=1e-6)
+        np.testing.assert_allclose(nodes.residual, weight * blocks.residual, rtol=1e-6)
+        if sensor is white:
+            assert nodes.residual.mean() == pytest.approx(13, rel=0.08)
 
 
 def pixels(seed, count=200):
