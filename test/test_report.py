@@ -14,7 +14,7 @@ from rangeseg_ros.batch.frame_files import write_frame
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.report import charts
-from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
+from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced, shared_values
 from rangeseg_ros.report.replay import ReplayReport
 
 CAMERA = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
@@ -72,6 +72,14 @@ def test_a_page_says_what_was_found(report):
     assert re.search(r'without planes\s*number\s*reason\s*1\s*no valid depth', page.text)
     for stage in ('edges', 'labels', 'planes', 'total'):
         assert re.search(rf'\n{stage}(\d+\.\d){{3}}\n', page.text)
+
+
+def test_stages_have_the_median_the_95th_percentile_and_the_most_of_their_times():
+    """0 where a frame has not come to the stage."""
+    laps = [{'edges': 1.0, 'labels': 4.0}, {'edges': 3.0}, {'edges': 2.0, 'labels': 2.0}]
+    stages = shared_values(Config(), laps, {})['stages']
+    expected = [('edges', 2, 2.9, 3), ('labels', 2, 3.8, 4), ('total', 4, 4.9, 5)]
+    assert [(name, *map(pytest.approx, times)) for name, *times in expected] == stages
 
 
 def test_parameters_that_were_changed_are_marked(report):
