@@ -1,4 +1,4 @@
-"""Compiled kernels are kept where that is possible, and nothing fails where it is not."""
+"""Compiled kernels: kept where that is possible, dropped when outdated, loaded unparsed."""
 
 import os
 import pickle
@@ -180,3 +180,44 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
     changed.write_text(KERNEL_OF.format('f', 2))
     os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert call() == ['2', '3', '0', '1']
+
+
+KERNELS = """
+from numba import njit
+
+@njit(cache=True)
+def twice(x):
+    return 2 * x
+
+@njit(cache=True)
+def shifted(x):
+    return twice(x) + 1
+"""
+
+COUNT = """
+from llvmlite import binding
+parsed, parse = [], binding.parse_bitcode
+binding.parse_bitcode = lambda code: parsed.append(code) or parse(code)
+"""
+
+LAZY = 'from rangeseg_ros.core.runtime.kernels import load_lazily\nload_lazily()\n'
+
+
+def run(folder, code):
+    """What `code` prints in a process of its own with the kernels at hand."""
+    command = [sys.executable, '-c', code]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_bitcode_is_parsed_only_for_what_is_compiled(tmp_path):
+    (tmp_path / 'kernels.py').write_text(KERNELS)
+    call = 'from kernels import *\nprint(twice(3), len(parsed))\n'
+    assert run(tmp_path, LAZY + COUNT + call) == ['6', '0']
+    # From the cache; then as a part of a kernel that is compiled.
+    assert run(tmp_path, COUNT + call) == ['6', '1']
+    more = 'print(shifted(3), len(parsed))'
+    assert run(tmp_path, LAZY + COUNT + call + more) == ['6', '0', '7', '1']
+    # Both from the cache, whoever has compiled them.
+    assert run(tmp_path, LAZY + COUNT + call + more) == ['6', '0', '7', '0']
+    assert run(tmp_path, call.replace(', len(parsed)', '') + 'print(shifted(4))') == ['6', '9']

@@ -1,7 +1,9 @@
-"""Rotations: as SciPy has them."""
+"""Rotations and quantiles: as SciPy has them."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, f
 
 from rangeseg_ros.core.rotations import (
     cross_products,
@@ -9,6 +11,7 @@ from rangeseg_ros.core.rotations import (
     rotation_by,
     rotation_matrix,
 )
+from rangeseg_ros.core.significance import LEVEL, chi2_quantile, f_quantile
 
 TURNS = np.concatenate(
     [
@@ -46,3 +49,13 @@ def test_cross_products():
     one, other = TURNS[:-1], TURNS[1:]
     assert np.array_equal(cross_products(one, other), np.cross(one, other))
     assert cross_products(one[:0], other[:0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize('level', [0.05, 0.5, 0.99, LEVEL])
+def test_quantiles(level):
+    for freedom in (0.5, 1, 2, 3, 6, 9, 13, 15.7, 60):
+        expected = chi2.ppf(level, freedom)
+        assert chi2_quantile(freedom, level) == pytest.approx(expected, rel=1e-10)
+    for freedom, others in ((0.5, 100), (3, 2), (6, 22), (13, 9.5)):
+        expected = f.ppf(level, freedom, others)
+        assert f_quantile(freedom, others, level) == pytest.approx(expected, rel=1e-8)
