@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import maxflow
 import numpy as np
 import pytest
 
@@ -49,7 +50,6 @@ def test_no_cut_is_better_and_of_equal_ones_the_smallest_is_taken(seed, whole):
 
 
 def test_larger_graphs_are_cut_as_by_another_implementation():
-    maxflow = pytest.importorskip('maxflow')
     random = np.random.default_rng(100)
     for whole in 10 * (True, False):
         excess, neighbour, link = grid_graph(random, *random.integers(5, 60, 2), whole)

@@ -223,19 +223,6 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     assert (steps.windows <= steps.pixels).all()
 
 
-def test_jumps_follow_the_noise():
-    """About 0.0065 1/m for a Kinect."""
-    random = np.random.default_rng(7)
-    image = RangeImage(CAMERA.rays, three_planes().astype(np.float32), CAMERA)
-    steps = jump_steps(Blocks.of(image), STATED._replace(column_noise=0.0, row_noise=0.0))
-    np.testing.assert_allclose(steps.windows, 0.0065, rtol=0.05)
-    inverse = three_planes() + random.normal(0, 1e-5, CAMERA.shape)
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    blocks = Blocks.of(image)
-    steps = jump_steps(blocks, measured_sensor(image, blocks, STATED))
-    assert np.median(steps.windows) < 6e-4
-
-
 def test_steps_are_those_of_the_flat_blocks_around():
     """By the definition, block for block."""
     draw, shape = np.random.default_rng(9), (9, 11)
