@@ -4,8 +4,8 @@ import pickle
 
 import numpy as np
 import pytest
+from clouds import scanned
 from message_classes import header, make_rosbags
-from scanner_points import scanned
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.classes import GROUND

@@ -5,7 +5,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from segcomp_files import raster
+from dataset_files import raster
 
 
 @pytest.fixture

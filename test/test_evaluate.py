@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from corner_set import CAMERA, LEFT, RIGHT, corner, depth_and_truth, segcomp_set
-from pcd_files import literal_lzf
+from dataset_files import literal_lzf
 
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify

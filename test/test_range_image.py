@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from scanner_points import scanned
+from clouds import scanned
 
 from rangeseg_ros import Camera, RangeImage
 from rangeseg_ros.core.rotations import rotation_by

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from dataset_files import raster
 from hypothesis import given
 from hypothesis import strategies as st
-from segcomp_files import raster
 
 from rangeseg_ros.segcomp import files as segcomp
 from rangeseg_ros.segcomp import geometry as geometry
