@@ -108,16 +108,11 @@ def test_orthogonal_fit_is_the_plane_of_least_distances():
     assert np.isnan(found[1, 5]).all()
 
 
-@pytest.mark.parametrize(('subdivisions', 'count'), list(enumerate([4, 17, 73, 305, 1249])))
-def test_platonic_counts_of_table_a3(subdivisions, count):
-    assert len(platonic(subdivisions)) == count
-    assert len(directions('platonic', count)) == count
-
-
-@pytest.mark.parametrize(('n', 'count'), [(1, 1), (2, 9), (3, 25), (4, 49), (8, 225), (18, 1225)])
-def test_regular_counts_of_table_a1(n, count):
-    assert len(regular(n)) == count
-    assert len(directions('regular', count)) == count
+def test_counts_of_tables_a1_and_a3():
+    for subdivisions, count in enumerate((4, 17, 73, 305, 1249)):
+        assert len(platonic(subdivisions)) == len(directions('platonic', count)) == count
+    for n, count in ((1, 1), (2, 9), (3, 25), (4, 49), (8, 225), (18, 1225)):
+        assert len(regular(n)) == len(directions('regular', count)) == count
 
 
 @pytest.mark.parametrize(
