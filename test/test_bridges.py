@@ -81,15 +81,11 @@ def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(step):
     np.testing.assert_array_equal(whole.inverse, expected)
 
 
-def test_wide_holes_stay():
+def test_wide_holes_stay_and_an_image_without_any_is_itself():
     inverse, _ = crease(0.0)
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
     inverse[40:60, 20:40] = 0
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
     assert not whole.inverse[42:58, 22:38].any()
-
-
-def test_an_image_without_holes_is_itself():
-    inverse, _ = crease()
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image

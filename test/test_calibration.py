@@ -179,11 +179,7 @@ def test_joint_solution_is_that_of_dense_least_squares():
     v, u = (np.eye(n)[1:] - np.eye(n)[:-1] for n in grid)
     vv, uu = (np.diff(np.eye(n), 2, axis=0) for n in grid)
     smooth = np.vstack(
-        [
-            np.kron(np.eye(grid[0]), uu),
-            np.kron(vv, np.eye(grid[1])),
-            np.sqrt(2) * np.kron(v, u),
-        ]
+        [np.kron(np.eye(grid[0]), uu), np.kron(vv, np.eye(grid[1])), np.sqrt(2) * np.kron(v, u)]
     )
     smooth = np.hstack([smooth, np.zeros((len(smooth), 3 * planes))])
     root = np.sqrt(weight)[:, None]
@@ -218,10 +214,7 @@ def test_smoothness_does_not_punish_what_is_free():
 
 @pytest.mark.parametrize(
     ('options', 'words'),
-    [
-        ({'count': 6}, 'too few planes'),
-        ({'count': 20, 'depths': (1.99, 2.0)}, 'too few ranges'),
-    ],
+    [({'count': 6}, 'too few planes'), ({'count': 20, 'depths': (1.99, 2.0)}, 'too few ranges')],
 )
 def test_recordings_that_do_not_hold_it_are_refused_with_advice(options, words):
     cells = seen(options.pop('count'), true_map(), **options)

@@ -11,14 +11,7 @@ from dataset_files import literal_lzf
 
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
-from rangeseg_ros.evaluation.pictures import (
-    CORRECT,
-    MISSED,
-    NO_DATA,
-    NOISE,
-    OVER,
-    class_picture,
-)
+from rangeseg_ros.evaluation.pictures import CORRECT, MISSED, NO_DATA, NOISE, OVER, class_picture
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.segcomp.geometry import abw_calibration
 

@@ -15,12 +15,7 @@ from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import replacing
-from rangeseg_ros.io.images import (
-    ImageFileError,
-    read_depth,
-    read_labels,
-    write_image,
-)
+from rangeseg_ros.io.images import ImageFileError, read_depth, read_labels, write_image
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.planes import PlaneTable, columns
 

@@ -154,10 +154,7 @@ def test_strong_noise_leaves_no_face_in_parts(fold, faces, seed):
 def borders(part, right, below, count):
     """Length of the border between every two parts, by definition."""
     found = np.zeros((count, count))
-    for one, other, touch in (
-        (part[:, :-1], part[:, 1:], right),
-        (part[:-1], part[1:], below),
-    ):
+    for one, other, touch in ((part[:, :-1], part[:, 1:], right), (part[:-1], part[1:], below)):
         for a, b in zip(one[touch], other[touch], strict=True):
             if a != b and a > 0 and b > 0:
                 found[a, b] += 1

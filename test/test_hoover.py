@@ -119,24 +119,14 @@ def test_overlap_figures_by_hand():
     assert figures['recall'] == pytest.approx(2 / 3)
 
 
-def test_assignment_is_the_best_not_the_greedy_one():
+def test_figures_are_of_the_best_assignment_and_pooled_over_images():
     # Greedy takes 1-1 (5) and is left with 2-2 (0): 5. Best: 1-2 (4) and 2-1 (4): 8 of 13.
     item = overlap((1, 1, 5), (1, 2, 4), (2, 1, 4))
     assert overlap_figures([item])['pixel_accuracy'] == pytest.approx(8 / 13)
-
-
-def test_figures_are_pooled_over_images():
     perfect, lost = overlap((1, 1, 30)), overlap((1, 0, 10), (0, 1, 10))
     figures = overlap_figures([perfect, lost])
-    assert figures == {
-        'mean_iou': 0.5,
-        'pixel_accuracy': 0.75,
-        'precision': 0.5,
-        'recall': 0.5,
-    }
-
-
-def test_figures_without_regions_are_undefined():
+    assert figures == {'mean_iou': 0.5, 'pixel_accuracy': 0.75, 'precision': 0.5, 'recall': 0.5}
+    # Without regions they are undefined.
     assert all(np.isnan(v) for v in overlap_figures([overlap((0, 0, 4))]).values())
 
 

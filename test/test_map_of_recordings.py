@@ -51,8 +51,7 @@ def check(folder):
 
 
 @pytest.mark.parametrize(
-    ('storage', 'kind'),
-    [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)],
+    ('storage', 'kind'), [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)]
 )
 def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
     recording = Recording(ros1=storage == 'rosbag1')

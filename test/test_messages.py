@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import (
-    Camera,
-    Plane,
-    RangeImage,
-    Segmentation,
-    planes_from_message,
-)
+from rangeseg_ros import Camera, Plane, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.mapping.map_planes import MapOutline
 from rangeseg_ros.drawing import colours
@@ -23,12 +17,7 @@ from rangeseg_ros.messages.cameras import camera_from_message, camera_info_messa
 from rangeseg_ros.messages.clouds import planes_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.marker_bytes import markers_bytes
-from rangeseg_ros.messages.markers import (
-    ARROW_LENGTH,
-    LINE_STRIP,
-    Marker,
-    of_planes,
-)
+from rangeseg_ros.messages.markers import ARROW_LENGTH, LINE_STRIP, Marker, of_planes
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 

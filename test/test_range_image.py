@@ -210,10 +210,9 @@ def test_refused_depth_images(depth, scale, message):
         RangeImage.from_depth(depth, CAMERA, scale)
 
 
-@pytest.mark.parametrize(
-    'points',
-    [np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int), np.zeros((0, 0, 3))],
-)
-def test_refused_clouds(points):
+def test_refused_clouds():
+    for points in (np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int)):
+        with pytest.raises(RangeImageError, match='organised cloud'):
+            RangeImage.from_points(points)
     with pytest.raises(RangeImageError, match='organised cloud'):
-        RangeImage.from_points(points)
+        RangeImage.from_points(np.zeros((0, 0, 3)))

@@ -85,10 +85,7 @@ def test_copied_topics_are_as_they_were(done):
     )
     written = [m[3] for m in both if m[1].startswith('/segment_planes')]
     assert written == [m[3] for m in read(done / 'plain/bag')]
-    with (
-        rosbag2.Reader(done / 'recording') as before,
-        rosbag2.Reader(done / 'copy/bag') as after,
-    ):
+    with rosbag2.Reader(done / 'recording') as before, rosbag2.Reader(done / 'copy/bag') as after:
         for topic, info in before.topics.items():
             assert after.topics[topic].msgtype == info.msgtype
             assert after.topics[topic].msgdef == info.msgdef

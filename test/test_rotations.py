@@ -5,12 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, f
 
-from rangeseg_ros.core.rotations import (
-    cross_products,
-    quaternions,
-    rotation_by,
-    rotation_matrix,
-)
+from rangeseg_ros.core.rotations import cross_products, quaternions, rotation_by, rotation_matrix
 from rangeseg_ros.core.significance import LEVEL, chi2_quantile, f_quantile
 
 TURNS = np.concatenate(

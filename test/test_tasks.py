@@ -11,13 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rangeseg_ros.tasks import (
-    Failure,
-    SchedulerError,
-    attempt_all,
-    check_scheduler,
-    run_all,
-)
+from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,7 @@ import numpy as np
 import pytest
 from planes_of_labels import fit_planes
 
-from rangeseg_ros.core.fitting.uncertainty import (
-    plane_jacobians,
-    sandwiches,
-)
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
