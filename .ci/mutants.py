@@ -104,6 +104,9 @@ def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
         for child in value if isinstance(value, list) else [value]:
             if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
                 continue
+            # zip() asserts that its arguments are of one length.
+            if isinstance(child, ast.keyword) and child.arg == 'strict':
+                continue
             if isinstance(child, ast.expr):
                 yield child
             yield from _expressions(child)
