@@ -217,7 +217,7 @@ def test_terrain_of_every_frame_is_that_of_the_messages(done):
     assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
 
 
-def test_doubtful_images_are_counted(tmp_path):
+def test_doubtful_images_are_counted(tmp_path, run):
     recording = Recording()
     rng = np.random.default_rng(0)
     for index, image in enumerate(walls(2)):
@@ -226,5 +226,7 @@ def test_doubtful_images_are_counted(tmp_path):
         recording.add_camera(stamp)
         recording.add_image(stamp, noisy[::2, ::2].repeat(2, axis=0).repeat(2, axis=1))
     recording.write(tmp_path / 'enlarged')
-    outcome = replay(tmp_path / 'enlarged', tmp_path / 'out')
-    assert [n for doubt, n in outcome.doubts.items() if 'fills 2 x 2 pixels' in doubt] == [2]
+    code, output, error = run('replay', tmp_path / 'enlarged', '--output', tmp_path / 'out')
+    assert code == 0 and '2 frames' in output
+    assert all(line.startswith('rangeseg: 2 frames: ') for line in error.splitlines())
+    assert 'fills 2 x 2 pixels' in error
