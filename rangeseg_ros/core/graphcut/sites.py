@@ -114,7 +114,7 @@ def band(
     ----------
     alpha : int
     front : (m,) int32
-        Sites of other labels next to those of the label, one or more times.
+        Sites next to those of the label, one or more times. Those of the label are left out.
     reach : int
     labelling : GridLabelling
         `position` receives the place of each site in the result.
@@ -132,7 +132,7 @@ def band(
     sites = np.empty((2 * reach * (reach - 1) + 1) * len(front), np.int32)
     count = done = 0
     for p in front:
-        if position[p] < 0:
+        if labels[p] != alpha and position[p] < 0:
             position[p] = count
             sites[count] = p
             count += 1
