@@ -14,8 +14,7 @@ from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.sensor import resize
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
-from rangeseg_ros.simulation.terrain.hard import HARD
-from rangeseg_ros.simulation.terrain.kinds import KINDS, stated, terrain_scene
+from rangeseg_ros.simulation.terrain.kinds import HARD, KINDS, stated, terrain_scene
 from rangeseg_ros.simulation.terrain.testpieces import all_pieces, piece_scene
 
 RECORDED = Path(__file__).with_name('published_scenes.json')
