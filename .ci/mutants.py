@@ -159,6 +159,9 @@ class Selection:
             found = imports(path)
             for helper in found & helpers.keys():
                 found |= imports(helpers[helper])
+            # Commands are run by their names.
+            words = re.findall(r"'(\w+)'", path.read_text().replace('segment_image', "'segment'"))
+            found |= {f'{PACKAGE.name}.cli.{word}' for word in words}
             self._tests[path] = found & modules.keys()
 
     @staticmethod
