@@ -17,6 +17,7 @@ import os
 import random
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -24,6 +25,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -102,6 +104,9 @@ def _expressions(tree: ast.AST) -> Iterator[ast.expr]:
         for child in value if isinstance(value, list) else [value]:
             if not isinstance(child, ast.AST) or isinstance(child, ast.JoinedStr):
                 continue
+            # zip() asserts that its arguments are of one length.
+            if isinstance(child, ast.keyword) and child.arg == 'strict':
+                continue
             if isinstance(child, ast.expr):
                 yield child
             yield from _expressions(child)
@@ -154,6 +159,9 @@ class Selection:
             found = imports(path)
             for helper in found & helpers.keys():
                 found |= imports(helpers[helper])
+            # Commands are run by their names.
+            words = re.findall(r"'(\w+)'", path.read_text().replace('segment_image', "'segment'"))
+            found |= {f'{PACKAGE.name}.cli.{word}' for word in words}
             self._tests[path] = found & modules.keys()
 
     @staticmethod
@@ -185,45 +193,57 @@ class Selection:
         ]
 
 
-def run(tests: list[str], limit: float, mutant: Mutant | None = None) -> tuple[str, str]:
-    """What tests say within `limit` seconds of a copy, perhaps changed, and which failed first."""
-    # Workers that compile may still write.
-    place = tempfile.TemporaryDirectory(prefix='mutant-', ignore_cleanup_errors=True)
-    with place as folder:
-        left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
-        shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
-        if mutant:
-            target = Path(folder, mutant.path.relative_to(ROOT))
-            lines = target.read_text().splitlines(keepends=True)
-            lines[mutant.first - 1 : mutant.last] = [mutant.text]
-            target.write_text(''.join(lines))
-        command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
-        if mutant:
-            of_ros = 'rclpy' in mutant.path.read_text()
-            command += ['-m', 'not slow' if of_ros else 'not slow and not ros']
-        environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
-        environment.pop('NUMBA_CACHE_DIR', None)
-        with tempfile.TemporaryFile('w+') as output:
-            process = subprocess.Popen(
+def run(
+    tests: list[str], limit: float, root: str, mutant: Mutant | None = None
+) -> tuple[str, str]:
+    """What tests say within `limit` seconds of a copy in `root`, and which failed first."""
+    folder = tempfile.mkdtemp(dir=root)
+    left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
+    shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
+    if mutant:
+        target = Path(folder, mutant.path.relative_to(ROOT))
+        lines = target.read_text().splitlines(keepends=True)
+        lines[mutant.first - 1 : mutant.last] = [mutant.text]
+        target.write_text(''.join(lines))
+    command = [sys.executable, '-m', 'pytest', '-x', '-q', '-n', '0', '--no-header', *tests]
+    if mutant:
+        of_ros = 'rclpy' in mutant.path.read_text()
+        command += ['-m', 'not slow' if of_ros else 'not slow and not ros']
+    environment = {**os.environ, 'PYTHONPATH': folder, 'PYTHONDONTWRITEBYTECODE': '1'}
+    environment.pop('NUMBA_CACHE_DIR', None)
+    with tempfile.TemporaryFile('w+') as output:
+        try:
+            code = subprocess.run(
                 command,
                 cwd=folder,
                 env=environment,
                 stdout=output,
                 stderr=output,
+                timeout=limit,
                 start_new_session=True,
-            )
-            try:
-                code = process.wait(limit)
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
-                process.wait()
-                return 'timeout', ''
-            output.seek(0)
-            failed = re.search(r'^(?:FAILED|ERROR) (.+?)(?: - |$)', output.read(), re.MULTILINE)
+            ).returncode
+        except subprocess.TimeoutExpired:
+            return 'timeout', ''
+        finally:
+            end_processes(folder)
+            shutil.rmtree(folder, ignore_errors=True)
+        output.seek(0)
+        failed = re.search(r'^(?:FAILED|ERROR) (.+?)(?: - |$)', output.read(), re.MULTILINE)
     if code < 0 or code >= 128:
         return 'crashed', ''
     kinds = {0: 'survived', 5: 'untested'}
     return kinds.get(code, 'killed'), failed[1] if failed else ''
+
+
+def end_processes(folder: str) -> None:
+    """End those that came of tests in a folder, which they have in their environment.
+
+    What compiles has a session of its own, and would go on.
+    """
+    for environment in Path('/proc').glob('[0-9]*/environ'):
+        with suppress(OSError):
+            if os.fsencode(folder) in environment.read_bytes():
+                os.kill(int(environment.parent.name), signal.SIGKILL)
 
 
 def main() -> int:
@@ -250,24 +270,38 @@ def main() -> int:
     drawn = random.Random(chosen.seed).sample(every, min(chosen.count, len(every)))
     selection = Selection(chosen.files)
     end = time.monotonic() + 60 * chosen.minutes
+    place = tempfile.TemporaryDirectory(prefix='mutants-', ignore_cleanup_errors=True)
+
+    def stop(number: int, frame: object) -> None:
+        """Begin no more, and end what runs: the table is of those that are done."""
+        nonlocal end
+        end = -math.inf
+        end_processes(place.name)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, stop)
 
     @cache
     def passes(test: str) -> bool:
         """Whether a test passes where nothing is changed."""
-        return run([test], chosen.limit)[0] == 'survived'
+        return run([test], chosen.limit, place.name)[0] == 'survived'
 
     def judged(mutant: Mutant) -> str:
         if time.monotonic() > end:
             return 'no time'
         tests = selection.tests(mutant.path, mutant.function)
         names = [str(test.relative_to(ROOT)) for test in tests]
-        outcome, failed = run(names, chosen.limit, mutant) if names else ('untested', '')
+        outcome, failed = 'untested', ''
+        if names:
+            outcome, failed = run(names, chosen.limit, place.name, mutant)
         if outcome == 'killed' and failed and not passes(failed):
             outcome = 'unsound'
+        if end == -math.inf:
+            return 'no time'
         print(f'{outcome:9}{mutant.name}  (line {mutant.first}) {failed}', flush=True)
         return outcome
 
-    with ThreadPoolExecutor(chosen.jobs) as pool:
+    with place, ThreadPoolExecutor(chosen.jobs) as pool:
         outcomes = list(pool.map(judged, drawn))
     table: dict[str, Counter[str]] = defaultdict(Counter)
     for mutant, outcome in zip(drawn, outcomes, strict=True):

@@ -1,7 +1,7 @@
 """A corner of two walls as the sets that `rangeseg evaluate` reads; its regions are exact."""
 
 import numpy as np
-from segcomp_files import raster
+from dataset_files import raster
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.segcomp import abw_calibration

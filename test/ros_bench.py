@@ -27,11 +27,7 @@ TYPES['odometry'] = message_class(ODOMETRY)
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 DEPTH, INFO = '/depth/image_rect', '/depth/camera_info'
-NODE = [
-    sys.executable,
-    '-c',
-    'from rangeseg_ros.start import segment_planes; segment_planes()',
-]
+NODE = [sys.executable, '-c', 'from rangeseg_ros.start import segment_planes; segment_planes()']
 FRAME = 'camera_depth_optical_frame'
 
 os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'

@@ -172,7 +172,7 @@ def test_camera_changes_on_the_way(tmp_path):
     assert [frame.camera.fx for frame in read(tmp_path / 'bag')] == [50.0, 50.0, 60.0]
 
 
-def test_errors_list_the_topics(tmp_path):
+def test_errors_list_the_topics_and_encodings(tmp_path):
     recording = Recording()
     recording.add_camera(1, topic='/left/camera_info')
     recording.add_camera(1, topic='/right/camera_info')
@@ -187,9 +187,6 @@ def test_errors_list_the_topics(tmp_path):
         DepthBag(tmp_path / 'both', '/nowhere')
     with pytest.raises(BagError, match=r'no camera_info on /nowhere; topics: /camera'):
         DepthBag(tmp_path / 'both', None, '/nowhere')
-
-
-def test_errors_name_the_encodings(tmp_path):
     colour = Recording()
     colour.add_camera(1)
     colour.add_image(1, np.zeros((48, 64), np.uint8), '8UC1')

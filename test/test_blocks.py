@@ -1,4 +1,4 @@
-"""Blocks against their definition."""
+"""Sums over pixels, the planes that fit them, and links: against definitions and NumPy."""
 
 import numpy as np
 import pytest
@@ -7,8 +7,8 @@ from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid, View
-from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, fit_all
+from rangeseg_ros.core.sensing.grid import Grid, View, weights
+from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -37,19 +37,7 @@ def whole(inverse, edges):
     return nodes_of(inverse, grid(*inverse.shape)[1], edges).moments[..., COUNT] > 0
 
 
-def test_blocks_are_sums_over_their_pixels():
-    inverse, rays, _ = grid(12, 14)
-    blocks = Blocks.of(RangeImage(rays, inverse)).moments
-    assert blocks.shape == (3, 4, SIZE)
-    part = slice(4, 8), slice(8, 12)
-    own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
-    expected = [*(own.T @ own)[np.triu_indices(3)], *own.T @ y, y @ y, 16, 0, 0]
-    np.testing.assert_allclose(blocks[1, 2], expected, rtol=1e-12)
-    assert (blocks[:, :3, COUNT] == 16).all()
-    assert (blocks[:, 3, COUNT] == 8).all(), 'half a block at the border'
-
-
-@pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3)])
+@pytest.mark.parametrize('hole', [(2, 2), (3, 2), (2, 3), np.s_[4], np.s_[:4, 4]])
 def test_slopes_do_not_need_the_rays_of_holes(hole):
     """Those in the middle of a block, which clouds do not have."""
     _, rays, _ = grid(8, 8)
@@ -63,17 +51,18 @@ def test_slopes_do_not_need_the_rays_of_holes(hole):
 
 @pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
 @pytest.mark.parametrize('size', [2, 3, 4])
-def test_blocks_of_any_size_add_up(shape, size):
+def test_blocks_are_sums_over_their_pixels(shape, size):
     """Of images wider than what is summed at a time, with holes where no ray is."""
     inverse, rays, _ = grid(*shape)
     holes = np.random.default_rng(1).random(shape) < 0.3
     inverse[holes], rays[holes] = 0, np.nan
     blocks = Blocks.of(RangeImage(rays, inverse), size)
-    y = np.where(holes, 0, inverse).astype(float)
     for i, j in np.ndindex(blocks.squared.shape):
         part = np.s_[size * i : size * (i + 1), size * j : size * (j + 1)]
-        assert blocks.moments[i, j, COUNT] == np.count_nonzero(~holes[part])
-        np.testing.assert_allclose(blocks.moments[i, j, 9], (y[part] ** 2).sum(), rtol=1e-12)
+        own, y = (array[part][~holes[part]].astype(float) for array in (rays, inverse))
+        expected = [*(own.T @ own)[np.triu_indices(3)], *own.T @ y, y @ y, len(y), 0, 0]
+        np.testing.assert_allclose(blocks.moments[i, j], expected, rtol=1e-12, atol=1e-15)
+        assert blocks.squared[i, j] == pytest.approx(y @ y / max(len(y), 1), rel=1e-12)
     whole = blocks.merged(rays, 2 * size)
     assert whole.squared.shape == tuple(-(-n // (2 * size)) for n in shape)
     for i, j in np.ndindex(whole.squared.shape):
@@ -131,7 +120,6 @@ def test_slopes_and_residuals_are_those_of_the_planes():
     own, y = rays[part].reshape(-1, 3).astype(float), inverse[part].ravel().astype(float)
     theta, square, _, _ = np.linalg.lstsq(own, y, rcond=None)
     assert blocks.residual[i, j] == pytest.approx(square[0], rel=1e-6)
-    assert blocks.squared[i, j] == pytest.approx((y**2).mean(), rel=1e-6)
     # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
     expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
     assert blocks.across[i, j] + blocks.down[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
@@ -158,3 +146,86 @@ def test_weights_count_in_variances_of_the_sensor():
     assert residual.mean() == pytest.approx(1, rel=0.12)
     np.testing.assert_allclose(nodes.residual.ravel(), residual, rtol=1e-3, atol=1e-6)
     np.testing.assert_allclose(nodes.moments[..., RATIO], 4 * 4.0, rtol=1e-5)
+
+
+def pixels(seed, count=200):
+    """Rays (n, 3) float32, inverse ranges and weights (n,) of random pixels near a plane."""
+    random = np.random.default_rng(seed)
+    rays = np.column_stack([random.uniform(-0.6, 0.6, (count, 2)), np.ones(count)])
+    rays = rays.astype(np.float32)
+    inverse = rays @ random.uniform(0.1, 0.6, 3) + random.normal(0, 0.01, count)
+    return rays, inverse, random.uniform(0.5, 4, count)
+
+
+def moments_of(rays, inverse, weight):
+    rays = rays.astype(float)
+    square = np.einsum('n,ni,nj->ij', weight, rays, rays)[np.triu_indices(3)]
+    sums = [*square, *(weight * inverse) @ rays, weight @ inverse**2, len(rays)]
+    return np.pad(sums, (0, SIZE - len(sums)))
+
+
+def fitted(moments):
+    theta = np.full(3, np.nan)
+    return theta, fit(moments, theta)
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_fit_is_weighted_least_squares(seed):
+    rays, inverse, weight = pixels(seed)
+    root = np.sqrt(weight)
+    expected, residual, _, _ = np.linalg.lstsq(root[:, None] * rays, root * inverse, rcond=None)
+    theta, chi2 = fitted(moments_of(rays, inverse, weight))
+    np.testing.assert_allclose(theta, expected, rtol=1e-6)
+    assert chi2 == pytest.approx(residual[0], rel=1e-6)
+
+
+@pytest.mark.parametrize('case', ['nothing', 'two pixels', 'a line'])
+def test_pixels_that_determine_no_plane(case):
+    rays, inverse, weight = pixels(8, 40)
+    if case == 'nothing':
+        rays, inverse, weight = rays[:0], inverse[:0], weight[:0]
+    elif case == 'a line':
+        rays[:, 1] = 0.5 * rays[:, 0] - 0.125
+    else:
+        rays[:] = rays[np.arange(40) % 2]
+    moments = moments_of(rays, inverse, weight)
+    theta, chi2 = fitted(moments)
+    assert not theta.any()
+    assert chi2 == moments[CHI2]
+    many, residuals = fit_all(np.stack([moments, moments_of(*pixels(9))]))
+    assert not many[0].any() and many[1].any()
+    assert residuals[0] == chi2
+
+
+def image_of(depth):
+    height, width = np.shape(depth)
+    return RangeImage.from_depth(np.array(depth, float), Camera(width, height, 10.0, 10.0, 0, 0))
+
+
+def test_measurements_are_linked_but_across_jumps():
+    horizontal, vertical = weights(image_of([[1, 1, 0], [1, 1, 1]]))
+    assert horizontal.dtype == vertical.dtype == np.float32
+    assert (horizontal.tolist(), vertical.tolist()) == ([[1, 0], [1, 1]], [[1, 1, 0]])
+    jumps = np.array([[True, False], [False, False]]), np.array([[False, False, True]])
+    horizontal, vertical = weights(image_of(np.ones((2, 3))), jumps)
+    assert (horizontal.tolist(), vertical.tolist()) == ([[0, 1], [1, 1]], [[1, 1, 0]])
+
+
+def test_distance_weights_fall_with_the_distance_about_the_median():
+    image = image_of([[1.0, 1.0, 1.0, 1.5], [1.0, 1.0, 1.0, 1.5]])
+    horizontal, vertical = weights(image, weighting='distance')
+    points = image.points
+    across = np.linalg.norm(np.diff(points, axis=1), axis=2)
+    down = np.linalg.norm(np.diff(points, axis=0), axis=2)
+    median = np.median(np.concatenate([across.ravel(), down.ravel()]))
+    np.testing.assert_allclose(horizontal, 2 * median / (median + across), rtol=1e-5)
+    np.testing.assert_allclose(vertical, 2 * median / (median + down), rtol=1e-5)
+    assert horizontal[0, 2] < 0.5 < horizontal[0, 0]
+
+
+@pytest.mark.parametrize('weighting', ['uniform', 'distance'])
+@pytest.mark.parametrize('shape', [(1, 1), (1, 4), (3, 2)])
+def test_shadow_is_disconnected_and_small_images_pass(shape, weighting):
+    horizontal, vertical = weights(image_of(np.zeros(shape)), None, weighting)
+    assert horizontal.shape == (shape[0], shape[1] - 1) and not horizontal.any()
+    assert vertical.shape == (shape[0] - 1, shape[1]) and not vertical.any()

@@ -70,26 +70,54 @@ def test_what_is_bridged_lies_between_its_neighbours():
     np.testing.assert_array_equal(whole.inverse[~holes], image.inverse[~holes])
 
 
-@pytest.mark.parametrize('step', [(0, 1), (1, 0), (1, 1), (1, -1)])
-def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(step):
-    inverse = np.zeros(CAMERA.shape, np.float32)
-    for side in (-1, 1):
-        inverse[60 + side * step[0], 80 + side * step[1]] = 0.5
-    whole = bridge_holes(RangeImage(CAMERA.rays, inverse, CAMERA), *steps_and_slopes(0.01, 0.01))
-    expected = inverse.copy()
-    expected[60, 80] = 0.5
-    np.testing.assert_array_equal(whole.inverse, expected)
+def pairs_around(measured, i, j):
+    """Pairs of measured pixels that a hole lies between, at most four apart: the closest first."""
+    height, width = measured.shape
+    found = []
+    for di, dj in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        ends = []
+        for sign in (-1, 1):
+            line = ((k, i + sign * k * di, j + sign * k * dj) for k in (1, 2, 3))
+            inside = [(k, u, v) for k, u, v in line if 0 <= u < height and 0 <= v < width]
+            ends.append(next((end for end in inside if measured[end[1:]] > 0), None))
+        if all(ends) and ends[0][0] + ends[1][0] <= 4:
+            found.append((ends[0][0] + ends[1][0], *ends))
+    return sorted(found, key=lambda pair: pair[0])
 
 
-def test_wide_holes_stay():
+@pytest.mark.parametrize('cloud', [False, True])
+def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(cloud):
+    """The closest pair is interpolated where all continue each other."""
+    draw, camera = np.random.default_rng(4), Camera(37, 30, 33.0, 34.0, 17.0, 15.0)
+    inverse = draw.normal(0.5, 0.01, camera.shape).astype(np.float32)
+    inverse *= draw.random(camera.shape) < 0.35
+    steps = draw.uniform(0.005, 0.03, (8, 10)).astype(np.float32)
+    slopes = draw.uniform(0, 0.005, (8, 10)).astype(np.float32)
+    image = RangeImage(camera.rays, inverse, None if cloud else camera)
+    whole = bridge_holes(image, steps, slopes)
+    bridged, refused = 0, 0
+    for i, j in np.argwhere(inverse == 0):
+        pairs, here = pairs_around(inverse, i, j), (i // 4, j // 4)
+        gaps = [abs(inverse[one[1:]] - inverse[other[1:]]) for _, one, other in pairs]
+        allowed = [steps[here] + slopes[here] * span for span, *_ in pairs]
+        if not pairs or any(gap > most for gap, most in zip(gaps, allowed, strict=True)):
+            assert whole.inverse[i, j] == 0
+            refused += bool(pairs)
+            continue
+        span, one, other = pairs[0]
+        for values, found in ((inverse, whole.inverse), (image.rays, whole.rays)):
+            expected = values[one[1:]] + one[0] / span * (values[other[1:]] - values[one[1:]])
+            np.testing.assert_allclose(found[i, j], expected, rtol=1e-5, atol=1e-6)
+        bridged += 1
+    assert min(bridged, refused) > 50
+    np.testing.assert_array_equal(whole.inverse[inverse > 0], inverse[inverse > 0])
+
+
+def test_wide_holes_stay_and_an_image_without_any_is_itself():
     inverse, _ = crease(0.0)
+    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
+    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
     inverse[40:60, 20:40] = 0
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
     assert not whole.inverse[42:58, 22:38].any()
-
-
-def test_an_image_without_holes_is_itself():
-    inverse, _ = crease()
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image

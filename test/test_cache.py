@@ -1,4 +1,4 @@
-"""Compiled kernels are kept where that is possible, and nothing fails where it is not."""
+"""Compiled kernels: kept where that is possible, dropped when outdated, loaded unparsed."""
 
 import os
 import pickle
@@ -33,9 +33,8 @@ def mkdtemp(*arguments, **options):
 tempfile.mkdtemp = mkdtemp
 """
 KERNEL = """
-import numpy as np
-from rangeseg_ros.core.sensing.moments import fit_all
-fit_all(np.zeros((1, 10)))
+from rangeseg_ros.core.by_normals.angular_cost import degrees
+degrees(1.0)
 """
 
 
@@ -66,17 +65,6 @@ def test_where_nothing_can_be_kept_kernels_last_as_long_as_the_process(tmp_path)
     assert not [*tmp_path.iterdir()]
 
 
-@pytest.mark.parametrize(
-    'variable, folder',
-    [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')],
-)
-def test_folders_that_the_user_names_come_first(tmp_path, variable, folder):
-    named = tmp_path / 'named'
-    run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
-    assert (run.returncode, run.stderr) == (0, '')
-    assert list((named / folder).rglob('*.nbi'))
-
-
 @pytest.mark.parametrize('start', ['rangeseg', 'segment_planes'])
 def test_where_nothing_can_be_written_one_line_says_so(start):
     code = f"sys.argv[1:] = ['compile']\nfrom rangeseg_ros.start import {start}; {start}()"
@@ -86,11 +74,18 @@ def test_where_nothing_can_be_written_one_line_says_so(start):
     assert 'NUMBA_CACHE_DIR' in run.stderr
 
 
-@pytest.mark.parametrize('mode', [0o777, 0o1777, 0o755])
 @pytest.mark.parametrize(
-    ('variable', 'within'), [('NUMBA_CACHE_DIR', ''), ('XDG_CACHE_HOME', 'rangeseg_ros')]
+    ('variable', 'within', 'mode'),
+    [
+        ('NUMBA_CACHE_DIR', '', 0o777),
+        ('NUMBA_CACHE_DIR', '', 0o1777),
+        ('NUMBA_CACHE_DIR', '', 0o755),
+        ('XDG_CACHE_HOME', 'rangeseg_ros', 0o777),
+    ],
 )
-def test_nothing_is_taken_from_where_others_can_write(tmp_path, variable, within, mode):
+def test_folders_that_the_user_names_come_first_but_where_others_can_write(
+    tmp_path, variable, within, mode
+):
     """What is unpickled from there is executed."""
     named = tmp_path / 'named'
     run = run_restricted(KERNEL, tmp_path, **{variable: os.fspath(named)})
@@ -185,3 +180,44 @@ def test_kernels_are_compiled_anew_when_what_they_call_has_changed(tmp_path):
     changed.write_text(KERNEL_OF.format('f', 2))
     os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
     assert call() == ['2', '3', '0', '1']
+
+
+KERNELS = """
+from numba import njit
+
+@njit(cache=True)
+def twice(x):
+    return 2 * x
+
+@njit(cache=True)
+def shifted(x):
+    return twice(x) + 1
+"""
+
+COUNT = """
+from llvmlite import binding
+parsed, parse = [], binding.parse_bitcode
+binding.parse_bitcode = lambda code: parsed.append(code) or parse(code)
+"""
+
+LAZY = 'from rangeseg_ros.core.runtime.kernels import load_lazily\nload_lazily()\n'
+
+
+def run(folder, code):
+    """What `code` prints in a process of its own with the kernels at hand."""
+    command = [sys.executable, '-c', code]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True)
+    return done.stdout.split()
+
+
+def test_bitcode_is_parsed_only_for_what_is_compiled(tmp_path):
+    (tmp_path / 'kernels.py').write_text(KERNELS)
+    call = 'from kernels import *\nprint(twice(3), len(parsed))\n'
+    assert run(tmp_path, LAZY + COUNT + call) == ['6', '0']
+    # From the cache; then as a part of a kernel that is compiled.
+    assert run(tmp_path, COUNT + call) == ['6', '1']
+    more = 'print(shifted(3), len(parsed))'
+    assert run(tmp_path, LAZY + COUNT + call + more) == ['6', '0', '7', '1']
+    # Both from the cache, whoever has compiled them.
+    assert run(tmp_path, LAZY + COUNT + call + more) == ['6', '0', '7', '0']
+    assert run(tmp_path, call.replace(', len(parsed)', '') + 'print(shifted(4))') == ['6', '9']

@@ -43,9 +43,13 @@ def test_numbers_of_numpy_are_numbers():
 
 
 def test_projection_matrix_wins_when_rectified():
+    rectified = Camera(640, 480, 450, 460, 310, 235)
+    assert camera_from_matrices(640, 480, K, P) == rectified
+    assert camera_from_calibration({**WHOLE, 'projection_matrix': {'data': P}}) == rectified
     assert camera_from_matrices(640, 480, K).fx == 500
-    assert camera_from_matrices(640, 480, K, P) == Camera(640, 480, 450, 460, 310, 235)
     assert camera_from_matrices(640, 480, K, np.zeros(12)).fx == 500
+    for calibration in (WHOLE, {**WHOLE, 'projection_matrix': None}):
+        assert camera_from_calibration(calibration).fx == 500
 
 
 def test_binning_keeps_the_rays_of_the_collected_pixels():
@@ -63,20 +67,6 @@ def test_region_of_interest_moves_the_principal_point():
     part = camera_from_matrices(640, 480, K, None, (0, 0), (100, 50, 320, 200))
     assert part.shape == (200, 320)
     np.testing.assert_allclose(part.rays[10, 20], full.rays[60, 120], atol=1e-6)
-
-
-def test_calibration_file_content():
-    calibration = {
-        'image_width': 640,
-        'image_height': 480,
-        'camera_matrix': {'data': np.ravel(K).tolist()},
-        'projection_matrix': {'data': np.ravel(P).tolist()},
-    }
-    assert camera_from_calibration(calibration).fx == 450
-    calibration['projection_matrix'] = None
-    assert camera_from_calibration(calibration).fx == 500
-    del calibration['projection_matrix']
-    assert camera_from_calibration(calibration).fx == 500
 
 
 @pytest.mark.parametrize(

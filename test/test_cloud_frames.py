@@ -1,9 +1,11 @@
 """Clouds in frames of any axes: found as in an optical frame, told in their own."""
 
+import pickle
+
 import numpy as np
 import pytest
+from clouds import scanned
 from message_classes import header, make_rosbags
-from scanner_points import scanned
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.ground.classes import GROUND
@@ -104,8 +106,9 @@ def test_a_room_is_segmented_as_its_depth_image(frame, method):
         assert len(here) == pytest.approx(len(there), rel=0.02)
         np.testing.assert_allclose((here @ turn.T + place).mean(0), there.mean(0), atol=0.02)
     ground = OUTPUTS['ground'].message(make_rosbags, header(), cloud, result)
-    points = np.frombuffer(ground.data, '<f4').reshape(-1, 4)[:, :3]
-    np.testing.assert_allclose(points, cloud.points[result.terrain == GROUND], atol=1e-6)
+    points, shown = np.frombuffer(ground.data, '<f4').reshape(-1, 4), result.terrain == GROUND
+    np.testing.assert_allclose(points[:, :3], cloud.points[shown], atol=1e-6)
+    np.testing.assert_array_equal(points[:, 3], result.height[shown])
     normals = expected.normals @ turn.T.astype(np.float32)
     both = np.isfinite(normals + result.normals).all(axis=2)
     assert (np.abs(normals - result.normals)[both].max(axis=1) < 0.01).mean() > 0.98
@@ -161,6 +164,7 @@ def test_where_the_camera_is(size, scale):
     np.testing.assert_allclose(found.matrix, camera.matrix, atol=0.002)
     # Frames share a camera, and so its rays.
     assert cloud_in(BASE, 1.01 * points).camera is found
+    assert pickle.loads(pickle.dumps(found)) == found
 
 
 def no_cameras():

@@ -5,7 +5,7 @@ from functools import partial
 import cv2
 import numpy as np
 import pytest
-from segcomp_files import raster
+from dataset_files import raster
 
 
 @pytest.fixture
@@ -67,42 +67,35 @@ def test_folders_are_paired_by_name_and_summed(tmp_path, compare):
     assert figures['per_image']['10']['tolerances']['0.8']['missed'] == 1
 
 
-def test_not_judged_pixels_do_not_count(tmp_path, compare):
-    # Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3.
-    truth = write(tmp_path / 'truth.png', [[1, 1, 0, 65535, 65535]])
-    labels = write(tmp_path / 'labels.png', [[7, 7, 7, 7, 0]])
-    row = compare(truth, labels, '--tolerance', '0.6')[1]['tolerances']['0.6']
-    assert (row['regions'], row['correct'], row['noise']) == (1, 1, 0)
-    assert row['mean_iou'] == pytest.approx(2 / 3)
-    # Without 65535 in the truth every pixel counts: 2 / 4.
-    truth = write(tmp_path / 'truth.png', [[1, 1, 0, 0, 0]])
-    assert compare(truth, labels)[1]['tolerances']['0.6']['mean_iou'] == pytest.approx(1 / 2)
+NONE = 65535
+# Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3. Without 65535
+# in the truth every pixel counts: 2 / 4.
+CURVED, FLAT, WIDE = [1, 1, 0, NONE, NONE], [1, 1, 0, 0, 0], [7, 7, 7, 7, 0]
+# Found 8 has 2 of its 6 pixels on truth 1, the rest is not judged; 7 has the other 8.
+RIM, PARTS = [1] * 10 + [0] * 4 + [NONE], [7] * 8 + [8] * 6 + [0]
+# Half of its 4 judged: it counts, whatever its size.
+HALF = [7] * 8 + [8] * 4 + [0] * 3
 
 
-def test_the_rim_of_something_not_judged_is_no_part(tmp_path, compare):
-    # Found 8 has 2 of its 6 pixels on truth 1, the rest is not judged; 7 has the other 8.
-    truth = write(tmp_path / 'truth.png', [[1] * 10 + [0] * 4 + [65535]])
-    labels = write(tmp_path / 'labels.png', [[7] * 8 + [8] * 6 + [0]])
-    row = compare(truth, labels)[1]['tolerances']['0.8']
-    assert (row['correct'], row['over'], row['noise']) == (0, 1, 0)
-    row = compare(truth, labels, '--min-pixels', 3)[1]['tolerances']['0.8']
-    assert (row['correct'], row['over'], row['noise']) == (1, 0, 0)
-    # Half of 8 judged: it counts, whatever its size.
-    labels = write(tmp_path / 'labels.png', [[7] * 8 + [8] * 4 + [0] * 3])
-    assert compare(truth, labels, '--min-pixels', 3)[1]['tolerances']['0.8']['over'] == 1
-
-
-def test_small_regions_can_be_left_out(tmp_path, compare):
-    truth = write(tmp_path / 'truth.png', [[1, 1, 1, 2]])
-    labels = write(tmp_path / 'labels.png', [[1, 1, 1, 0]])
-    assert compare(truth, labels)[1]['tolerances']['0.8']['missed'] == 1
-    row = compare(truth, labels, '--min-pixels', 2)[1]['tolerances']['0.8']
-    assert (row['regions'], row['missed']) == (1, 0)
-
-
-def test_undefined_figures_are_null(tmp_path, compare):
-    empty = write(tmp_path / 'empty.png', [[0, 0]])
-    assert compare(empty, empty)[1]['tolerances']['0.8']['mean_iou'] is None
+@pytest.mark.parametrize(
+    ('truth', 'labels', 'least', 'expected'),
+    [
+        (CURVED, WIDE, 1, {'regions': 1, 'noise': 1, 'mean_iou': pytest.approx(2 / 3)}),
+        (FLAT, WIDE, 1, {'mean_iou': 1 / 2}),
+        (RIM, PARTS, 1, {'correct': 0, 'over': 1, 'noise': 0}),
+        (RIM, PARTS, 3, {'correct': 1, 'over': 0, 'noise': 0}),
+        (RIM, HALF, 3, {'over': 1}),
+        ([1, 1, 1, 2], [1, 1, 1, 0], 1, {'missed': 1}),
+        ([1, 1, 1, 2], [1, 1, 1, 0], 2, {'regions': 1, 'missed': 0}),
+        ([0, 0], [0, 0], 1, {'mean_iou': None}),
+    ],
+)
+def test_what_is_not_judged_or_too_small_does_not_count(
+    tmp_path, compare, truth, labels, least, expected
+):
+    truth, labels = (write(tmp_path / f'{k}.png', [row]) for k, row in enumerate((truth, labels)))
+    row = compare(truth, labels, '--min-pixels', least)[1]['tolerances']['0.8']
+    assert {name: row[name] for name in expected} == expected
 
 
 def refuse(result, *parts):
@@ -113,25 +106,13 @@ def refuse(result, *parts):
         assert str(part) in err
 
 
-@pytest.mark.parametrize('tolerance', ['0.5', '1.2', '80', 'nan'])
-def test_tolerance_out_of_range(tmp_path, compare, tolerance):
-    truth = write(tmp_path / 'truth.png', [[1]])
-    refuse(compare(truth, truth, '--tolerance', tolerance), 'tolerance', 'above 0.5')
-
-
-def test_files_of_different_size(tmp_path, compare):
-    a, b = write(tmp_path / 'a.png', [[1, 1]]), write(tmp_path / 'b.png', [[1]])
-    refuse(compare(a, b), b, 'differ in size')
-
-
-def test_missing_counterpart(tmp_path, compare):
-    write(tmp_path / 'gt/1.png', [[1]])
+def test_refusals(tmp_path, compare):
+    one, wide = write(tmp_path / 'gt/1.png', [[1]]), write(tmp_path / 'wide.png', [[1, 1]])
+    for tolerance in ('0.5', '1.2', '80', 'nan'):
+        refuse(compare(one, one, '--tolerance', tolerance), 'tolerance', 'above 0.5')
+    refuse(compare(wide, one), one, 'differ in size')
+    refuse(compare(one, one.parent), 'two files or two folders')
     write(tmp_path / 'ms/1.png', [[1]])
     extra = write(tmp_path / 'ms/2.png', [[1]])
-    refuse(compare(tmp_path / 'gt', tmp_path / 'ms'), extra, 'no ground truth')
-    refuse(compare(tmp_path / 'ms', tmp_path / 'gt'), extra, 'no segmentation')
-
-
-def test_file_against_folder(tmp_path, compare):
-    truth = write(tmp_path / 'gt/1.png', [[1]])
-    refuse(compare(truth, tmp_path / 'gt'), 'two files or two folders')
+    refuse(compare(one.parent, extra.parent), extra, 'no ground truth')
+    refuse(compare(extra.parent, one.parent), extra, 'no segmentation')

@@ -7,10 +7,8 @@ import sys
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from rangeseg_ros import Camera, RangeImage
-from rangeseg_ros.cli.main import main, rangeseg
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.depth_files import Intrinsics, files_in, read_frame, scale_of
 
@@ -144,24 +142,19 @@ def test_intrinsics_of_numbers():
         Intrinsics().of((48, 64))
 
 
-def run(*words):
-    return CliRunner().invoke(rangeseg, list(map(str, words)))
-
-
-def test_the_command_takes_folders_and_numbers(depth, tmp_path):
+def test_the_command_takes_folders_and_numbers(depth, tmp_path, run):
     (tmp_path / 'in').mkdir()
     np.save(tmp_path / 'in/a.npy', depth)
     points = RangeImage.from_depth(depth, CAMERA).points
     write_ply(tmp_path / 'in/b.ply', points)
     out = tmp_path / 'out'
-    done = run('segment', tmp_path / 'in', '--fx', 60, '--output', out)
-    assert done.exit_code == 0, done.output
+    assert run('segment', tmp_path / 'in', '--fx', 60, '--output', out)[0] == 0
     assert {path.name for path in out.glob('*_planes.csv')} == {'a_planes.csv', 'b_planes.csv'}
     tum = tmp_path / 'tum/depth'
     tum.mkdir(parents=True)
     shutil.copy(tmp_path / 'in/a.npy', tum)
     (tmp_path / 'tum/associations.txt').touch()
-    assert run('segment', tmp_path / 'tum', '--fov', 56, '--output', out / 'tum').exit_code == 0
+    assert run('segment', tmp_path / 'tum', '--fov', 56, '--output', out / 'tum')[0] == 0
     distance = [
         float((folder / 'a_planes.csv').read_text().splitlines()[1].split(',')[6])
         for folder in (out, out / 'tum')
@@ -181,23 +174,16 @@ def test_the_command_takes_folders_and_numbers(depth, tmp_path):
         (['segment', __file__, '--fov', 'nan', '--output', 'y'], 'not finite'),
     ],
 )
-def test_help_and_suggestions(words, told, monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['rangeseg', *words])
-    with pytest.raises(SystemExit) as end:
-        main()
-    said = capsys.readouterr()
-    assert told in (said.err if words else said.out)
-    assert end.value.code == (2 if words else 0)
-    assert said.err.count('\n') == bool(words)
+def test_help_and_suggestions(words, told, run):
+    code, output, error = run(*words)
+    assert told in (error if words else output)
+    assert (code, error.count('\n')) == ((2, 1) if words else (0, 0))
 
 
-def test_a_missing_extra_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(sys, 'argv', ['rangeseg', 'replay', 'x', '--output', 'y'])
+def test_a_missing_extra_is_one_line(monkeypatch, run):
     for name in [name for name in sys.modules if name.startswith('rangeseg_ros.')]:
         if 'replay' in name or 'recordings' in name or name.endswith(('bags', 'result_bag')):
             monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, 'rosbags', None)
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert end.value.code == 2
-    assert "pip install 'rangeseg_ros[bags]'" in capsys.readouterr().err
+    code, _, error = run('replay', 'x', '--output', 'y')
+    assert code == 2 and "pip install 'rangeseg_ros[bags]'" in error

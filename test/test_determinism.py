@@ -1,16 +1,21 @@
-"""The same frame and parameters give the same bits: any threads, any process, compiled or not."""
+"""The same bits with any threads, in any process, compiled or not; work in threads."""
 
+import hashlib
 import json
+import multiprocessing
 import os
 import subprocess
 import sys
+import threading
+import time
+import warnings
 
 import cv2
 import numpy as np
 import pytest
-from hard_inputs import digest
 
-from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
 from rangeseg_ros.core.runtime.work import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -18,6 +23,7 @@ from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 CASES = [{}, {'method': 'normals'}, *({'work_budget': step} for step in STEPS[1:])]
+SHAPES = [(1, 1), (1, 2), (2, 1), (1, 97), (97, 1), (2, 2), (3, 3), (5, 64), (17, 33), (37, 49)]
 
 
 @pytest.fixture(scope='module')
@@ -34,7 +40,14 @@ def all_digests():
     return [digest(SequenceSegmenter(config).segment(image, 0, up)) for config in configs]
 
 
-@pytest.mark.parametrize('threads', [1, 2, 5])
+def digest(result):
+    """Of all that is told of a frame."""
+    told = [result.labels, result.terrain, result.height, result.normals]
+    told += [part for p in result.planes for part in (p.normal, p.covariance, p.hull)]
+    return hashlib.sha256(b''.join(part.tobytes() for part in told)).hexdigest()
+
+
+@pytest.mark.parametrize('threads', [1, 5])
 def test_any_number_of_threads_gives_the_same_bits(digests, threads):
     before = cv2.getNumThreads()
     cv2.setNumThreads(threads)
@@ -56,18 +69,196 @@ def test_another_process_gives_the_same_bits(digests):
     assert len(set(digests)) == len(CASES)
 
 
-def labels_and_planes():
-    frame = simulate_kinect(kinect_room(903), kinect_camera(160, 120), seed=903, sensor_seed=903)
-    image = RangeImage.from_depth(frame.depth, frame.camera)
-    result = Segmenter(Config(min_pixels=100)).segment(image)
-    planes = [(p.label, p.count, *p.normal.tolist(), float(p.distance)) for p in result.planes]
-    return result.labels.tolist(), planes
+def rooms():
+    """Labels and planes of both methods, of the slower one in a smaller image."""
+    for method, width in (('planes', 160), ('normals', 64)):
+        camera = kinect_camera(width, width * 3 // 4)
+        frame = simulate_kinect(kinect_room(903), camera, seed=903, sensor_seed=903)
+        config = Config(method=method, direction_count=73, min_pixels=width * width // 256)
+        result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, camera))
+        planes = [[p.label, p.count, *p.normal.tolist(), p.distance] for p in result.planes]
+        yield method, result.labels.tolist(), planes
 
 
-def test_compiled_code_gives_the_labels_of_the_plain_python():
-    """But for the order of floating-point sums, on which hang pixels that fit two planes alike."""
-    here = labels_and_planes()
-    labels, planes = in_another_process(labels_and_planes, NUMBA_DISABLE_JIT='1')
-    assert np.mean(np.array(labels) != here[0]) < 1e-3 and len(planes) >= 5
-    geometry, same = np.array(planes)[:, 2:], np.array(here[1])[:, 2:]
-    np.testing.assert_allclose(geometry, same, atol=1e-3)
+def depths(shape):
+    """Depth images (H, W) at the limits of indices, holes and values."""
+    random = np.random.default_rng(shape[0] * 1000 + shape[1])
+    v, u = np.indices(shape, float)
+    planes = np.where(u > v, 1 + 0.01 * u, 2 - 0.01 * v)
+    noisy = planes + random.normal(0, 0.003, shape)
+    last = (v == shape[0] - 1) & (u == shape[1] - 1)
+    return {
+        'nothing': np.full(shape, np.nan),
+        'constant': np.ones(shape),
+        'last pixel': np.where(last, 1.0, np.nan),
+        'border': np.where((v % max(shape[0] - 1, 1) == 0), 1.0, np.nan),
+        'chequered': np.where((u + v) % 2, 1.0, 5.0),
+        'lines': np.where(v % 2, 1.0, np.nan),
+        'noise': random.uniform(0.1, 10, shape),
+        'planes': planes,
+        'holes': np.where(random.random(shape) < 0.4, np.nan, noisy),
+        'stairs': 1 + 0.2 * (v // 4),
+        'infinite': np.where(u % 3 == 0, np.inf, noisy),
+        'near and far': np.where(u > v, 1e-6, 1e5),
+        'negative': -noisy,
+    }
+
+
+def hard_images():
+    """Labels, planes and terrain of images and clouds of any size."""
+    for shape in SHAPES:
+        (height, width), focal = shape, max(shape)
+        camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        for name, depth in depths(shape).items():
+            image = RangeImage.from_depth(depth.astype(np.float32), camera)
+            for method, seen in (
+                ('planes', image),
+                ('planes', RangeImage.from_points(image.points)),
+                ('normals', image),
+            ):
+                # Down the image, so that there is ground in some.
+                config = Config(method=method, up_y=-1.0, up_z=0.0, min_pixels=4)
+                result = SequenceSegmenter(config).segment(seen, 0)
+                planes = [[p.count, *np.round(p.normal, 6).tolist()] for p in result.planes]
+                told = hashlib.sha256(result.labels.tobytes() + result.terrain.tobytes())
+                yield f'{shape} {name} {method}', told.hexdigest(), planes
+
+
+def frames():
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        return [[*told] for told in (*rooms(), *hard_images())]
+
+
+@pytest.mark.slow
+def test_plain_python_gives_what_compiled_code_gives():
+    """And reads and writes within arrays: NumPy checks every index, compiled code does not."""
+    plain, compiled = in_another_process(frames, NUMBA_DISABLE_JIT='1'), frames()
+    assert [one for one, other in zip(plain, compiled, strict=True) if one != other] == []
+    assert [len(planes) >= 5 for _, _, planes in compiled[:2]] == [True, True]
+
+
+@pytest.fixture(params=[1, 2, 7])
+def threads(request):
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(request.param)
+    yield request.param
+    cv2.setNumThreads(before)
+
+
+@pytest.mark.parametrize('rows', [0, 1, 15, 16, 33, 100, 1000])
+def test_every_row_is_in_one_strip(threads, rows):
+    visits = np.zeros(rows, int)
+
+    def kernel(first, after, step):
+        visits[first:after] += step
+
+    run_rows(kernel, rows, 3)
+    assert (visits == 3).all()
+
+
+def test_halves_do_not_depend_on_the_number_of_threads(threads):
+    assert map_halves(lambda first, after, name: (first, after, name), 9, 'x') == (
+        (0, 4, 'x'),
+        (4, 9, 'x'),
+    )
+
+
+@pytest.mark.parametrize('threads', [2, 7], indirect=True)
+def test_strips_are_worked_on_at_the_same_time(threads):
+    """As many as there are threads wait for each other; alone they would for ever."""
+    barrier = threading.Barrier(min(threads, 4), timeout=20)
+    run_rows(lambda first, after: barrier.wait(), 1000)
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_a_thread_that_is_done_takes_more_strips(threads):
+    """The caller's first one takes as long as all others together."""
+    begun, others_are_done = [], threading.Event()
+
+    def kernel(first, after):
+        if first == 0:
+            assert others_are_done.wait(20)
+            return
+        begun.append(first)
+        if after == 1000 and len(begun) > 1:
+            others_are_done.set()
+
+    run_rows(kernel, 1000)
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_frames_with_a_core_each_have_no_helpers(threads):
+    def worker():
+        """Who does a task: another thread, given the time to begin it."""
+        begun = threading.Event()
+        task = submit(lambda: (threading.get_ident(), begun.set()))
+        begun.wait(0.5)
+        return task.result()[0]
+
+    me = threading.get_ident()
+    with sharing_cores():
+        assert worker() != me
+        with sharing_cores():
+            assert worker() == me
+        assert worker() != me
+    with pytest.raises(ValueError), sharing_cores(), sharing_cores():
+        raise ValueError
+    assert worker() != me
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_a_task_that_waits_for_a_helper_is_done_by_who_needs_it(threads):
+    """The only helper is at work for as long as the other task is not done."""
+    begun, free = threading.Event(), threading.Event()
+    busy = submit(lambda: (begun.set(), free.wait(20)))
+    assert begun.wait(20)
+    assert submit(threading.get_ident).result() == threading.get_ident()
+    free.set()
+    assert busy.result() == (None, True)
+
+
+@pytest.mark.parametrize('threads', [2], indirect=True)
+def test_tasks_may_have_tasks(threads):
+    """Also where no helper is free for them."""
+
+    def depth(left):
+        return 1 + max(submit(depth, left - 1).result() for _ in range(2)) if left else 0
+
+    assert depth(5) == 5
+
+
+def test_a_program_ends_after_its_tasks():
+    """A kernel that is at work when the interpreter is gone may bring down the process."""
+    program = (
+        'import time, cv2; from rangeseg_ros.core.runtime.threads import submit\n'
+        'cv2.setNumThreads(2); submit(lambda: (time.sleep(0.5), print("over", flush=True)))\n'
+        'time.sleep(0.1)'
+    )
+    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (0, 'over\n')
+
+
+def test_errors_come_back():
+    def kernel(first, after):
+        raise ValueError(str(first))
+
+    with pytest.raises(ValueError, match='0'):
+        run_rows(kernel, 100)
+    with pytest.raises(ValueError, match='late'):
+        submit(lambda: (time.sleep(0.05), int('late'))).result()
+
+
+def total(queue):
+    queue.put(sum(map_halves(lambda first, after: after - first, 100)))
+
+
+@pytest.mark.skipif('fork' not in multiprocessing.get_all_start_methods(), reason='no fork')
+def test_threads_are_started_anew_in_a_forked_process():
+    assert sum(map_halves(lambda first, after: after - first, 100)) == 100
+    context = multiprocessing.get_context('fork')
+    queue = context.Queue()
+    child = context.Process(target=total, args=(queue,), daemon=True)
+    child.start()
+    assert queue.get(timeout=30) == 100
+    child.join()

@@ -12,10 +12,8 @@ from PIL import Image, TiffImagePlugin
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
 from rangeseg_ros.core.sensing.distortion import DistortionError, DistortionMap
-from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.corrections import load_distortion
 from rangeseg_ros.io.distortion import KIND, read_distortion, write_distortion
-from rangeseg_ros.io.images import write_image
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
@@ -152,20 +150,15 @@ def test_damaged_files_are_refused(tmp_path_factory, data):
 
 
 @pytest.mark.parametrize('kind', ['missing', 'png', 'nan', 'integers'])
-def test_wrong_files_end_the_command_in_one_line(tmp_path, kind, run):
+def test_wrong_files_end_the_command_in_one_line(tmp_path, kind, segment_image):
     path = tmp_path / 'map.tiff'
     if kind == 'png':
         path.write_bytes(cv2.imencode('.png', np.zeros(CAMERA.shape, np.uint16))[1].tobytes())
-    elif kind == 'nan':
-        cv2.imwrite(str(path), np.full(CAMERA.shape, np.nan, np.float32))
-    elif kind == 'integers':
-        cv2.imwrite(str(path), np.zeros(CAMERA.shape, np.uint16))
-    write_camera(tmp_path / 'camera.yaml', CAMERA)
-    write_image(tmp_path / 'depth.png', np.full(CAMERA.shape, 1000, np.uint16))
-    (tmp_path / 'params.yaml').write_text(f'distortion_map: {path}\n')
-    names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
-    paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
-    code, _, error = run('segment', *paths)
+    elif kind != 'missing':
+        values = np.full(CAMERA.shape, np.nan, np.float32)
+        cv2.imwrite(str(path), values if kind == 'nan' else np.zeros(CAMERA.shape, np.uint16))
+    depth = np.full(CAMERA.shape, 1000, np.uint16)
+    code, _, error = segment_image(depth, CAMERA, distortion_map=str(path))
     assert code == 2 and f'params.yaml: parameter distortion_map: {path}' in error
     assert error.count('\n') == 1
     assert not (tmp_path / 'out').exists()

@@ -20,27 +20,16 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
     for name, count in zip(names, (20, 21, 22), strict=True):
         record_walls(tmp_path / name, count)
         replay(tmp_path / name, tmp_path / 'local' / name)
+    options = {'n_workers': 2, 'threads_per_worker': 1, 'processes': True}
+    options |= {'dashboard_address': None, 'local_directory': tmp_path / 'dask'}
     with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=None,
-            local_directory=tmp_path / 'dask',
-        ) as cluster,
+        distributed.LocalCluster(**options) as cluster,
         distributed.Client(cluster, set_as_default=False) as client,
     ):
         victim = next(iter(client.run(os.getpid).values()))
+        words = *COMMAND, 'replay', *names, '--output', 'out'
         command = subprocess.Popen(
-            [
-                *COMMAND,
-                'replay',
-                *names,
-                '--output',
-                'out',
-                '--scheduler',
-                cluster.scheduler_address,
-            ],
+            [*words, '--scheduler', cluster.scheduler_address],
             cwd=tmp_path,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -49,13 +38,8 @@ def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
         try:
             # Each process has its name on the folder that it has begun.
             deadline = time.monotonic() + 120
-            half_way = f'out/*/.rangeseg-{victim}'
-            while not (
-                any(
-                    len(list(folder.glob('*_labels.png'))) > 5
-                    for folder in tmp_path.glob(half_way)
-                )
-            ):
+            half_way = f'out/*/.rangeseg-{victim}/*_labels.png'
+            while len(list(tmp_path.glob(half_way))) <= 5:
                 assert command.poll() is None
                 assert time.monotonic() < deadline
                 time.sleep(0.005)

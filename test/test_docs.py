@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import CliRunner
+from matplotlib import pyplot
 
 from rangeseg_ros import RangeImage
 from rangeseg_ros.cli.main import rangeseg
@@ -92,8 +93,6 @@ def run(words):
 
 
 def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
-    pytest.importorskip('pandas')
-    pyplot = pytest.importorskip('matplotlib.pyplot')
     pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
     text = (ROOT / 'docs/tutorial.md').read_text()
@@ -160,8 +159,6 @@ def test_settings_of_nav2_are_yaml_and_name_topics():
 
 
 def test_the_notebook_runs():
-    pytest.importorskip('pandas')
-    pytest.importorskip('trimesh')
     cells = json.loads((ROOT / 'examples/first_steps.ipynb').read_text())['cells']
     known = {}
     for cell in cells:

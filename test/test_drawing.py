@@ -33,6 +33,8 @@ def test_unlabelled_pixels_stay_grey_and_labelled_ones_have_their_colour():
     inner = picture[6:13, 6:13].reshape(-1, 3)
     assert (inner == inner[0]).all()
     assert inner[0].max() > inner[0].min() + 50
+    mixed = 0.45 * grey(inverse)[6, 6] + 0.55 * colours([3])[0].astype(float)
+    np.testing.assert_allclose(inner[0], mixed, atol=0.51)
     np.testing.assert_array_equal(picture, overlay(inverse, labels))
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from corner_set import CAMERA, LEFT, RIGHT, corner, depth_and_truth, segcomp_set
-from pcd_files import literal_lzf
+from dataset_files import literal_lzf
 
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
@@ -162,28 +162,16 @@ def refuse(result, *parts):
         assert str(part) in err
 
 
-def test_missing_truth(simulated, evaluate):
-    (simulated / 'truth' / '000010.png').unlink()
-    refuse(evaluate(simulated), '000010.png', 'no ground truth')
-
-
-def test_truth_of_another_size(simulated, evaluate):
+def test_refusals(simulated, evaluate, tmp_path):
     assert cv2.imwrite(str(simulated / 'truth/000002.png'), np.ones((4, 5), np.uint16))
     refuse(evaluate(simulated), '000002.png', 'truth is 5x4', '96x72')
-
-
-@pytest.mark.parametrize('text', ['1 2 3', 'nan 1 1 1'])
-def test_malformed_camera(tmp_path, evaluate, text):
-    folder = tmp_path / 'set'
-    folder.mkdir()
-    depth, truth = depth_and_truth()
-    assert cv2.imwrite(str(folder / 'depth.png'), depth)
-    assert cv2.imwrite(str(folder / 'truth.png'), truth)
-    (folder / 'camera.txt').write_text(text)
-    refuse(evaluate(folder), 'camera.txt')
-
-
-def test_unknown_layout(tmp_path, evaluate):
-    folder = tmp_path / 'set'
+    (simulated / 'truth' / '000010.png').unlink()
+    refuse(evaluate(simulated), '000010.png', 'no ground truth')
+    folder = tmp_path / 'annotated'
     folder.mkdir()
     refuse(evaluate(folder), folder, 'known layout')
+    for name, image in zip(('depth', 'truth'), depth_and_truth(), strict=True):
+        assert cv2.imwrite(str(folder / f'{name}.png'), image)
+    for text in ('1 2 3', 'nan 1 1 1'):
+        (folder / 'camera.txt').write_text(text)
+        refuse(evaluate(folder), 'camera.txt')

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from rosbags.typesys import Stores
 
 from rangeseg_ros import CameraError, Config, ConfigError, Plane
 from rangeseg_ros.cli.errors import one_line
@@ -22,18 +21,7 @@ from rangeseg_ros.io.images import (
     write_image,
 )
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
-from rangeseg_ros.io.recordings import message_types
 from rangeseg_ros.io.tables import columns, open_table, values
-
-
-def test_depth_of_16_bits_and_floats(tmp_path):
-    depth = np.array([[0, 1, 65535], [700, 800, 900]], np.uint16)
-    metres = np.array([[np.nan, np.inf, 1.5], [-1, 0, 2]], np.float32)
-    for name, image in (('a.png', depth), ('a.tif', depth), ('b.tiff', metres)):
-        cv2.imwrite(str(tmp_path / name), image)
-        read = read_depth(tmp_path / name)
-        assert read.dtype == image.dtype
-        np.testing.assert_array_equal(read, image)
 
 
 def test_what_is_no_depth_image_is_named(tmp_path):
@@ -95,29 +83,15 @@ def test_where_there_is_no_room_the_file_is_named(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(
-    ('content', 'message'),
-    [
+def test_what_is_no_camera_is_named(tmp_path):
+    path = tmp_path / 'camera.yaml'
+    for content, message in (
         ('- 1', 'not a camera calibration'),
         ('{image_width: 4, image_height: 3}', "lacks 'camera_matrix'"),
-        ('{image_width: 4, image_height: 3, camera_matrix: 5}', 'malformed'),
-        ('{image_width: 4, image_height: 3, camera_matrix: {data: [1, 2]}}', '9 values, not 2'),
-        (
-            '{image_width: 4, image_height: 3, camera_matrix: {data: [0,0,1,0,9,1,0,0,1]}}',
-            'focal length fx must be positive',
-        ),
-        (
-            '{image_width: 4, image_height: 3, camera_matrix: {data: [.nan,0,1,0,9,1,0,0,1]}}',
-            'fx must be finite',
-        ),
-    ],
-)
-def test_what_is_no_camera_is_named(tmp_path, content, message):
-    path = tmp_path / 'camera.yaml'
-    path.write_text(content)
-    with pytest.raises(CameraError, match=message) as caught:
-        read_camera(path)
-    assert str(path) in str(caught.value)
+    ):
+        path.write_text(content)
+        with pytest.raises(CameraError, match=f'{path}: .*{message}'):
+            read_camera(path)
     with pytest.raises(FileError, match='No such file'):
         read_camera(tmp_path / 'none.yaml')
 
@@ -236,8 +210,3 @@ def test_plane_table(tmp_path):
     assert all(None not in row and None not in row.values() for row in rows)
     # No array is written as numpy prints it.
     assert not any('[' in value for row in rows for value in row.values())
-
-
-def test_bags_of_ros_1_may_have_transforms_of_either_time():
-    types = message_types(Stores.ROS1_NOETIC).types
-    assert {'tf2_msgs/msg/TFMessage', 'tf/msg/tfMessage'} <= types.keys()

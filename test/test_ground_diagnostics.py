@@ -1,4 +1,4 @@
-"""What /diagnostics says of the ground, of stairs and of a camera that is tilted."""
+"""What /diagnostics says of the ground, of stairs, of doubtful input and of what is lost."""
 
 import time
 from types import SimpleNamespace
@@ -10,6 +10,7 @@ pytest.importorskip('rclpy')
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rangeseg_ros.core.sensing.verdict import Verdict
+from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.diagnostics import FrameStatistics
 
 
@@ -20,6 +21,7 @@ def status(**found):
     source = SimpleNamespace(
         last_arrival=time.monotonic(), problem='', pairing='', topic='/depth', publishers=1
     )
+    source.loss_hint = lambda: 'a larger buffer'
     return statistics.status('segment_planes', source, 3600.0)
 
 
@@ -46,3 +48,12 @@ def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
         found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
         assert found.level == level and found.message == 'What it is.'
         assert {value.key: value.value for value in found.values}['input'] == 'What it is.'
+
+
+def test_lost_messages_are_a_warning_with_their_share_and_what_helps():
+    received, losses = Window(), Losses()
+    received.add(3)
+    losses.lost.add(1)
+    found = status(received=received, losses=losses)
+    assert found.level == DiagnosticStatus.WARN
+    assert found.message == '25% lost on /depth: a larger buffer'

@@ -24,6 +24,8 @@ WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
 MISTAKEN = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
             except KeyboardInterrupt: raise ValueError('not a bag')"""
 IN_A_CALLBACK = """ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()"""
+BESIDE_A_THREAD_THAT_WAITS = """threading.Thread(target=threading.Event().wait).start()
+            os.kill(os.getpid(), signal.SIGINT)"""
 NONE = "raise SystemError('without a reason')"
 
 
@@ -42,18 +44,11 @@ def run(body):
         (MISTAKEN, 'SIGTERM', 143),
         (IN_A_CALLBACK, 'SIGTERM', 143),
         (LOST, 'SIGHUP', 129),
+        (BESIDE_A_THREAD_THAT_WAITS, 'SIGINT', 130),
     ],
-    ids=['lost', 'wrapped', 'mistaken', 'in a callback', 'hang-up'],
 )
 def test_a_signal_ends_the_command(body, name, code):
     done = run(body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException'))
-    assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
-
-
-@pytest.mark.parametrize(('name', 'code'), [('SIGINT', 130), ('SIGTERM', 143)])
-def test_a_thread_that_waits_for_ever_keeps_no_command(name, code):
-    waits = 'threading.Thread(target=threading.Event().wait).start()'
-    done = run(f'{waits}; os.kill(os.getpid(), signal.{name})')
     assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
 
 

@@ -1,13 +1,17 @@
-"""Jump edges of exact scenes: where they are, that they close, and what must not fire."""
+"""Jump edges of exact scenes: where they are, that they close, shadows, what must not fire."""
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.jump_edges import bridge_edges, plane_deviation, sobel
+from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.jump_edges import bridge_edges, jump_edges, plane_deviation, sobel
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.simulation.solids import box, cast, half_space
 
 STEP = 0.0044
 CAMERA = Camera(120, 100, 100.0, 100.0, 59.5, 49.5)
@@ -26,7 +30,7 @@ def ramp(a=0.0, b=0.0, c=0.5):
 
 def parts(edges):
     """Number of 4-connected parts that the edges cut the image into."""
-    height, width = CAMERA.shape
+    height, width = edges[1].shape[0] + 1, edges[0].shape[1] + 1
     grid = np.zeros((2 * height - 1, 2 * width - 1), np.uint8)
     grid[::2, ::2] = 1
     grid[::2, 1::2] = ~edges[0]
@@ -34,27 +38,20 @@ def parts(edges):
     return cv2.connectedComponents(grid, connectivity=4)[1][::2, ::2]
 
 
-@pytest.mark.parametrize('slope', [(0, 0), (0.002, -0.001), (-0.004, 0.003)])
-def test_planes_have_no_jump(slope):
-    horizontal, vertical = plane_deviation(image_of(ramp(*slope, c=1.0)), STEP)
-    assert not horizontal.any() and not vertical.any()
-
-
-@pytest.mark.parametrize('sign', [-1, 1])
-def test_creases_have_no_jump(sign):
-    """Two planes that meet: any slopes, convex or concave."""
-    inverse = 0.8 + sign * 0.004 * np.abs(np.indices(CAMERA.shape)[1] - 57.3)
-    horizontal, vertical = plane_deviation(image_of(inverse), STEP)
-    assert not horizontal.any() and not vertical.any()
-
-
-@pytest.mark.parametrize('width', [12, 20])
-@pytest.mark.parametrize('slope', [10 * STEP, -10 * STEP])
-@pytest.mark.parametrize('axis', [0, 1])
-def test_a_narrow_steep_face_has_no_jump(axis, slope, width):
-    """However steep from pixel to pixel, and too narrow for its slope to be told."""
+def creased(axis, slope, width):
+    """A face that is steep from pixel to pixel, and may be too narrow for its slope to be told."""
     crease = CAMERA.shape[axis] - 1 - width
-    inverse = 1.0 + slope * np.maximum(np.indices(CAMERA.shape)[axis] - crease, 0)
+    return 1.0 + slope * np.maximum(np.indices(CAMERA.shape)[axis] - crease, 0)
+
+
+CONTINUOUS = [ramp(*slope, c=1.0) for slope in ((0, 0), (0.002, -0.001), (-0.004, 0.003))]
+CONTINUOUS += [0.8 + a * 0.004 * np.abs(np.indices(CAMERA.shape)[1] - 57.3) for a in (-1, 1)]
+CONTINUOUS += [creased(a, s, w) for a in (0, 1) for s in (10 * STEP, -10 * STEP) for w in (12, 20)]
+
+
+@pytest.mark.parametrize('inverse', CONTINUOUS)
+def test_planes_and_creases_have_no_jump(inverse):
+    """Of any slopes, convex or concave."""
     horizontal, vertical = plane_deviation(image_of(inverse), STEP)
     assert not horizontal.any() and not vertical.any()
 
@@ -184,3 +181,79 @@ def test_a_steep_face_whose_directions_err_reaches_the_jump_beside_it(slope, see
     labels = Segmenter().segment(image).labels
     found = labels == np.bincount(labels[face]).argmax()
     assert (found & face).sum() > 0.996 * (found | face).sum()
+
+
+# Shadows (thesis 5.5.2, 6.7): a board before a parallel wall, seen by a structured-light sensor.
+# Where its projector stands aside, the board casts a shadow on the wall, and every contour of the
+# board ends in it. What lies before and behind stays apart.
+KINECT = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+WALL = 2.0
+SIDES = {'left': (-1, 0, 0), 'right': (1, 0, 0), 'above': (0, -1, 0), 'beside': (-0.7, -0.7, 0)}
+EDGE_STEP = 0.0065
+
+
+def board(step, shadow, side, roll=0.0, turn=0.0):
+    """Depth (H, W), 0 in the shadow, and where the board is seen (H, W).
+
+    step: of the depth at the board, metres; shadow: its width, pixels; roll: of the board;
+    turn: of all of the scene about the vertical; degrees.
+    """
+    depth = WALL - step
+    turned = Rotation.from_euler('y', turn, degrees=True).as_matrix()
+    rolled = Rotation.from_euler('z', roll, degrees=True).as_matrix()
+    size = 0.4 * depth, 0.32 * depth, 0.001
+    solids = [
+        half_space(turned @ [0, 0, -1], turned @ [0, 0, WALL]),
+        box(size, turned @ rolled, turned @ [0.01, 0.02, depth]),
+    ]
+    rays = KINECT.rays.astype(float)
+    distance, face = cast(solids, np.zeros(3), rays)
+    projector = np.array(SIDES[side]) * shadow / (KINECT.fx * (1 / depth - 1 / WALL))
+    # Light ends at parameter 1 on the very surface, give or take rounding.
+    bright = cast(solids, projector, distance[..., None] * rays - projector)[0] > 1 - 1e-7
+    return np.where(bright, distance, 0).astype(np.float32), bright & (face > 0)
+
+
+def mixed(found, front, valid):
+    """Pixels on the wrong side: of parts (H, W) that hold pixels of both surfaces, the fewer."""
+    count = int(found.max()) + 1
+    of_front = np.bincount(found[front], minlength=count)
+    of_wall = np.bincount(found[valid & ~front], minlength=count)
+    return int(np.minimum(of_front, of_wall).sum())
+
+
+def flooded(image, config):
+    """Numbers (H, W) of what the links connect, whatever the normals."""
+    grid = weights(image, jump_edges(image, config.jump_edges, config.edge_step))
+    return parts([links == 0 for links in grid])
+
+
+@pytest.mark.parametrize('side', SIDES)
+@pytest.mark.parametrize('shadow', [0, 1, 4, 40])
+@pytest.mark.parametrize(
+    ('detector', 'steps'),
+    # The smallest ones are 4 and 2 times `edge_step` in inverse range.
+    [('sobel', (1.0, 0.2, 0.05, 0.03)), ('plane', (1.0, 0.1, 0.05))],
+)
+def test_no_link_joins_a_board_and_the_wall_behind_it(detector, steps, shadow, side):
+    config = Config(jump_edges=detector, edge_step=EDGE_STEP)
+    for step in steps:
+        for roll, turn in ((0, 0), (20, 0), (45, 15)):
+            depth, front = board(step, shadow, side, roll, turn)
+            image = RangeImage.from_depth(depth, KINECT)
+            assert mixed(flooded(image, config), front, image.valid) == 0, (step, roll, turn)
+
+
+@pytest.mark.parametrize('method', ['planes', 'normals'])
+@pytest.mark.parametrize('detector', ['sobel', 'plane'])
+@pytest.mark.parametrize('side', SIDES)
+def test_no_region_holds_a_board_and_the_wall_behind_it(side, detector, method):
+    """Down to the steps that the detector can see, but for a few pixels of a border."""
+    config = Config(method=method, jump_edges=detector, edge_step=EDGE_STEP, min_pixels=100)
+    for step, shadow in ((1.0, 12), (0.1, 1), (0.05, 0)):
+        depth, front = board(step, shadow, side, roll=5)
+        image = RangeImage.from_depth(depth, KINECT)
+        labels = Segmenter(config).segment(image).labels
+        judged = labels > 0
+        assert mixed(labels, front & judged, judged) <= 30, (step, shadow)
+        assert (front & judged).any(), (step, shadow)

@@ -5,12 +5,10 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from recordings import EARLY_TF, SUFFIXES, TF, Recording
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 
@@ -53,8 +51,7 @@ def check(folder):
 
 
 @pytest.mark.parametrize(
-    ('storage', 'kind'),
-    [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)],
+    ('storage', 'kind'), [('mcap', TF), ('sqlite3', TF), ('rosbag1', TF), ('rosbag1', EARLY_TF)]
 )
 def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
     recording = Recording(ros1=storage == 'rosbag1')
@@ -80,7 +77,7 @@ def test_tf_of_any_recording_places_the_planes(tmp_path, storage, kind):
     check(tmp_path / 'out')
 
 
-def test_poses_in_files_become_a_map(tmp_path):
+def test_poses_in_files_become_a_map(tmp_path, run):
     images, poses = tmp_path / 'images', tmp_path / 'poses'
     for folder in (images, poses):
         folder.mkdir()
@@ -95,15 +92,11 @@ def test_poses_in_files_become_a_map(tmp_path):
     )
     (tmp_path / 'p.yaml').write_text('min_pixels: 300\ngravity_frame: world\n')
 
-    def run(*words):
-        result = CliRunner().invoke(rangeseg, list(map(str, words)))
-        assert result.exit_code == 0, result.output
-        return result.output
-
     bag, out = tmp_path / 'bag', tmp_path / 'out'
     camera = tmp_path / 'camera.yaml'
-    run('pack', images, '--camera', camera, '--poses', poses, '--rate', 10, '--output', bag)
+    files = '--camera', camera, '--poses', poses, '--output', bag
+    assert run('pack', images, *files, '--rate', 10)[0] == 0
     options = '--fixed-frame', 'world', '--params', tmp_path / 'p.yaml'
-    told = run('replay', bag, *options, '--output', out)
-    assert f'{FRAMES} frames, 2 planes in the map' in told
+    code, told, error = run('replay', bag, *options, '--output', out)
+    assert code == 0 and f'{FRAMES} frames, 2 planes in the map' in told, error
     check(out)

@@ -3,13 +3,10 @@
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
-from rangeseg_ros.cli.segment import command
 from rangeseg_ros.core.ground.points import unseen
-from rangeseg_ros.io.cameras import write_camera
-from rangeseg_ros.io.images import read_labels, write_image
+from rangeseg_ros.io.images import read_labels
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 TILT = np.radians(40)
@@ -27,11 +24,9 @@ def robot_on_a_floor():
     return np.round(1000 * np.minimum(depth, 60)).astype(np.uint16)
 
 
-def parameters(path, tmp_path):
+def parameters(path):
     up = dict(zip(('up_x', 'up_y', 'up_z'), map(float, UP), strict=True))
-    text = ''.join(f'{k}: {v}\n' for k, v in {**up, 'sensor_height': 1.0, 'mask': path}.items())
-    (tmp_path / 'params.yaml').write_text(text)
-    return Config(**up, sensor_height=1.0, mask=str(path))
+    return {**up, 'sensor_height': 1.0, 'mask': str(path)}
 
 
 @pytest.mark.parametrize('channels', [1, 3, 4])
@@ -39,7 +34,7 @@ def test_the_body_is_left_out(tmp_path, channels):
     path = tmp_path / 'mask.png'
     picture = BODY if channels == 1 else np.dstack([BODY] * channels)
     cv2.imwrite(str(path), picture)
-    config = parameters(path, tmp_path)
+    config = Config(**parameters(path))
     image = RangeImage.from_depth(robot_on_a_floor(), CAMERA)
     with pytest.raises(RangeImageError, match=r'corrected\(image, config\)'):
         Segmenter(config).segment(image)
@@ -50,34 +45,23 @@ def test_the_body_is_left_out(tmp_path, channels):
     assert (result.terrain[(BODY == 0) & image.valid] == 1).mean() > 0.99
 
 
-def test_a_command_reads_it(tmp_path):
+def test_a_command_reads_it(tmp_path, segment_image):
     cv2.imwrite(str(tmp_path / 'mask.png'), BODY)
-    result = segment(tmp_path, tmp_path / 'mask.png')
-    assert result.exit_code == 0, result.output
+    code, _, error = segment_image(robot_on_a_floor(), CAMERA, **parameters(tmp_path / 'mask.png'))
+    assert (code, error) == (0, '')
     terrain = read_labels(tmp_path / 'out' / 'depth_terrain.png')
     assert not terrain[BODY > 0].any() and terrain[BODY == 0].any()
 
 
 @pytest.mark.parametrize('kind', ['missing', 'text', 'size'])
-def test_wrong_files_end_the_command_in_one_line(tmp_path, kind):
+def test_wrong_files_end_the_command_in_one_line(tmp_path, kind, segment_image):
     path = tmp_path / 'mask.png'
     if kind == 'text':
         path.write_text('mask')
     elif kind == 'size':
         cv2.imwrite(str(path), BODY[:-1])
-    result = segment(tmp_path, path)
-    said = result.output.strip() or str(result.exception)
-    assert result.exit_code != 0 and str(path) in said
+    code, _, error = segment_image(robot_on_a_floor(), CAMERA, **parameters(path))
+    assert code == 2 and str(path) in error and error.count('\n') == 1
     # Of the size nothing is known before there is an image.
-    assert (f'{tmp_path / "params.yaml"}: parameter mask: ' in said) == (kind != 'size')
-    assert len(said.splitlines()) == 1
+    assert (f'{tmp_path / "params.yaml"}: parameter mask: ' in error) == (kind != 'size')
     assert not (tmp_path / 'out').exists()
-
-
-def segment(tmp_path, mask):
-    write_camera(tmp_path / 'camera.yaml', CAMERA)
-    write_image(tmp_path / 'depth.png', robot_on_a_floor())
-    parameters(mask, tmp_path)
-    names = ['depth.png', '--camera', 'camera.yaml', '--params', 'params.yaml', '--output', 'out']
-    paths = [name if name.startswith('--') else str(tmp_path / name) for name in names]
-    return CliRunner().invoke(command, paths)

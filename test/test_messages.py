@@ -9,13 +9,7 @@ from hypothesis import strategies as st
 from message_classes import STORE, header, make_rosbags, needs_rclpy
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros import (
-    Camera,
-    Plane,
-    RangeImage,
-    Segmentation,
-    planes_from_message,
-)
+from rangeseg_ros import Camera, Plane, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.core.mapping.map_planes import MapOutline
 from rangeseg_ros.drawing import colours

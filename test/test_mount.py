@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.cli.mount import command
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.transforms import Transform
@@ -51,7 +49,7 @@ def test_angles_and_height_are_within_their_errors(height, pitch, roll):
     )
 
 
-def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_path):
+def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_path, run):
     scene = driving(1.1, 25, 3, frames=4)
     for name, pose in (('robot', None), ('wall', Pose.looking((0, 0, 1.5), 0, -20, 0))):
         with DepthBagWriter(tmp_path / name, CAMERA) as bag:
@@ -60,11 +58,9 @@ def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_p
                 bag.write(simulate_kinect(shown, CAMERA).depth, 10**9 + k * 10**8)
     params = tmp_path / 'params.yaml'
     params.write_text('min_pixels: 150')
-    robot, wall = (
-        CliRunner().invoke(command, [str(tmp_path / name), '--params', str(params)])
-        for name in ('robot', 'wall')
-    )
-    assert robot.exit_code == 0
-    assert '--frame-id base_footprint --child-frame-id camera_depth_optical_frame' in robot.output
-    assert '<origin xyz="0 0 1.' in robot.output and 'pitch 2' in robot.output
-    assert wall.exit_code != 0 and 'no plane that faces up' in wall.output
+    robot, wall = (run('mount', tmp_path / name, '--params', params) for name in ('robot', 'wall'))
+    code, output, _ = robot
+    assert code == 0
+    assert '--frame-id base_footprint --child-frame-id camera_depth_optical_frame' in output
+    assert '<origin xyz="0 0 1.' in output and 'pitch 2' in output
+    assert wall[0] == 2 and 'no plane that faces up' in wall[2]

@@ -158,6 +158,22 @@ def test_diagnostics_tell_where_the_time_goes(bench):
     assert counts[0] >= counts[1] > 0
 
 
+def test_the_latency_of_recorded_stamps_is_unknown(bench):
+    recorded = bench.image()
+    recorded.header.stamp.sec = 1
+    for image, known in ((recorded, False), (bench.image(), True)):
+        bench.segment(image)
+
+        def told(status, known=known):
+            """Of this frame, whose times are counted once it is published."""
+            values = values_of(status)
+            return ('transport (ms)' in values) == known and 'latency (ms)' in values
+
+        values = values_of(bench.status(told))
+        assert values['latency (ms)'].startswith('unknown') != known
+        assert float(values['latency since arrival (ms)']) > 0
+
+
 def test_latest_frame_wins_and_parameters_answer_meanwhile(bench, expected):
     """Of frames that come during long computations only the newest is segmented."""
 
@@ -243,3 +259,14 @@ def test_camera_info_may_be_remapped_and_reliability_overridden(expected):
         bench.settled(info_topic, ReliabilityPolicy.RELIABLE)
         np.testing.assert_array_equal(bench.stream(), expected)
         bench.settled(depth_topic, ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_a_clock_that_stands_still_silences_no_report():
+    with Bench('-p', 'use_sim_time:=true', namespace='paused') as bench:
+        bench.status(lambda status: status.message.startswith('idle'))
+        with bench.listening('labels'):
+            dead = bench.status(lambda status: status.level == DiagnosticStatus.ERROR)
+            assert f'no depth message on /paused{DEPTH}' in dead.message
+            bench.until(lambda: bench.log().count('no depth message') == 1)
+            with bench.camera_on(f'/paused{DEPTH}', f'/paused{INFO}'):
+                assert bench.segment().any()

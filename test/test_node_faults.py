@@ -131,31 +131,6 @@ def test_a_topic_of_another_type_is_told(node):
         error_about(node, '(1 publishers of sensor_msgs/msg/PointCloud2)')
 
 
-def test_lost_images_are_noticed(node):
-    """Best-effort images over the default shared-memory segment of Fast DDS get lost."""
-    camera = kinect_camera(640, 480)
-    image = node.image(corner_depth(camera))
-
-    with node.listening('labels'), node.camera_on(qos=BEST_EFFORT):
-
-        def burst():
-            for _ in range(5):
-                node.send(image, node.info(camera))
-
-        status = node.reported(
-            lambda s: s.level == DiagnosticStatus.WARN and 'lost on' in s.message,
-            burst,
-            period=0.1,
-            timeout=20.0,
-            required=False,
-        )
-        if not status:
-            pytest.skip('Fast DDS lost no image')
-        assert 'fastdds_large_images.xml' in status.message
-    with node.listening('labels'), node.camera_on():
-        assert_segments(node)
-
-
 def test_camera_info_of_another_stamp_is_not_that_of_the_image(bench):
     """Zoom: the image comes 20 ms before its camera_info, which differs from the one before."""
     with bench.listening('planes'):

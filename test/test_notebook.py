@@ -3,6 +3,7 @@
 import json
 import sys
 
+import matplotlib
 import numpy as np
 import pytest
 
@@ -71,14 +72,12 @@ def test_html_has_a_picture_and_a_row_for_each_plane(result):
 
 
 def test_pandas(result):
-    pytest.importorskip('pandas')
     table = result.to_pandas()
     assert table['count'].tolist() == [plane.count for plane in result.planes]
     assert table['normal_z'].tolist() == [plane.normal[2] for plane in result.planes]
 
 
 def test_trimesh(result):
-    pytest.importorskip('trimesh')
     scene = result.to_trimesh()
     for plane in result.planes:
         mesh = scene.geometry[f'plane {plane.id}']
@@ -93,7 +92,7 @@ def test_open3d(result):
 
 
 def test_plot(result):
-    pytest.importorskip('matplotlib').use('agg')
+    matplotlib.use('agg')
     (shown,) = result.plot().images
     assert shown.get_array().shape == (480, 640, 3)
 

@@ -3,10 +3,8 @@
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.cli.pack import command
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.poses import match_poses, read_pose
@@ -31,13 +29,19 @@ def folders(tmp_path):
     return images, poses
 
 
-def pack(folders, *options):
-    images, poses = folders
-    output = images.parent / 'bag'
-    camera = images.parent / 'camera.yaml'
-    arguments = [images, '--camera', camera, '--output', output, '--poses', poses, *options]
-    result = CliRunner().invoke(command, list(map(str, arguments)), catch_exceptions=False)
-    return output, result
+@pytest.fixture
+def pack(folders, run):
+    """Pack the images with their poses: the bag, and what is said."""
+
+    def run_command(*options):
+        images, poses = folders
+        bag = images.parent / 'bag'
+        files = '--camera', images.parent / 'camera.yaml', '--poses', poses, '--output', bag
+        code, output, error = run('pack', images, *files, *options)
+        assert code == 0, error
+        return bag, output
+
+    return run_command
 
 
 def some_pose(k):
@@ -47,12 +51,12 @@ def some_pose(k):
     return pose
 
 
-def test_poses_become_transforms_at_the_stamps_of_their_images(folders):
+def test_poses_become_transforms_at_the_stamps_of_their_images(folders, pack):
     for k in range(6):
         np.savetxt(folders[1] / f'frame-{k}.pose.txt', some_pose(k))
-    output, result = pack(folders, '--rate', '10')
-    assert result.output.splitlines()[-2:] == [f'{output}: 6 images', '6 poses']
-    with RecordedTransforms(output, timeout=0.0) as transforms:
+    bag, output = pack('--rate', '10')
+    assert output.splitlines()[-2:] == [f'{bag}: 6 images', '6 poses']
+    with RecordedTransforms(bag, timeout=0.0) as transforms:
         for k in range(6):
             stamp = 10**9 + k * 10**8
             found = transforms.lookup('world', FRAME, stamp, stamp)
@@ -63,7 +67,7 @@ def test_poses_become_transforms_at_the_stamps_of_their_images(folders):
                 transforms.lookup('world', FRAME, stamp + 5 * 10**7, stamp)
 
 
-def test_what_is_missing_or_no_pose_is_counted_and_said(folders):
+def test_what_is_missing_or_no_pose_is_counted_and_said(folders, pack):
     values = [some_pose(k) for k in range(6)]
     values[1][0, 0] = np.nan
     values[2][:3, :3] *= 1.5
@@ -71,10 +75,9 @@ def test_what_is_missing_or_no_pose_is_counted_and_said(folders):
     for k in (0, 1, 2, 3):
         np.savetxt(folders[1] / f'{k}.txt', values[k])
     (folders[1] / '4.txt').write_text('1 2 three')
-    output, result = pack(folders)
-    assert result.exit_code == 0
-    assert '1 poses, 5 without: 1.txt: values are not finite, and 4 more' in result.output
-    with RecordedTransforms(output, timeout=1.0) as transforms:
+    bag, output = pack()
+    assert '1 poses, 5 without: 1.txt: values are not finite, and 4 more' in output
+    with RecordedTransforms(bag, timeout=1.0) as transforms:
         transforms.lookup('world', FRAME, 10**9, 10**9)
         with pytest.raises(TransformError):
             transforms.lookup('world', FRAME, 2 * 10**9, 2 * 10**9)

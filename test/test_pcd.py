@@ -5,9 +5,9 @@ import struct
 
 import numpy as np
 import pytest
+from dataset_files import literal_lzf
 from hypothesis import given
 from hypothesis import strategies as st
-from pcd_files import literal_lzf
 
 from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.pcd import lzf_decompress, read_pcd

@@ -8,7 +8,10 @@ import pytest
 from clouds import cloud_of
 from planes_of_labels import fit_planes
 
+from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
+from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera
@@ -184,6 +187,57 @@ def test_areas_and_rectangles_are_those_of_the_pixels(seed, form):
         low, high = along.min(axis=0), along.max(axis=0)
         np.testing.assert_allclose(plane.extents, high - low, atol=1e-4)
         np.testing.assert_allclose(plane.centre @ axes[:, :2], (low + high) / 2, atol=1e-4)
+
+
+def record(rays, inverse, weight, places):
+    """What is summed of pixels (29,): moments, rays, points and places."""
+    points, upper = rays / inverse[:, None], np.triu_indices(3)
+    sums = [*((weight[:, None] * rays).T @ rays)[upper], *(weight * inverse) @ rays]
+    sums += [weight @ inverse**2, len(inverse), *weight @ rays, weight @ inverse, weight.sum()]
+    sums += [*points.sum(axis=0), *(points.T @ points)[upper]]
+    return np.array([*sums, *places.sum(axis=0), *(places**2).sum(axis=0)])
+
+
+@pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
+def test_sums_of_regions_are_those_over_their_pixels(form):
+    """Without what is four deviations off the plane of the blocks that a region fills."""
+    draw = np.random.default_rng(7)
+    camera = Camera(72, 60, 90.0, 95.0, 30.0, 33.0, turn=(0.1, 0.5, -0.5, 0.7))
+    sensor = SensorModel(0.001, 0, 1.0, 0, 0.0005, 0, 35)
+    theta = np.array([[0, 0, 0.4], [0.1, 0.05, 0.5], [-0.1, 0.2, 0.7], [0.05, -0.1, 0.6]])
+    theta = theta @ camera.axes.T
+    labels = draw.permutation(np.arange(30) % 4).reshape(5, 6).repeat(12, 0).repeat(12, 1)
+    inverse = (theta[labels] * camera.rays).sum(axis=2)
+    # Half of the third region is off: it is then no plane, or another sensor.
+    inverse += draw.normal(0, np.where(labels == 3, 0.05, 0.0005))
+    inverse += 0.1 * draw.choice([-1, 0, 1], labels.shape, p=[0.01, 0.98, 0.01])
+    labels = (labels * (draw.random(labels.shape) > 0.01)).astype(np.uint16)
+    inverse[draw.random(labels.shape) < 0.01] = 0
+    exact = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    image = form(exact)
+    sums, total = sum_regions(labels, image, Blocks.of(image), sensor)
+    whole = labels.reshape(15, 4, 18, 4).transpose(0, 2, 1, 3).reshape(15, 18, 16)
+    whole = (whole == whole[..., :1]).all(axis=2).repeat(4, 0).repeat(4, 1)
+    for label in (1, 2, 3):
+        mask = (labels == label) & image.valid
+        rays, y = image.rays.astype(float), image.inverse.astype(float)
+        plane = np.linalg.lstsq(rays[mask & whole], y[mask & whole], rcond=None)[0]
+        outlier = mask & ((y - rays @ plane) ** 2 > 16 * (1e-6 + 0.25e-6))
+        assert (sums.pixels[label], sums.outliers[label]) == (mask.sum(), outlier.sum())
+        assert (2 * outlier.sum() > mask.sum()) == (label == 3)
+        kept = mask if label == 3 else mask & ~outlier
+        y, w = y[kept], np.full(kept.sum(), 1e6) if image.camera else 1 / y[kept] ** 2
+        expected, scale = (
+            record(r, y, w, np.argwhere(kept)) for r in (rays[kept], np.abs(rays[kept]))
+        )
+        # Of whole blocks of a camera, the middle stands for points and places.
+        off = np.abs(total[label] - expected) / scale
+        assert off[:POINT].max() < 3e-6 and off[POINT:].max() < (4e-4 if image.camera else 1e-6)
+        cells = sums.cells[sums.start[label] : sums.start[label + 1]]
+        np.testing.assert_allclose(cells.sum(axis=0), total[label], rtol=1e-9, atol=1e-6)
+        assert 16 < len(cells) <= 64 and (cells[:, COUNT] > 0).all()
+        first, after = np.argwhere(labels == label).min(0), np.argwhere(labels == label).max(0) + 1
+        np.testing.assert_array_equal(sums.box[label], [*first, *after])
 
 
 def test_a_plane_by_another_name_is_the_same_plane():

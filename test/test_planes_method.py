@@ -90,32 +90,27 @@ def test_any_size(size):
 
 
 @pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('value', [1e-38, 1e-20, 1e-6, 1e6, 1e20, 1e38])
-@pytest.mark.parametrize('where', ['part', 'all'])
-def test_absurd_depths_disturb_nothing(value, where):
+@pytest.mark.parametrize('value', [1e-38, 1e-6, 1e6, 1e38])
+def test_absurd_depths_disturb_nothing(value):
     frame = room(900, 'none', 160, 120)
     depth = frame.depth.copy()
-    part = (slice(30, 60), slice(40, 90)) if where == 'part' else ...
-    depth[part] = value
-    doubted = where == 'all' and value == 1e6
-    with pytest.warns(UnitWarning) if doubted else nullcontext():
-        result = segmented(depth, frame.camera)
+    depth[30:60, 40:90] = value
+    result, expected = (segmented(image, frame.camera) for image in (depth, frame.depth))
     assert np.isfinite(result.energy)
     for plane in result.planes:
         assert np.isfinite([*plane.normal, plane.distance]).all()
-    if where == 'all':
-        # Depths no sensor can measure are not measured; 1000 km is still a wall.
-        if value == 1e6:
-            (wall,) = result.planes
-            np.testing.assert_allclose(wall.normal, [0, 0, -1], atol=1e-6)
-            assert wall.distance == pytest.approx(value, rel=1e-6) and wall.count == depth.size
-        else:
-            assert not result.planes and result.reason == 'no valid depth'
+    away = np.ones(depth.shape, bool)
+    away[20:70, 30:100] = False
+    assert ((result.labels > 0) == (expected.labels > 0))[away].mean() > 0.9
+    # Depths that no sensor can measure are not measured; 1000 km is still a wall.
+    with pytest.warns(UnitWarning) if value == 1e6 else nullcontext():
+        result = segmented(np.full_like(depth, value), frame.camera)
+    if value == 1e6:
+        (wall,) = result.planes
+        np.testing.assert_allclose(wall.normal, [0, 0, -1], atol=1e-6)
+        assert wall.distance == pytest.approx(value, rel=1e-6) and wall.count == depth.size
     else:
-        expected = segmented(frame.depth, frame.camera)
-        away = np.ones(depth.shape, bool)
-        away[20:70, 30:100] = False
-        assert ((result.labels > 0) == (expected.labels > 0))[away].mean() > 0.9
+        assert not result.planes and result.reason == 'no valid depth'
 
 
 @pytest.mark.parametrize(('distance', 'degrees'), [(2, 0), (2, 40), (4, 20)])

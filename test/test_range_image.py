@@ -1,11 +1,10 @@
 """Depth images and organised clouds become rays, inverse range and validity."""
 
-import pickle
 import warnings
 
 import numpy as np
 import pytest
-from scanner_points import scanned
+from clouds import scanned
 
 from rangeseg_ros import Camera, RangeImage
 from rangeseg_ros.core.rotations import rotation_by
@@ -133,23 +132,6 @@ def test_the_cloud_of_a_pinhole_camera_is_its_depth_image(camera, holes):
     assert image.rays is RangeImage.from_points(np.stack([x, y, z], axis=2)).rays
 
 
-@pytest.mark.parametrize('camera', CAMERAS)
-@pytest.mark.parametrize('turn', [(0, 0, 0.5), (1.2, -1.2, 1.2), (2.0, 1.0, -0.5), (0, np.pi, 0)])
-def test_the_camera_of_a_cloud_in_another_frame_is_found(camera, turn):
-    turn = rotation_by(turn)
-    z = np.random.default_rng(3).uniform(0.4, 6, camera.shape)
-    z[np.random.default_rng(4).random(camera.shape) < 0.3] = np.nan
-    points = camera.rays_at(*np.indices(camera.shape, float)[::-1]) * z[..., None]
-    image = RangeImage.from_points((points @ turn.T).astype(np.float32))
-    np.testing.assert_allclose(image.camera.matrix, camera.matrix, atol=4e-3)
-    np.testing.assert_allclose(image.axes, turn, atol=1e-5)
-    np.testing.assert_allclose(image.inverse[image.valid], 1 / z[image.valid], rtol=1e-5)
-    # Frames share it, whatever their noise.
-    again = RangeImage.from_points((1.5 * points @ turn.T).astype(np.float32))
-    assert again.camera == image.camera and again.rays is image.rays
-    assert pickle.loads(pickle.dumps(image.camera)) == image.camera
-
-
 def bent(camera):
     """Rays through a lens that moves the corners by a fifth of a pixel."""
     square = (camera.rays[..., :2] ** 2).sum(axis=2, keepdims=True)
@@ -228,10 +210,9 @@ def test_refused_depth_images(depth, scale, message):
         RangeImage.from_depth(depth, CAMERA, scale)
 
 
-@pytest.mark.parametrize(
-    'points',
-    [np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int), np.zeros((0, 0, 3))],
-)
-def test_refused_clouds(points):
+def test_refused_clouds():
+    for points in (np.zeros((3, 4)), np.zeros((3, 4, 2)), np.zeros((3, 4, 3), int)):
+        with pytest.raises(RangeImageError, match='organised cloud'):
+            RangeImage.from_points(points)
     with pytest.raises(RangeImageError, match='organised cloud'):
-        RangeImage.from_points(points)
+        RangeImage.from_points(np.zeros((0, 0, 3)))

@@ -4,7 +4,6 @@ import cv2
 import numpy as np
 import pytest
 
-from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
@@ -63,21 +62,20 @@ def test_edges_lie_on_both_sides_of_jumps():
     assert not Segmenter(Config(jump_edges='none')).segment(image).edges.any()
 
 
-def test_segment_writes_normals_as_red_green_blue(tmp_path, room):
+def test_segment_writes_normals_as_red_green_blue(tmp_path, room, run):
     path = tmp_path / 'a.tiff'
     cv2.imwrite(str(path), room.depth)
     (tmp_path / 'camera.yaml').write_text(
         'image_width: 160\nimage_height: 120\ncamera_matrix: {rows: 3, cols: 3, data: '
         f'[{CAMERA.fx}, 0, {CAMERA.cx}, 0, {CAMERA.fy}, {CAMERA.cy}, 0, 0, 1]}}\n'
     )
-    arguments = ['segment', path, '--camera', tmp_path / 'camera.yaml', '--output', tmp_path]
-    rangeseg.main([*map(str, arguments), '--normals'], standalone_mode=False)
+    segment = 'segment', path, '--camera', tmp_path / 'camera.yaml', '--output'
+    assert run(*segment, tmp_path, '--normals')[0] == run(*segment, tmp_path / 'plain')[0] == 0
+    assert not (tmp_path / 'plain/a_normals.tiff').exists()
     # OpenCV reads blue, green, red.
     written = cv2.imread(str(tmp_path / 'a_normals.tiff'), cv2.IMREAD_UNCHANGED)[..., ::-1]
     image = RangeImage.from_depth(room.depth, CAMERA)
     np.testing.assert_array_equal(written, Segmenter().segment(image).normals)
-    rangeseg.main([*map(str, arguments[:-1]), str(tmp_path / 'plain')], standalone_mode=False)
-    assert not (tmp_path / 'plain/a_normals.tiff').exists()
 
 
 def test_messages_hold_normals_and_edges(room):

@@ -85,10 +85,7 @@ def test_copied_topics_are_as_they_were(done):
     )
     written = [m[3] for m in both if m[1].startswith('/segment_planes')]
     assert written == [m[3] for m in read(done / 'plain/bag')]
-    with (
-        rosbag2.Reader(done / 'recording') as before,
-        rosbag2.Reader(done / 'copy/bag') as after,
-    ):
+    with rosbag2.Reader(done / 'recording') as before, rosbag2.Reader(done / 'copy/bag') as after:
         for topic, info in before.topics.items():
             assert after.topics[topic].msgtype == info.msgtype
             assert after.topics[topic].msgdef == info.msgdef
@@ -220,7 +217,7 @@ def test_terrain_of_every_frame_is_that_of_the_messages(done):
     assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
 
 
-def test_doubtful_images_are_counted(tmp_path):
+def test_doubtful_images_are_counted(tmp_path, run):
     recording = Recording()
     rng = np.random.default_rng(0)
     for index, image in enumerate(walls(2)):
@@ -229,6 +226,7 @@ def test_doubtful_images_are_counted(tmp_path):
         recording.add_camera(stamp)
         recording.add_image(stamp, noisy[::2, ::2].repeat(2, axis=0).repeat(2, axis=1))
     recording.write(tmp_path / 'enlarged')
-    outcome = replay(tmp_path / 'enlarged', tmp_path / 'out')
-    (warning,) = (told for told in outcome.warnings if 'fills 2 x 2 pixels' in told)
-    assert warning.startswith('2 frames: ')
+    code, output, error = run('replay', tmp_path / 'enlarged', '--output', tmp_path / 'out')
+    assert code == 0 and '2 frames' in output
+    assert all(line.startswith('rangeseg: 2 frames: ') for line in error.splitlines())
+    assert 'fills 2 x 2 pixels' in error

@@ -1,6 +1,7 @@
 """Roles of planes: rooms with known answers, tolerances to the degree, tilted cameras."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.roles import ROLES, RolesError, ramps_of, roles
+from rangeseg_ros.core.ground.roles import ROLES, RolesError, ramps_of, roles, tilt_of
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -161,17 +162,41 @@ def test_up_of_any_length_in_the_frame_of_a_tilted_camera():
     assert roles(planes(*turned), config) == ['floor', 'wall']
 
 
-@pytest.mark.parametrize('up', [(0, 0, 0), (np.nan, 0, 1), (0, 1), np.inf, (np.inf, 0, 0)])
-def test_directions_that_are_none(up):
-    with pytest.raises(RolesError, match='up must be a direction'):
-        roles(planes((BOTTOM, UP, 1.2)), LEVEL, up)
-
-
-def test_configured_directions_that_are_none():
+def test_directions_that_are_none():
+    for up in ((0, 0, 0), (np.nan, 0, 1), (0, 1), np.inf, (np.inf, 0, 0)):
+        with pytest.raises(RolesError, match='up must be a direction'):
+            roles(planes((BOTTOM, UP, 1.2)), LEVEL, up)
     with pytest.raises(ConfigError, match='up_x, up_y, up_z must not all be 0'):
         Config(up_y=0)
-
-
-def test_nothing():
     assert roles([], LEVEL) == []
     assert len(set(ROLES)) == len(ROLES)
+
+
+@pytest.mark.parametrize(
+    ('degrees', 'change', 'told'),
+    [
+        (20, {}, True),
+        # Up to the slope of a ramp and the tolerance it is none, nor where nothing is built so.
+        (12, {}, False),
+        (12.1, {}, True),
+        (45.1, {}, False),
+        (20, {'area': 0.99}, False),
+        # Half of what is seen, and twice what agrees with the stated up alone.
+        (20, {'askew': 110}, True),
+        (20, {'askew': 112}, False),
+        (20, {'level': 49}, True),
+        (20, {'level': 51}, False),
+    ],
+)
+def test_a_tilt_is_what_most_planes_agree_with(degrees, change, told):
+    """100 pixels of a floor, and 10 of a wall that both directions agree with."""
+    known = {'area': 1.0, 'level': 0, 'askew': 0} | change
+    floor = SimpleNamespace(normal=tilted(degrees), count=100, area=known['area'])
+    wall = SimpleNamespace(normal=(1, 0, 0), count=10, area=5.0)
+    level = SimpleNamespace(normal=UP, count=known['level'], area=5.0)
+    askew = SimpleNamespace(normal=(0.7, -0.5, 0.5), count=known['askew'], area=5.0)
+    found = tilt_of([wall, level, floor, askew], np.array(UP), 10.0, 1.0, 12.0)
+    assert (found is not None) == told
+    if told:
+        assert found.degrees == pytest.approx(degrees)
+        np.testing.assert_allclose(found.up, tilted(degrees), atol=1e-9)

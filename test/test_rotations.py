@@ -1,9 +1,12 @@
-"""Rotations: as SciPy has them."""
+"""Rotations and quantiles: as SciPy has them."""
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2, f
 
 from rangeseg_ros.core.rotations import quaternions, rotation_by, rotation_matrix
+from rangeseg_ros.core.significance import LEVEL, chi2_quantile, f_quantile
 
 TURNS = np.concatenate(
     [
@@ -35,3 +38,13 @@ def test_matrices_of_quaternions_and_of_turns():
         truth = Rotation.from_rotvec(turn)
         assert np.abs(rotation_matrix(truth.as_quat()) - truth.as_matrix()).max() < 1e-15
         assert np.abs(rotation_by(turn) - truth.as_matrix()).max() < 1e-15
+
+
+@pytest.mark.parametrize('level', [0.05, 0.5, 0.99, LEVEL])
+def test_quantiles(level):
+    for freedom in (0.5, 1, 2, 3, 6, 9, 13, 15.7, 60):
+        expected = chi2.ppf(level, freedom)
+        assert chi2_quantile(freedom, level) == pytest.approx(expected, rel=1e-10)
+    for freedom, others in ((0.5, 100), (3, 2), (6, 22), (13, 9.5)):
+        expected = f.ppf(level, freedom, others)
+        assert f_quantile(freedom, others, level) == pytest.approx(expected, rel=1e-8)

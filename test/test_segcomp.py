@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from dataset_files import raster
 from hypothesis import given
 from hypothesis import strategies as st
-from segcomp_files import raster
 
 from rangeseg_ros import segcomp
 from rangeseg_ros.segcomp import SegcompError
@@ -56,71 +56,50 @@ def test_normals_and_angles(tmp_path):
     assert segcomp.read_angles(tmp_path / 'a.gt-ang') == [(1, 2, 90.0), (1, 5, 37.25)]
 
 
-@pytest.mark.parametrize(
-    ('data', 'fault'),
-    [
-        (b'', 'magic'),
-        (raster(BLANK, magic=0x956AA659), 'magic'),
-        (raster(BLANK)[:20], 'header has 20 of 32'),
-        (raster(BLANK, depth=1), '1 bits'),
-        (raster(BLANK, kind=2), 'type 2'),
-        (raster(BLANK, width=0), 'size 0x2'),
-        (raster(BLANK)[:-1], '3 of 4 pixels'),
-        (raster(BLANK, colours=3), '1 of 4 pixels'),
-    ],
-)
-def test_malformed_raster(tmp_path, data, fault):
-    path = tmp_path / 'bad.range'
-    path.write_bytes(data)
-    with pytest.raises(SegcompError, match=fault) as error:
-        segcomp.read_raster(path)
-    assert str(path) in str(error.value) and '\n' not in str(error.value)
-
-
 def test_perceptron_values_are_the_lower_12_bits(tmp_path):
     values = np.random.default_rng(1).integers(0, 2**32, (512, 512), np.uint32)
     (tmp_path / 'perc.test.0').write_bytes(perceptron_bytes(values))
     assert np.array_equal(segcomp.read_perceptron(tmp_path / 'perc.test.0'), values & 4095)
 
 
-@pytest.mark.parametrize(
-    ('change', 'fault'),
-    [
-        (lambda data: data[:-1], 'truncated'),
-        (lambda data: data[:34], 'header line 7 must have 4 words'),
-        (lambda data: data + b'x', 'oversized'),
-        (lambda data: b'extra ' + data, 'header line 1 must have 2 words'),
-        (lambda data: data[data.index(b'\n') + 1 :], 'header line 2'),
-        (lambda data: b'', 'header line 1'),
-    ],
-)
-def test_malformed_perceptron(tmp_path, change, fault):
-    path = tmp_path / 'perc.test.0'
-    path.write_bytes(change(perceptron_bytes(np.zeros((512, 512), np.uint32))))
-    with pytest.raises(SegcompError, match=fault):
-        segcomp.read_perceptron(path)
+PERCEPTRON = perceptron_bytes(np.zeros((512, 512), np.uint32))
 
 
 @pytest.mark.parametrize(
-    ('text', 'fault'),
+    ('read', 'data', 'fault'),
     [
-        ('', 'count'),
-        ('two\n', 'count'),
-        ('2 3\n', 'count'),
-        ('2\n10 11 90\n', '1 lines where the first announces 2'),
-        ('1\n10 11\n', 'malformed entry 1'),
-        ('1\n10 11.5 90\n', 'malformed entry 1'),
-        ('1\n10 11 ninety\n', 'malformed entry 1'),
-        ('1\n10 11 nan\n', 'malformed entry 1'),
-        ('1\n10 11 90 4\n', 'malformed entry 1'),
-        ('1\n' + '9' * 400 + ' 11 90\n', 'malformed entry 1'),
+        (segcomp.read_raster, b'', 'magic'),
+        (segcomp.read_raster, raster(BLANK, magic=0x956AA659), 'magic'),
+        (segcomp.read_raster, raster(BLANK)[:20], 'header has 20 of 32'),
+        (segcomp.read_raster, raster(BLANK, depth=1), '1 bits'),
+        (segcomp.read_raster, raster(BLANK, kind=2), 'type 2'),
+        (segcomp.read_raster, raster(BLANK, width=0), 'size 0x2'),
+        (segcomp.read_raster, raster(BLANK)[:-1], '3 of 4 pixels'),
+        (segcomp.read_raster, raster(BLANK, colours=3), '1 of 4 pixels'),
+        (segcomp.read_perceptron, PERCEPTRON[:-1], 'truncated'),
+        (segcomp.read_perceptron, PERCEPTRON[:34], 'header line 7 must have 4 words'),
+        (segcomp.read_perceptron, PERCEPTRON + b'x', 'oversized'),
+        (segcomp.read_perceptron, b'extra ' + PERCEPTRON, 'header line 1 must have 2 words'),
+        (segcomp.read_perceptron, PERCEPTRON[PERCEPTRON.index(b'\n') + 1 :], 'header line 2'),
+        (segcomp.read_perceptron, b'', 'header line 1'),
+        (segcomp.read_angles, b'', 'count'),
+        (segcomp.read_angles, b'two\n', 'count'),
+        (segcomp.read_angles, b'2 3\n', 'count'),
+        (segcomp.read_angles, b'2\n10 11 90\n', '1 lines where the first announces 2'),
+        *(
+            (segcomp.read_angles, f'1\n{entry}\n'.encode(), 'malformed entry 1')
+            for entry in ('10 11', '10 11.5 90', '10 11 ninety', '10 11 nan', '10 11 90 4')
+        ),
+        (segcomp.read_angles, b'1\n' + b'9' * 400 + b' 11 90\n', 'malformed entry 1'),
     ],
+    ids=range(24),
 )
-def test_malformed_angles(tmp_path, text, fault):
-    path = tmp_path / 'a.gt-ang'
-    path.write_text(text)
-    with pytest.raises(SegcompError, match=fault):
-        segcomp.read_angles(path)
+def test_malformed_files(tmp_path, read, data, fault):
+    path = tmp_path / 'bad'
+    path.write_bytes(data)
+    with pytest.raises(SegcompError, match=fault) as error:
+        read(path)
+    assert str(path) in str(error.value) and '\n' not in str(error.value)
 
 
 @given(st.binary(max_size=200), st.sampled_from(READERS))

@@ -1,4 +1,4 @@
-"""Method `normals` from depth to planes: noise-free rooms, degenerate frames, determinism."""
+"""Method normals from depth to planes: noise-free rooms, options, the fast minimiser."""
 
 import pickle
 from dataclasses import replace
@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_normals import coarse_to_fine
+from rangeseg_ros.core.by_normals.angular_cost import degrees
+from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.method import minimise_exactly
+from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 NORMALS = Config(method='normals')
 # Without noise neither a wide baseline nor much smoothing is called for.
@@ -55,15 +61,6 @@ def test_every_face_of_a_noise_free_room_is_found(seed):
     assert checked >= 8
 
 
-def test_coarse_to_fine_and_exact_agree_on_a_corner():
-    fast = segment(corner(0.002))
-    full = segment(corner(0.002), replace(NORMALS, exact=True))
-    assert len(fast.planes) == len(full.planes) == 3
-    assert np.mean(fast.labels == full.labels) > 0.97
-    # Both are local minima: either may be the lower.
-    assert fast.energy == pytest.approx(full.energy, rel=0.005)
-
-
 def test_exact_goes_on_until_no_move_helps():
     swap = replace(NORMALS, exact=True, moves='swap', direction_count=17, normal_baseline=1)
     energies = [
@@ -98,24 +95,6 @@ def test_every_option_finds_the_corner(options):
     truth = np.array([(0, -0.8, -0.6), (-0.8, 0.36, -0.48), (0.8, 0.36, -0.48)])
     angles = np.degrees(np.arccos(np.clip(np.array([p.normal for p in large]) @ truth.T, -1, 1)))
     assert (angles.min(axis=0) < 2).all()
-
-
-@pytest.mark.parametrize('method', ['normals', 'planes'])
-@pytest.mark.parametrize(
-    'depth',
-    [
-        np.zeros((48, 64), np.uint16),
-        np.full((48, 64), np.nan),
-        np.full((48, 64), np.inf),
-        np.full((48, 64), -1.0),
-        np.where(np.eye(48, 64) > 0, 1.0, np.inf),
-    ],
-    ids=['zero', 'nan', 'infinite', 'negative', 'diagonal'],
-)
-def test_frames_without_a_plane_say_why(depth, method):
-    result = segment(depth, Config(method=method))
-    assert result.planes == [] and not result.labels.any()
-    assert result.reason
 
 
 @pytest.mark.parametrize('config', [Config(min_pixels=100), NORMALS], ids=['planes', 'normals'])
@@ -157,3 +136,75 @@ def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():
     image = RangeImage.from_depth(corner(), CAMERA)
     assert sequence.segment(image, 0).tilt is not None
     assert sequence.segment(image, 1, up=(0, -0.8, -0.6)).tilt is None
+
+
+DIRECTIONS = directions('platonic', 73).astype(np.float32)
+
+
+def patches(seed, height, width, noise):
+    """Normals of rectangles about as large as the smallest plane, noisy, with holes."""
+    random = np.random.default_rng(seed)
+    rows = np.searchsorted((19, 43), np.arange(height), side='right')
+    columns = np.searchsorted((25, 42, 71), np.arange(width), side='right')
+    label = 4 * rows[:, None] + columns
+    truth = DIRECTIONS[random.permutation(len(DIRECTIONS))[:12]][label]
+    normals = truth + noise * random.normal(size=truth.shape)
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    normals[random.random((height, width)) < 0.05] = np.nan
+    return normals.astype(np.float32), label
+
+
+def problem(seed, height=75, width=101, noise=0.15):
+    normals, label = patches(seed, height, width, noise)
+    grid = connected(height, width)
+    grid.right[10:60, 50] = 0
+    return (normals, DIRECTIONS, grid, 40.0), label
+
+
+def connected(height, width):
+    right, below = np.ones((height, width - 1)), np.ones((height - 1, width))
+    return Grid(right.astype(np.float32), below.astype(np.float32))
+
+
+def test_energy_is_close_to_that_of_the_full_expansion():
+    """1 % is the package's promise, of rooms."""
+    camera = kinect_camera(320, 240)
+    image = RangeImage.from_depth(simulate_kinect(kinect_room(5), camera, seed=5).depth, camera)
+    fast, full = (
+        Segmenter(Config(method='normals', direction_count=73, exact=exact)).segment(image).energy
+        for exact in (False, True)
+    )
+    assert full <= fast <= 1.01 * full
+
+
+def test_noise_free_patches_are_found_to_the_pixel():
+    arguments, label = problem(3, noise=0.0)
+    known = np.isfinite(arguments[0][..., 0])
+    found = coarse_to_fine.minimise(*arguments)
+    assert len(np.unique(np.stack([found[known], label[known]]), axis=1).T) == 12
+    np.testing.assert_array_equal(found[known], minimise_exactly(*arguments)[known])
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 30), (7, 9), (8, 16)])
+def test_any_size_of_image(shape):
+    normals = np.tile(DIRECTIONS[5].astype(np.float32), (*shape, 1))
+    assert (coarse_to_fine.minimise(normals, DIRECTIONS, connected(*shape), 40.0) == 5).all()
+
+
+def test_angles_of_the_kernel_are_those_of_the_arc_cosine():
+    cosines = np.append(np.linspace(-1, 1, 501), [1 + 1e-7, -1 - 1e-7]).astype(np.float32)
+    found = [degrees(cosine) for cosine in cosines]
+    expected = np.degrees(np.arccos(np.clip(cosines.astype(float), -1, 1)))
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    assert degrees(np.float32(np.nan)) == 0
+
+
+def test_pixels_without_normal_belong_to_their_side_of_a_jump():
+    """A jump within a block, pixels without normal beside it: the prior alone places them."""
+    normals = np.empty((64, 64, 3), np.float32)
+    normals[:, :35], normals[:, 35:] = DIRECTIONS[5], DIRECTIONS[40]
+    normals[:, 32:38] = np.nan
+    grid = connected(64, 64)
+    grid.right[:, 34] = 0
+    found = coarse_to_fine.minimise(normals, DIRECTIONS, grid, 100.0)
+    assert (found[:, :35] == 5).all() and (found[:, 35:] == 40).all()

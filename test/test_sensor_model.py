@@ -7,11 +7,12 @@ from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.error_law import Strata, fit_law
-from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.noise import ROUGH, measured_sensor
 from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.moments import COUNT, SIZE
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -223,17 +224,34 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
     assert (steps.windows <= steps.pixels).all()
 
 
-def test_jumps_follow_the_noise():
-    """About 0.0065 1/m for a Kinect."""
-    random = np.random.default_rng(7)
-    image = RangeImage(CAMERA.rays, three_planes().astype(np.float32), CAMERA)
-    steps = jump_steps(Blocks.of(image), STATED._replace(column_noise=0.0, row_noise=0.0))
-    np.testing.assert_allclose(steps.windows, 0.0065, rtol=0.05)
-    inverse = three_planes() + random.normal(0, 1e-5, CAMERA.shape)
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    blocks = Blocks.of(image)
-    steps = jump_steps(blocks, measured_sensor(image, blocks, STATED, (0.0, 0.0)))
-    assert np.median(steps.windows) < 6e-4
+def test_steps_are_those_of_the_flat_blocks_around():
+    """By the definition, block for block."""
+    draw, shape = np.random.default_rng(9), (9, 11)
+    sensor = STATED._replace(
+        noise=0.001, quantum=0.003, range_quantum=0.004, column_noise=0.4, row_noise=0.2
+    )
+    across, down = draw.exponential(1e-5, (2, *shape))
+    squared, moments = draw.uniform(0.1, 2, shape), np.zeros((*shape, SIZE))
+    moments[..., COUNT] = draw.choice([3, 4, 16], shape)
+    freedom = moments[..., COUNT] - 3
+    tilt = 0.16 * across + 0.04 * down
+    residual = draw.choice([0.99, 1.01, 9], shape) * ROUGH * (1e-6 + tilt) * freedom
+    found = jump_steps(Blocks(moments, squared, across, down, residual), sensor)
+    flat = (freedom > 0) & (residual < ROUGH * (1e-6 + tilt) * freedom)
+    for i, j in np.ndindex(shape):
+        window = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+        told = flat[window] if not flat[i, j] else np.zeros_like(flat[window])
+        tilts, slopes = tilt[window][told], (across + down)[window][told]
+        if flat[i, j]:
+            tilts, slopes = tilt[i, j], across[i, j] + down[i, j]
+        least, most = np.min(tilts, initial=1), np.max(tilts, initial=0)
+        least = least if flat[i, j] or told.any() else 0
+        steps = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + t)) for t in (least, most)]
+        steps = np.maximum(steps, 2.2 * max(0.003, 0.004 * squared[i, j]))
+        slope = np.sqrt(np.min(slopes, initial=1)) if flat[i, j] or told.any() else 0
+        assert (found.windows[i, j], found.pixels[i, j]) == pytest.approx(tuple(steps), rel=1e-5)
+        assert found.slopes[i, j] == pytest.approx(slope, rel=1e-5)
+    assert 20 < flat.sum() < 60
 
 
 @pytest.mark.parametrize('width', [0.7, 2.0, 4.0])

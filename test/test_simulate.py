@@ -5,9 +5,7 @@ import csv
 import cv2
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from rangeseg_ros.cli.simulate import command
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
@@ -22,17 +20,11 @@ from rangeseg_ros.simulation.terrain.kinds import terrain_scene
 SMALL = ['--width', '160', '--height', '120']
 
 
-def simulate(*arguments):
-    return CliRunner().invoke(command, [str(argument) for argument in arguments])
-
-
-def test_kinect_folder_holds_the_scenes(tmp_path):
+def test_kinect_folder_holds_the_scenes(tmp_path, run):
     output = tmp_path / 'rooms'
-    result = simulate(
-        'kinect', '--scenes', 2, '--frames', 2, '--seed', 7, '--scene', 'curved', *SMALL,
-        '--sensor-seed', 3, '--output', output,
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
+    words = '--scenes', 2, '--frames', 2, '--seed', 7, '--scene', 'curved', '--sensor-seed', 3
+    code, _, error = run('simulate', 'kinect', *words, *SMALL, '--output', output)
+    assert code == 0, error
     assert [path.name for path in tmp_path.iterdir()] == ['rooms']
     names = ['000007_000000', '000007_000001', '000008_000000', '000008_000001']
     for kind in ('depth', 'truth'):
@@ -62,10 +54,12 @@ def test_kinect_folder_holds_the_scenes(tmp_path):
     assert frames[3].stamp - frames[0].stamp == 100_000_000
 
 
-def test_noise_free_png_is_rounded_and_bag_exact(tmp_path):
+def test_noise_free_png_is_rounded_and_bag_exact(tmp_path, run):
     output = tmp_path / 'rooms'
-    result = simulate('kinect', '--scenes', 1, '--noise', 'none', *SMALL, '--output', output)
-    assert result.exit_code == 0, result.output
+    code, _, error = run(
+        'simulate', 'kinect', '--scenes', 1, '--noise', 'none', *SMALL, '--output', output
+    )
+    assert code == 0, error
     depth = cv2.imread(str(output / 'depth' / '000000.png'), cv2.IMREAD_UNCHANGED)
     assert depth.dtype == np.uint16
     with DepthBag(output / 'bag') as bag:
@@ -74,19 +68,21 @@ def test_noise_free_png_is_rounded_and_bag_exact(tmp_path):
     assert np.abs(1000 * frame.depth - depth).max() <= 0.501
 
 
-def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch):
+def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, run):
     output = tmp_path / 'rooms'
     output.mkdir()
     (output / 'precious').touch()
-    result = simulate('kinect', '--output', output)
-    assert result.exit_code != 0 and 'exists already' in result.output
+    code, _, error = run('simulate', 'kinect', '--output', output)
+    assert code == 2 and 'exists already' in error
 
     def fail(*_arguments, **_options):
         raise OSError('disk full')
 
     monkeypatch.setattr('rangeseg_ros.cli.simulate.write_image', fail)
-    result = simulate('kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other')
-    assert isinstance(result.exception, OSError)
+    code, _, error = run(
+        'simulate', 'kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other'
+    )
+    assert code == 2 and 'disk full' in error
     assert [path.name for path in tmp_path.iterdir()] == ['rooms']
 
 
@@ -94,20 +90,17 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch):
     ('option', 'value'),
     [('--noise', 'loud'), ('--scenes', 0), ('--seed', -1), ('--width', 1), ('--scene', 'desert')],
 )
-def test_bad_option(tmp_path, option, value):
-    result = simulate('kinect', option, value, '--output', tmp_path / 'rooms')
-    assert result.exit_code == 2
-    assert option in result.output and str(value) in result.output
+def test_bad_option(tmp_path, option, value, run):
+    code, _, error = run('simulate', 'kinect', option, value, '--output', tmp_path / 'rooms')
+    assert code == 2 and option in error and str(value) in error
     assert not any(tmp_path.iterdir())
 
 
-def test_terrain_is_seen_by_an_image_of_any_size(tmp_path):
+def test_terrain_is_seen_by_an_image_of_any_size(tmp_path, run):
     output = tmp_path / 'terrain'
-    result = simulate(
-        'terrain', '--sensor', 'realsense', '--scenes', 1, '--seed', 5, '--kind', 'curb', *SMALL,
-        '--output', output,
-    )  # fmt: skip
-    assert result.exit_code == 0, result.output
+    words = '--sensor', 'realsense', '--scenes', 1, '--seed', 5, '--kind', 'curb'
+    code, _, error = run('simulate', 'terrain', *words, *SMALL, '--output', output)
+    assert code == 0, error
     camera = read_camera(output / 'camera.yaml')
     # 90 degrees wide, as the sensor's own images.
     assert camera == Camera(160, 120, 80.0, 80.0, 79.5, 59.5)

@@ -11,13 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rangeseg_ros.tasks import (
-    Failure,
-    SchedulerError,
-    attempt_all,
-    check_scheduler,
-    run_all,
-)
+from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
 
 
 @dataclass(frozen=True)
@@ -168,12 +162,9 @@ def alive(process):
         return False
 
 
-@pytest.mark.parametrize('address', ['tcp://host:8786', 'host:1', 'tls://[::1]:8786'])
-def test_addresses_of_schedulers(address):
-    check_scheduler(address)
-
-
-@pytest.mark.parametrize('address', ['foo', 'xyz://h:1', 'tcp://h', 'tcp://h:0', 'h:99999', ''])
-def test_what_is_no_address_is_refused(address):
-    with pytest.raises(SchedulerError, match='no address'):
+def test_addresses_of_schedulers():
+    for address in ('tcp://host:8786', 'host:1', 'tls://[::1]:8786'):
         check_scheduler(address)
+    for address in ('foo', 'xyz://h:1', 'tcp://h', 'tcp://h:0', 'h:99999', ''):
+        with pytest.raises(SchedulerError, match='no address'):
+            check_scheduler(address)

@@ -1,6 +1,5 @@
 """What is doubtful about an image is said, enlarged images are read as what they were."""
 
-import pickle
 from dataclasses import replace
 
 import cv2
@@ -152,13 +151,6 @@ def test_filled_holes_are_told_with_their_share(seen, axis):
         filled[k] = np.where(filled[k] == 0, filled[k - 1], filled[k])
     image = RangeImage.from_depth(np.swapaxes(filled, 0, axis), seen.camera)
     assert 0.01 < filled_share(image) <= holes
-
-
-def test_a_pickled_result_keeps_its_verdict(seen):
-    result = segment(*enlarged(seen.depth, seen.camera, 2, (0, 0, 0, 0)))
-    again = pickle.loads(pickle.dumps(result))
-    assert again.image is None and again.verdict == result.verdict
-    assert replace(again, reason='x').verdict.ok  # what is not known is not doubted
 
 
 def test_curved_surfaces_keep_their_pixels():

@@ -114,7 +114,7 @@ def band(
     ----------
     alpha : int
     front : (m,) int32
-        Sites next to those of the label.
+        Sites next to those of the label, one or more times. Those of the label are left out.
     reach : int
     labelling : GridLabelling
         `position` receives the place of each site in the result.

@@ -88,7 +88,9 @@ def _sum_pixels(
             for i in range(bi * size, min((bi + 1) * size, height)):
                 for j in range(bj * size, min((bj + 1) * size, width)):
                     if inverse[i, j] > 0:
+                        # Not in float32, which 1.0 times a ray is where nothing is compiled.
                         x, y, z = ray_of(rays, pinhole, i, j)
+                        x, y, z = np.float64(x), np.float64(y), np.float64(z)
                         sums = plus_pixel(sums, x, y, z, np.float64(inverse[i, j]), 1.0)
                         count += 1
             for k, value in enumerate(sums):
