@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.ground.grid import GroundMemory
+from rangeseg_ros.core.ground.grid import GridOptions, GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
-from rangeseg_ros.core.ground.survey import Survey, grid_options
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
 from rangeseg_ros.core.mapping.placement import moved_planes
@@ -49,7 +49,7 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config)
-        self._ground = GroundMemory(grid_options(self.config))
+        self._ground = GroundMemory(GridOptions.of(self.config))
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -70,8 +70,9 @@ class SequenceSegmenter:
             self._odometry, self.motion = PlaneOdometry(config), None
         self._odometry.config = config
         self.map.config = config
-        if grid_options(config) != grid_options(before) or config.map_frame != before.map_frame:
-            self._ground = GroundMemory(grid_options(config))
+        options = GridOptions.of(config)
+        if options != GridOptions.of(before) or config.map_frame != before.map_frame:
+            self._ground = GroundMemory(options)
 
     def segment(
         self,

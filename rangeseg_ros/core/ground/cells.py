@@ -16,13 +16,11 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
-WINDOW = 9
-"""Side of the square, in cells, over which the slope of the ground is measured."""
 
 
 class CellSize(NamedTuple):
@@ -46,23 +44,13 @@ class CellSize(NamedTuple):
 class Cells(NamedTuple):
     """Means of the pixels of cells, (rows, columns).
 
-    Attributes
-    ----------
-    ray : (3, ...) float32
-        Mean ray of the measured pixels.
-    inverse : (...) float32
-        Their mean inverse range, 1/m; 0 where less than half of them are measured.
-    place : (3, ...) float32
-        Height above the sensor along up, and position along two horizontal directions, metres;
-        NaN where not measured.
-    error : (...) float32
-        Standard deviation of the height of a pixel, metres: by the sensor model, or by how much
-        neighbouring pixels differ where that is more, as it is on grass and gravel.
-    variance : (...) float64
-        Of the mean height, metres^2; 0 where not measured, and where the pixels are of two
-        surfaces: they differ by more than by noise.
-    shared : (...) float64
-        How many times that variance a slope over `WINDOW` cells errs, by what cells share.
+    `ray` (3, ...) and `inverse` (...) range, 1/m, of the measured pixels, 0 where less than half
+    of them are; `place` (3, ...) on `axes` (3, 3), height above the sensor along up and position
+    along two horizontal directions, metres, NaN where not measured. `error` is the standard
+    deviation of the height of a pixel, metres: by the sensor model, or by how much neighbouring
+    pixels differ where that is more, as it is on grass and gravel. `variance` is that of the mean
+    height, 0 where not measured and where pixels are of two surfaces: they differ by more than by
+    noise.
     """
 
     ray: NDArray[np.float32]
@@ -70,7 +58,8 @@ class Cells(NamedTuple):
     place: NDArray[np.float32]
     error: NDArray[np.float32]
     variance: NDArray[np.float64]
-    shared: NDArray[np.float64]
+    size: CellSize
+    axes: NDArray[np.float64]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,27 +70,16 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([up, ahead, np.cross(up, ahead)])
 
 
-def cells_of(
-    image: RangeImage, size: CellSize, up: NDArray[np.float64], sensor: SensorModel
-) -> Cells:
-    """Cells of an image.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    size : CellSize
-    up : (3,) float64
-        Unit vector in the frame of the image.
-    sensor : SensorModel
-    """
+def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) -> Cells:
+    """Cells of an image; `up` (3,) is a unit vector in its frame."""
+    size, axes = CellSize.for_image(image.shape), axes_of(up)
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
     values = np.empty((6, *shape), np.float32)
     ray, inverse, scatter = values[:3], values[3], values[4:]
     means = ray, inverse, scatter
     run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
-        place = np.tensordot(axes_of(up).astype(np.float32), ray, 1) / inverse
+        place = np.tensordot(axes.astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
         # The median: a cell on a jump edge scatters by more than noise.
         variance = np.maximum(random_variance(sensor, inverse**2), cv2.medianBlur(scatter[0], 5))
@@ -109,13 +87,7 @@ def cells_of(
     whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
-    # Noise that neighbours share counts once, and smooth distortion is a slope: the gradient of a
-    # field smoothed by a Gaussian is 1 / (sqrt(2) length) of the field, per pixel.
-    pixels = size.rows * size.columns
-    alike = max(4 * np.pi * sensor.correlation**2 / pixels, 1.0)
-    bend = WINDOW**4 * pixels / (24 * sensor.distortion_length**2)
-    shared = alike + bend * systematic_variance(sensor, inverse**2) / (variance * share)
-    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, shared)
+    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

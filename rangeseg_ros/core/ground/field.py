@@ -59,26 +59,9 @@ class GroundField(NamedTuple):
 
 
 def ground_field(
-    cells: Cells,
-    ground: NDArray[np.bool_],
-    base: NDArray[np.float64],
-    size: CellSize,
-    up: NDArray[np.float64],
+    cells: Cells, ground: NDArray[np.bool_], base: NDArray[np.float64]
 ) -> GroundField:
-    """The ground continued.
-
-    Parameters
-    ----------
-    cells : Cells
-        (rows, columns).
-    ground : (rows, columns) bool
-        Cells of the ground.
-    base : (3,) float64
-        Plane under the robot.
-    size : CellSize
-    up : (3,) float64
-        Unit vector in the frame of the image.
-    """
+    """The ground continued, from cells (rows, columns) of it and the plane (3,) under the robot."""
     levels = [_sums(cells.ray, cells.inverse, ground)]
     while levels[-1].size > 18:
         levels.append(_halved(levels[-1]))
@@ -89,7 +72,7 @@ def ground_field(
     large = (theta.shape[1] * _COLUMNS, theta.shape[0] * _ROWS)
     spread = cv2.resize(theta, large, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
     planes = np.ascontiguousarray(spread.transpose(2, 0, 1), np.float32)
-    return GroundField(planes, size, up)
+    return GroundField(planes, cells.size, cells.axes[0])
 
 
 @njit(cache=True, nogil=True)
@@ -155,27 +138,13 @@ def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np
 
 
 def classify(
-    image: RangeImage,
-    field: GroundField,
-    bounds: NDArray[np.float32],
+    image: RangeImage, field: GroundField, bounds: NDArray[np.float32]
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Class and height of every pixel.
+    """Class, 0 where not measured, and height above the ground, metres, of every pixel (H, W).
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    field : GroundField
-    bounds : (3, rows, columns) float32
-        Of the cells, metres: up to the first off the ground a pixel is ground, below the second
-        a drop, above the third an obstacle, and these count more than the first.
-
-    Returns
-    -------
-    classes : (H, W) uint8
-        0 where not measured.
-    heights : (H, W) float32
-        Along up above the ground, metres; NaN where not measured.
+    By `bounds` (3, rows, columns) of the cells, metres: up to the first off the ground a pixel is
+    ground, below the second a drop, above the third an obstacle, and these count more than the
+    first. Heights are NaN where not measured.
     """
     classes, heights = np.empty(image.shape, np.uint8), np.empty(image.shape, np.float32)
     rise = np.tensordot(field.up.astype(np.float32), field.theta, 1)

@@ -27,13 +27,11 @@ The rise from the International Building Code (1011.5.2, four inches at least) t
 (24 cm at most), the run from private stairs to those of general access in the British Approved
 Document K, table 1.1.
 """
-# Tangent of the flattest stairs: what is flatter is level.
-_FLATTEST = RISE[0] / _RUN[1]
 # Treads and noses are within so much of a rise and a run of where they should be: nearer to that
 # than to the middle between two.
 _UNEVEN = 1 / 4
-# The histogram of heights: width of a bin, and its end, metres.
-_BIN, _HIGHEST = 0.005, 2.5
+# Width of the bins of the histogram of heights, metres.
+_BIN = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +65,15 @@ class Stairs:
 
 
 def stairs_of(terrain: Terrain) -> list[Stairs]:
-    """Staircases in sight: none or one up, none or one down.
-
-    Parameters
-    ----------
-    terrain : Terrain
-        The ground of the image.
-    """
+    """Staircases in sight: none or one up, none or one down."""
     cells = terrain.cells
     if cells is None:
         return []
     found = []
     for sign in (1, -1):
         # Nobody sees a tread from below.
-        highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST
-        level = _find_level(cells, sign, min(highest, _HIGHEST))
+        highest = terrain.stand.height(terrain.field.up) if sign > 0 else np.inf
+        level = _find_level(cells, sign, highest)
         sums = np.bincount((level[level > 0] / _BIN).astype(np.int64), minlength=1)
         rise, count = _find_rise(sums)
         if count > 1 and (stairs := _staircase(cells, level, sign, rise, count, terrain)):
@@ -97,7 +89,8 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
     before = np.maximum.accumulate(np.where(measured, rows, 0), axis=0)[:-1]
     # A tread that is too thin to be measured is still seen between two risers.
     apart = cells.place[:, 1:] - cells.place[:, before, columns]
-    flat = np.abs(apart[0]) < _FLATTEST * np.hypot(apart[1], apart[2])
+    flattest = RISE[0] / _RUN[1]  # stairs; what is flatter is level
+    flat = np.abs(apart[0]) < flattest * np.hypot(apart[1], apart[2])
     level = np.zeros(measured.shape, np.bool_)
     level[1:] = flat
     level[before[flat], np.nonzero(flat)[1]] = True

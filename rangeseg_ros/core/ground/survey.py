@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.grid import GridOptions, GroundGrid, GroundMemory
+from rangeseg_ros.core.ground.reach import Limits
 from rangeseg_ros.core.ground.roles import unit
-from rangeseg_ros.core.ground.terrain import Limits, Terrain, terrain_of
+from rangeseg_ros.core.ground.terrain import Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -19,27 +20,11 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 class Survey:
     """What finding the ground takes.
 
-    Attributes
-    ----------
-    image : RangeImage
-    sensor : SensorModel
-    up : (3,) float64
-        Unit vector in the frame of the image.
-    sensor_height : float
-        Above the ground below the sensor, metres; 0 = unknown.
-    height_noise : float
-        Its standard deviation, metres.
-    limits : Limits
-    memory : GroundMemory
-        Of the images before, or of none.
-    stamp : int
-        When the image was taken, nanoseconds.
-    pose : (rotation (3, 3), shift (3,)), optional
-        Fixed frame from the frame of the image with the sensor as its origin.
-    fixed_frame : str
-        Its name.
-    cloud_resolution : float
-        Side of the cubes of which clouds have a point, metres; 0 = all pixels.
+    `up` (3,) is a unit vector in the frame of the image, `sensor_height` that above the ground
+    below the sensor, metres, 0 for unknown, and `height_noise` its standard deviation. `memory` is
+    of the images before the one of `stamp`, nanoseconds; `pose` (rotation, shift) leads from the
+    frame of the image, with the sensor as its origin, to the frame named `fixed_frame`. Clouds
+    have a point per cube of side `cloud_resolution`, metres; 0 = all pixels.
     """
 
     image: RangeImage
@@ -55,31 +40,17 @@ class Survey:
     cloud_resolution: float = 0.0
 
     @classmethod
-    def of(
-        cls, image: RangeImage, sensor: SensorModel, config: Config, up: ArrayLike | None = None
-    ) -> Survey:
-        """With the parameters of `config`, and its direction `up` when none is given.
-
-        The default is that of a level camera, see `RangeImage.level_up`.
-        """
-        limits = Limits(
-            float(np.radians(config.ground_slope)),
-            config.obstacle_height,
-            config.drop_height,
-            float(np.radians(config.up_sd)),
-            config.ground_gap,
-            config.robot_radius,
-        )
-        if up is None:
-            up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
+    def of(cls, image: RangeImage, sensor: SensorModel, config: Config) -> Survey:
+        """With the parameters of `config`; up is by default that of a level camera."""
+        up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
         return cls(
             image,
             sensor,
             unit(up),
             config.sensor_height,
             config.sensor_height_sd,
-            limits,
-            GroundMemory(grid_options(config)),
+            Limits.of(config),
+            GroundMemory(GridOptions.of(config)),
             cloud_resolution=config.cloud_resolution,
         )
 
@@ -99,14 +70,3 @@ class Survey:
         """The grid of the images before, with the terrain of this one."""
         place = self.image.place
         return self.memory.add(terrain, self.up, self.stamp, place, self.pose, self.fixed_frame)
-
-
-def grid_options(config: Config) -> GridOptions:
-    """Of the parameters."""
-    return GridOptions(
-        config.grid_resolution,
-        config.grid_size,
-        config.grid_memory,
-        config.grid_clearance,
-        config.track_time,
-    )
