@@ -1,7 +1,12 @@
-"""Cells of a few pixels: what the ground is looked for in.
+"""Cells of a few pixels: what the ground is looked for in, and continued in.
 
 A cell is the mean of its pixels, which for a plane is a point of the plane: theta . ray = inverse
 is linear. Cells are wider than high, because the ground recedes along the columns.
+
+The ground continued is a plane for every cell. Each block's plane is fitted to the ground in a
+window around it, with the plane of a window twice as wide as its prior, up to the whole image and
+the plane under the robot (a pyramid of ridge regressions): where the ground is seen, it follows
+undulation and distortion; where it is not, it goes on straight.
 """
 
 from __future__ import annotations
@@ -13,14 +18,20 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.moments import ray_of
+from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
+# Cells of a block of the ground continued, which is about square.
+_DOWN, _RIGHT = 4, 2
+# The prior counts as so much of a window full of ground: as much as the window is of the one twice
+# as wide that the prior is from.
+_PRIOR = 1 / 4
 
 
 class CellSize(NamedTuple):
@@ -135,3 +146,155 @@ def _means(
             scatter[0, i, c] = squares / (2 * pairs) if pairs > 0 else np.float32(0)
             falls -= fall * fall / max(below, 1)
             scatter[1, i, c] = falls / (2 * max(below - 1, 1))
+
+
+class GroundField(NamedTuple):
+    """The ground continued, by planes of cells: theta (3, rows, columns) . ray = inverse range."""
+
+    theta: NDArray[np.float32]
+    size: CellSize
+    up: NDArray[np.float64]
+
+    def turned(self) -> GroundField:
+        """Of the image with rows and columns exchanged."""
+        theta = np.ascontiguousarray(self.theta.transpose(0, 2, 1))
+        return GroundField(theta, CellSize(self.size.columns, self.size.rows), self.up)
+
+    def heights(self, cells: Cells) -> NDArray[np.float32]:
+        """Heights (rows, columns) of cells above the ground, metres; NaN where not measured."""
+        along = (self.theta * cells.ray).sum(axis=0)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            below = cells.inverse * np.tensordot(self.up.astype(np.float32), self.theta, 1)
+            heights: NDArray[np.float32] = (along - cells.inverse) / below
+        heights[cells.inverse == 0] = np.nan
+        return heights
+
+
+def ground_field(
+    cells: Cells, ground: NDArray[np.bool_], base: NDArray[np.float64]
+) -> GroundField:
+    """The ground continued, from cells (rows, columns) of it and the plane (3,) under the robot."""
+    levels = [_sums(cells.ray, cells.inverse, ground)]
+    while levels[-1].size > 18:
+        levels.append(_halved(levels[-1]))
+    theta = base.reshape(1, 1, 3)
+    for sums in reversed(levels):
+        theta = _fitted(sums, theta)
+    rows, columns = ground.shape
+    large = (theta.shape[1] * _RIGHT, theta.shape[0] * _DOWN)
+    spread = cv2.resize(theta, large, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    planes = np.ascontiguousarray(spread.transpose(2, 0, 1), np.float32)
+    return GroundField(planes, cells.size, cells.axes[0])
+
+
+@njit(cache=True, nogil=True)
+def _sums(
+    ray: NDArray[np.float32], inverse: NDArray[np.float32], ground: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Sums (2, M, N, 9) over blocks, of the ground and of all that is measured.
+
+    They are those of the regression: ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse.
+    """
+    rows, columns = ground.shape
+    sums = np.zeros((2, -(-rows // _DOWN), -(-columns // _RIGHT), 9))
+    for i in range(rows):
+        for c in range(columns):
+            s = inverse[i, c]
+            if s > 0:
+                x, y, z = ray[0, i, c], ray[1, i, c], ray[2, i, c]
+                entries = (x * x, x * y, x * z, y * y, y * z, z * z, x * s, y * s, z * s)
+                for n in range(9):
+                    sums[1, i // _DOWN, c // _RIGHT, n] += entries[n]
+                    if ground[i, c]:
+                        sums[0, i // _DOWN, c // _RIGHT, n] += entries[n]
+    return sums
+
+
+def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sums of 2 x 2 neighbours."""
+    _, rows, columns, _ = sums.shape
+    even = np.pad(sums, ((0, 0), (0, rows % 2), (0, columns % 2), (0, 0)))
+    return even[:, ::2, ::2] + even[:, 1::2, ::2] + even[:, ::2, 1::2] + even[:, 1::2, 1::2]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on the prior.
+
+    `prior` has a plane for 2 x 2 blocks.
+    """
+    _, rows, columns, _ = sums.shape
+    theta = np.empty((rows, columns, 3))
+    g, s = np.empty(9), np.empty(9)
+    for i in range(rows):
+        for j in range(columns):
+            g[:], s[:] = 0, 0
+            for k in range(max(i - 1, 0), min(i + 2, rows)):
+                for m in range(max(j - 1, 0), min(j + 2, columns)):
+                    g += sums[0, k, m]
+                    s += sums[1, k, m]
+            p = prior[min(i // 2, len(prior) - 1), min(j // 2, prior.shape[1] - 1)]
+            theta[i, j] = p
+            total = g + _PRIOR * s
+            # What the ground is off the prior plane.
+            x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
+            y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
+            z = g[8] - g[2] * p[0] - g[4] * p[1] - g[5] * p[2]
+            a, b, c, d, e, f = total[0], total[1], total[2], total[3], total[4], total[5]
+            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+            if g[0] + g[3] + g[5] != 0 and determinant > 1e-13 * a * d * f:
+                theta[i, j, 0] += (aa * x + bb * y + cc * z) / determinant
+                theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
+                theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
+    return theta
+
+
+def classify(
+    image: RangeImage, field: GroundField, bounds: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Class, 0 where not measured, and height above the ground, metres, of every pixel (H, W).
+
+    By `bounds` (3, rows, columns) of the cells, metres: up to the first off the ground a pixel is
+    ground, below the second a drop, above the third an obstacle, and these count more than the
+    first. Heights are NaN where not measured.
+    """
+    classes, heights = np.empty(image.shape, np.uint8), np.empty(image.shape, np.float32)
+    rise = np.tensordot(field.up.astype(np.float32), field.theta, 1)
+    run_rows(_classify, bounds.shape[1], image.inverse, image.rays, image.pinhole, field.theta,
+             rise, field.size, bounds, classes, heights)  # fmt: skip
+    return classes, heights
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _classify(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    pinhole: bool,
+    theta: NDArray[np.float32],
+    rise: NDArray[np.float32],
+    size: CellSize,
+    bounds: NDArray[np.float32],
+    classes: NDArray[np.uint8],
+    heights: NDArray[np.float32],
+) -> None:
+    """Of rows first...after of cells."""
+    height, width = inverse.shape
+    for i in range(first, after):
+        for v in range(i * size.rows, min((i + 1) * size.rows, height)):
+            for c in range(rise.shape[1]):
+                a, b, d, up = theta[0, i, c], theta[1, i, c], theta[2, i, c], rise[i, c]
+                flat, lowest, highest = bounds[0, i, c], bounds[1, i, c], bounds[2, i, c]
+                low, high = max(-flat, lowest), min(flat, highest)
+                for j in range(c * size.columns, min((c + 1) * size.columns, width)):
+                    x, y, z = ray_of(rays, pinhole, v, j)
+                    s = inverse[v, j]
+                    h = (a * x + b * y + d * z - s) / (s * up) if s > 0 else np.float32(np.nan)
+                    heights[v, j] = h
+                    # All of them are false where nothing was measured.
+                    classes[v, j] = (
+                        np.uint8((h >= low) & (h <= high)) * GROUND
+                        + np.uint8(h > highest) * OBSTACLE
+                        + np.uint8(h < lowest) * DROP
+                    )

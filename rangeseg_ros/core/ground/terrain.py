@@ -12,10 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.cells import Cells, cells_of
+from rangeseg_ros.core.ground.cells import Cells, GroundField, cells_of, classify, ground_field
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
-from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
 from rangeseg_ros.core.ground.reach import Limits, reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
