@@ -210,11 +210,15 @@ def _sums(
     return sums
 
 
+@njit(cache=True, nogil=True)
 def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
     """Sums of 2 x 2 neighbours."""
-    _, rows, columns, _ = sums.shape
-    even = np.pad(sums, ((0, 0), (0, rows % 2), (0, columns % 2), (0, 0)))
-    return even[:, ::2, ::2] + even[:, 1::2, ::2] + even[:, ::2, 1::2] + even[:, 1::2, 1::2]
+    _, rows, columns, count = sums.shape
+    half = np.zeros((2, -(-rows // 2), -(-columns // 2), count))
+    for i in range(rows):
+        for j in range(columns):
+            half[:, i // 2, j // 2] += sums[:, i, j]
+    return half
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

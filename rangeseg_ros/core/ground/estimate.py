@@ -79,17 +79,13 @@ def continued(
     h, x, y = place
     distance = np.hypot(x, y)
     start = float(np.partition(distance, len(distance) // 100)[len(distance) // 100])
-    # Half of what cells err by is shared by all.
-    terms, weight = np.stack([np.ones(len(x)), x, y, h]), 1 / (4 * variance)
-    shell = np.searchsorted(_WAYS, distance - start)
-    parts = [
-        (terms[:, here] * weight[here]) @ terms[:, here].T
-        for here in (shell == k for k in range(len(_WAYS)))
-    ]
+    terms = np.stack([np.ones(len(x)), x, y, h])
+    weighted = terms / (4 * variance)  # of a height, if all that errs alike were one measurement
     # The ground is level where it does not show its slope.
     prior = np.diag([1e-6, *2 * [(2 / math.tan(limits.slope)) ** 2]])
     found = []
-    for way, sums in zip(_WAYS, np.cumsum(parts, axis=0), strict=True):
+    for way in _WAYS:
+        sums = (weighted * (distance <= start + way)) @ terms.T
         covariance = np.linalg.inv(sums[:3, :3] + prior)
         plane = covariance @ sums[:3, 3]
         # What the ground is off its plane goes on unseen: it tells two points, a way apart.

@@ -167,15 +167,15 @@ def _spread(
                 total = summed = 0.0
                 nearest = np.inf
                 for q in range(max(c - _BESIDE, 0), min(c + _BESIDE + 1, columns)):
-                    way = np.sqrt((last[q, 1] - x) ** 2 + (last[q, 2] - y) ** 2)
-                    if way <= radius:
-                        nearest = min(nearest, way)
+                    square = (last[q, 1] - x) ** 2 + (last[q, 2] - y) ** 2
+                    if square <= radius * radius:
+                        nearest = min(nearest, square)
                         total += weight[q]
                         summed += weight[q] * mean[q]
                 if total == 0:
                     continue
                 apart = h - summed / total
-            near = abs(apart) < half and nearest <= gap
+            near = abs(apart) < half and nearest <= gap * gap
             way = np.sqrt((seen[c, 1] - x) ** 2 + (seen[c, 2] - y) ** 2)
             # Over a wall, or beyond an edge, it is another surface.
             noise = np.sqrt(variance[i, c] + seen[c, 3])
