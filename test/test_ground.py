@@ -4,8 +4,9 @@ import cv2
 import numpy as np
 import pytest
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
-from rangeseg_ros.core.ground.terrain import Limits, terrain_of
+from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.scenes import Pose
@@ -14,19 +15,19 @@ from rangeseg_ros.simulation.solids import box, prism
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Piece, Terrain, slab
 
-LIMITS = Limits(float(np.radians(12)), 0.05, 0.05)
 SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
 CAMERA = 0.8
 FLAT = slab(-3, FAR, 0, 0, ALL)
 
 
-def found(pieces, pitch, height, up=None, seed=0, camera=CAMERA, yaw=0, limits=LIMITS):
+def found(pieces, pitch, height, up=None, seed=0, camera=CAMERA, yaw=0, config=None):
     pose = Pose.looking((0, 0, camera), yaw, pitch, 0)
     scene = Terrain('made', tuple(Piece(*piece) for piece in pieces), (FLAT,), pose)
     frame = simulate_terrain(scene, Kinect(seed), seed=seed)
     image = RangeImage.from_depth(frame.depth, Kinect(seed).camera)
     known = (height, 0.015) if height else (0.0, 0.0)
-    return terrain_of(image, STATED, scene.up if up is None else up, known, limits), frame
+    up = scene.up if up is None else up
+    return terrain_of(image, STATED, up, known, config or Config()), frame
 
 
 def drop_at(edge, depth):
@@ -84,7 +85,8 @@ def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
         (slab(1.2, 1.5, -1, -1, ALL), DROP, 1.0),
         (slab(1.5, FAR, 0, 0, ALL), GROUND),
     ]
-    terrain, frame = found(pieces, 28, CAMERA, limits=LIMITS._replace(gap=gap, radius=gap + 0.1))
+    config = Config(ground_gap=gap, robot_radius=gap + 0.1)
+    terrain, frame = found(pieces, 28, CAMERA, config=config)
     beyond = (frame.terrain == GROUND) & (frame.depth > 2100) & (frame.depth < 2600)
     assert beyond.sum() > 1000
     assert abs((terrain.classes[beyond] == GROUND).mean() - kept) < 0.03

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.ground.grid import GridOptions, GroundMemory
+from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.mapping.observations import views
@@ -49,7 +49,7 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config)
-        self._ground = GroundMemory(GridOptions.of(self.config))
+        self._ground = GroundMemory(self.config)
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -70,9 +70,10 @@ class SequenceSegmenter:
             self._odometry, self.motion = PlaneOdometry(config), None
         self._odometry.config = config
         self.map.config = config
-        options = GridOptions.of(config)
-        if options != GridOptions.of(before) or config.map_frame != before.map_frame:
-            self._ground = GroundMemory(options)
+        grids = [(c.grid_resolution, c.grid_size, c.map_frame) for c in (before, config)]
+        if grids[0] != grids[1]:
+            self._ground = GroundMemory(config)
+        self._ground.config = config
 
     def segment(
         self,

@@ -115,7 +115,7 @@ def _points(image: RangeImage, result: Segmentation, kind: int) -> NDArray[np.fl
 
 
 def _resolution(result: Segmentation) -> float:
-    return result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+    return result.survey.config.cloud_resolution if isinstance(result.survey, Survey) else 0.0
 
 
 def _grid(make: Make, header: Any, image: RangeImage, result: Segmentation) -> Any:

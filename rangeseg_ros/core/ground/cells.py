@@ -4,9 +4,9 @@ A cell is the mean of its pixels, which for a plane is a point of the plane: the
 is linear. Cells are wider than high, because the ground recedes along the columns.
 
 The ground continued is a plane for every cell. Each block's plane is fitted to the ground in a
-window around it, with the plane of a window twice as wide as its prior, up to the whole image and
-the plane under the robot (a pyramid of ridge regressions): where the ground is seen, it follows
-undulation and distortion; where it is not, it goes on straight.
+window around it, with that of the whole image as its prior, whose own is the plane under the robot
+(ridge regressions): where the ground is seen, it follows undulation and distortion; where it is
+not, it goes on straight.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from rangeseg_ros.core.significance import OUTLIER
 _ROWS = 120
 # Cells of a block of the ground continued, which is about square.
 _DOWN, _RIGHT = 4, 2
-# The prior counts as so much of a window full of ground: as much as the window is of the one twice
-# as wide that the prior is from.
+# The prior counts as so much of a window full of ground.
 _PRIOR = 1 / 4
 
 
@@ -173,13 +172,10 @@ class GroundField(NamedTuple):
 def ground_field(
     cells: Cells, ground: NDArray[np.bool_], base: NDArray[np.float64]
 ) -> GroundField:
-    """The ground continued, from cells (rows, columns) of it and the plane (3,) under the robot."""
-    levels = [_sums(cells.ray, cells.inverse, ground)]
-    while levels[-1].size > 18:
-        levels.append(_halved(levels[-1]))
-    theta = base.reshape(1, 1, 3)
-    for sums in reversed(levels):
-        theta = _fitted(sums, theta)
+    """The ground continued, from its cells (rows, columns) and the plane (3,) under the robot."""
+    sums = _sums(cells.ray, cells.inverse, ground)
+    whole = _fitted(sums.sum(axis=(1, 2), keepdims=True), base)
+    theta = _fitted(sums, whole[0, 0])
     rows, columns = ground.shape
     large = (theta.shape[1] * _RIGHT, theta.shape[0] * _DOWN)
     spread = cv2.resize(theta, large, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
@@ -210,23 +206,9 @@ def _sums(
     return sums
 
 
-@njit(cache=True, nogil=True)
-def _halved(sums: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums of 2 x 2 neighbours."""
-    _, rows, columns, count = sums.shape
-    half = np.zeros((2, -(-rows // 2), -(-columns // 2), count))
-    for i in range(rows):
-        for j in range(columns):
-            half[:, i // 2, j // 2] += sums[:, i, j]
-    return half
-
-
 @njit(cache=True, nogil=True, error_model='numpy')
-def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on the prior.
-
-    `prior` has a plane for 2 x 2 blocks.
-    """
+def _fitted(sums: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on plane p."""
     _, rows, columns, _ = sums.shape
     theta = np.empty((rows, columns, 3))
     g, s = np.empty(9), np.empty(9)
@@ -237,7 +219,6 @@ def _fitted(sums: NDArray[np.float64], prior: NDArray[np.float64]) -> NDArray[np
                 for m in range(max(j - 1, 0), min(j + 2, columns)):
                     g += sums[0, k, m]
                     s += sums[1, k, m]
-            p = prior[min(i // 2, len(prior) - 1), min(j // 2, prior.shape[1] - 1)]
             theta[i, j] = p
             total = g + _PRIOR * s
             # What the ground is off the prior plane.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.reach import Limits
+from rangeseg_ros.core.config import Config
 
 # Metres of ground, from where it begins, that are continued to below the camera: each doubles the
 # one before. A short one is right where a ramp begins, a long one where the ground undulates.
@@ -68,7 +68,7 @@ def no_step(a: float, sd: float, least: float) -> float:
 
 
 def continued(
-    place: NDArray[np.float64], variance: NDArray[np.float64], height_sd: float, limits: Limits
+    place: NDArray[np.float64], variance: NDArray[np.float64], height_sd: float, config: Config
 ) -> Continuation:
     """The ground seen, continued to below the camera by the scale at which it agrees best.
 
@@ -82,7 +82,7 @@ def continued(
     terms = np.stack([np.ones(len(x)), x, y, h])
     weighted = terms / (4 * variance)  # of a height, if all that errs alike were one measurement
     # The ground is level where it does not show its slope.
-    prior = np.diag([1e-6, *2 * [(2 / math.tan(limits.slope)) ** 2]])
+    prior = np.diag([1e-6, *2 * [4 / max(config.steepest, 1e-3) ** 2]])
     found = []
     for way in _WAYS:
         sums = (weighted * (distance <= start + way)) @ terms.T
@@ -93,5 +93,5 @@ def continued(
         bent = (1 + 2 * start / way) * math.sqrt(max(off @ sums @ off, 0) / sums[0, 0])
         sd = math.sqrt(height_sd**2 + covariance[0, 0] + bent**2)
         a, b, c = map(float, plane)
-        found.append(Continuation((a, b, c), sd, no_step(a, sd, limits.least)))
+        found.append(Continuation((a, b, c), sd, no_step(a, sd, config.least_step)))
     return max(found, key=lambda one: one.confidence)

@@ -24,32 +24,6 @@ from rangeseg_ros.core.significance import OUTLIER
 _HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
 
 
-class GridOptions(NamedTuple):
-    """How large the grid is, and how long it remembers.
-
-    Sides of a cell and of the grid, metres; seconds after which a cell that is not seen is
-    forgotten; what hangs higher above the ground is not in the way, metres; and the seconds for
-    which the height of the camera holds while no ground is seen.
-    """
-
-    resolution: float
-    size: float
-    memory: float
-    clearance: float
-    patience: float
-
-    @classmethod
-    def of(cls, config: Config) -> GridOptions:
-        """Of the parameters."""
-        return cls(
-            config.grid_resolution,
-            config.grid_size,
-            config.grid_memory,
-            config.grid_clearance,
-            config.track_time,
-        )
-
-
 class GroundGrid(NamedTuple):
     """The ground around the robot, row by row along y, with x along the rows.
 
@@ -92,8 +66,8 @@ def empty_grid() -> GroundGrid:
 class GroundMemory:
     """What one camera has seen of the ground: the grid, and how high it is above the ground."""
 
-    def __init__(self, options: GridOptions) -> None:
-        self.options = options
+    def __init__(self, config: Config) -> None:
+        self.config = config
         self.forget()
 
     def forget(self) -> None:
@@ -104,7 +78,7 @@ class GroundMemory:
     def recall_height(self, stamp: int) -> float:
         """The height, metres, as it was found last; 0 for unknown."""
         age = stamp - self._height_stamp
-        return self._height_found if age <= 1e9 * self.options.patience else 0.0
+        return self._height_found if age <= 1e9 * self.config.track_time else 0.0
 
     def keep_height(self, height: float, stamp: int) -> None:
         """Take a height that was found, metres, in the image of a time, nanoseconds."""
@@ -112,7 +86,7 @@ class GroundMemory:
 
     def _forget_grid(self) -> None:
         """Have layers (5, N, N) of nothing: odds, height, variance, danger, second last seen."""
-        count = max(round(self.options.size / self.options.resolution), 1)
+        count = max(round(self.config.grid_size / self.config.grid_resolution), 1)
         self._layers = np.zeros((5, count, count))
         self._layers[4] = -np.inf
         self._corner = np.zeros(2, np.int64)
@@ -131,7 +105,7 @@ class GroundMemory:
         `up` and `place` (3,) of the sensor are in the frame of the image; `pose` (rotation, shift)
         leads from there, with the sensor as origin, to the fixed frame named `frame`, with z up.
         """
-        side, seconds = self.options.resolution, stamp * 1e-9
+        side, seconds = self.config.grid_resolution, stamp * 1e-9
         axes = axes_of(up)[[1, 2, 0]]  # ahead, left, up
         fixed = pose is not None and (pose[0] @ up)[2] > np.cos(np.pi / 4)
         rotation, shift = pose if fixed and pose else (axes, np.zeros(3))
@@ -140,11 +114,11 @@ class GroundMemory:
         self._move_to(shift)
         if terrain.cells is not None:
             turn = rotation @ axes.T
-            for danger, points, variance in _evidence(terrain.cells, self.options):
-                self._count(danger, points @ turn.T + shift, variance, seconds)
+            for kind, points, errors in _evidence(terrain.cells, self.config):
+                self._count(kind, points @ turn.T + shift, errors, seconds)
         odds, height, variance, danger, seen = self._layers
         age = seconds - seen
-        known = age <= self.options.memory
+        known = age <= self.config.grid_memory
         level = terrain.stand.height(up)
         origin = np.append(self._corner * side, shift[2] - (0 if np.isnan(level) else level))
         if not fixed:
@@ -162,12 +136,16 @@ class GroundMemory:
             frame if fixed else '',
         )
 
+    def _cells_of(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Numbers (..., 2) of the cells of points."""
+        return np.floor(points[..., :2] / self.config.grid_resolution).astype(np.int64)
+
     def _move_to(self, centre: NDArray[np.float64]) -> None:
         """Have the grid around a place; what leaves it is forgotten."""
         before, kept = self._corner, self._layers
         self._forget_grid()
         count = kept.shape[1]
-        self._corner = np.floor(centre[:2] / self.options.resolution).astype(np.int64) - count // 2
+        self._corner = self._cells_of(centre) - count // 2
         x, y = np.clip(self._corner - before, -count, count)
         # Of the old grid, the cells that are in the new one.
         old = slice(max(y, 0), count + min(y, 0)), slice(max(x, 0), count + min(x, 0))
@@ -184,7 +162,7 @@ class GroundMemory:
         """Add points (N, 3) of the ground, or of a kind of danger; variances (N,) of heights."""
         odds, height, variance, danger, seen = (layer.reshape(-1) for layer in self._layers)
         count = self._layers.shape[1]
-        index = np.floor(points[:, :2] / self.options.resolution).astype(np.int64) - self._corner
+        index = self._cells_of(points) - self._corner
         inside = ((index >= 0) & (index < count)).all(axis=1)
         cells = index[inside, 1] * count + index[inside, 0]
         number = np.bincount(cells, minlength=count * count)
@@ -208,7 +186,7 @@ class GroundMemory:
 
 
 def _evidence(
-    cells: CellTerrain, options: GridOptions
+    cells: CellTerrain, config: Config
 ) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
     """Classes, points (N, 3) on axes ahead, left, up, metres, and the variances of their heights.
 
@@ -222,13 +200,13 @@ def _evidence(
     both = ground[1:] & ground[:-1]
     near, far = place[:, :-1][:, both], place[:, 1:][:, both]
     way = np.hypot(*(far - near)[:2])
-    number = np.maximum(np.ceil(way / options.resolution), 1).astype(np.int64)
+    number = np.maximum(np.ceil(way / config.grid_resolution), 1).astype(np.int64)
     pair = np.repeat(np.arange(len(number)), number)
     share = (np.arange(len(pair)) - np.repeat(number.cumsum() - number, number)) / number[pair]
     between = near[:, pair] + share * (far - near)[:, pair]
     points = np.concatenate([place[:, ground], between], axis=1)
     errors = np.concatenate([variance[ground], variance[1:][both][pair]])
-    obstacle = (cells.kind == OBSTACLE) & (cells.height < options.clearance)
+    obstacle = (cells.kind == OBSTACLE) & (cells.height < config.grid_clearance)
     drop = (cells.kind == DROP) & np.isfinite(cells.crossing).all(axis=0)
     crossing = np.concatenate([cells.crossing, np.zeros((1, *drop.shape))])
     return [

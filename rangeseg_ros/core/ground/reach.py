@@ -9,8 +9,6 @@ edge farther away leads no chain across.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -24,51 +22,18 @@ _BESIDE = 4
 _BASELINES = 6
 
 
-class Limits(NamedTuple):
-    """What a robot drives over, metres and radians.
-
-    Steepest ground; what stands so high is an obstacle, what lies so deep a drop; standard
-    deviation of the direction that is up; the widest gap in the ground that it crosses; and its
-    radius: how far ground is looked for that leads to a cell, and how much farther than the
-    nearest ground in view a chain begins.
-    """
-
-    slope: float
-    obstacle: float
-    drop: float
-    tilt: float = float(np.radians(Config().up_sd))
-    gap: float = Config().ground_gap
-    radius: float = Config().robot_radius
-
-    @classmethod
-    def of(cls, config: Config) -> Limits:
-        """Of the parameters."""
-        return cls(
-            float(np.radians(config.ground_slope)),
-            config.obstacle_height,
-            config.drop_height,
-            float(np.radians(config.up_sd)),
-            config.ground_gap,
-            config.robot_radius,
-        )
-
-    @property
-    def least(self) -> float:
-        """The least step that is none of the ground, metres."""
-        return min(self.obstacle, self.drop)
-
-
 def reach(
-    place: NDArray[np.float64], variance: NDArray[np.float64], limits: Limits, turned: bool
+    place: NDArray[np.float64], variance: NDArray[np.float64], config: Config, turned: bool
 ) -> NDArray[np.bool_]:
     """Cells (rows, columns) that a chain leads to.
 
     `place` (3, rows, columns) is height and horizontal position, metres, NaN where nothing is
     measured; `variance` that of the height, 0 for cells that are no part of a chain. The nearest
-    row is the last, or the first where `turned`.
+    row is the last, or the first where `turned`. `robot_radius` says how far ground is looked for
+    that leads to a cell, and how much farther than the nearest ground in view a chain begins.
     """
-    tangent, half = float(np.tan(limits.slope)), limits.least / 2
-    even = _without_steps(place, variance, limits.least, tangent)
+    step, slope, radius = config.least_step, config.steepest, config.robot_radius
+    even = _without_steps(place, variance, step, slope)
     reached = np.zeros(even.shape, np.bool_)
     if not even.any():
         return reached
@@ -79,11 +44,11 @@ def reach(
     front, columns = even.argmax(axis=0), np.arange(even.shape[1])
     h, x, y = place[:, front, columns]
     distance = np.where(even.any(axis=0), np.hypot(x, y), np.inf)
-    near = distance <= distance.min() + limits.radius
+    near = distance <= distance.min() + radius
     level = h[near][np.abs(h[near]).argmin()]
-    start = near & (np.abs(h - level) < half)
+    start = near & (np.abs(h - level) < step / 2)
     reached[front[start], columns[start]] = True
-    _spread(place, variance, even, half, tangent, limits.gap, limits.radius, reached)
+    _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
     return reached[order]
 
 
@@ -156,9 +121,10 @@ def _spread(
     weight, mean, off = np.zeros(columns), np.zeros(columns), np.zeros(columns)
     last, seen = np.full((columns, 3), np.nan), np.full((columns, 4), np.nan)
     for i in range(rows):
-        for n in range(columns):
-            c = n if i % 2 == 0 else columns - 1 - n
-            if not variance[i, c] > 0:
+        # Both ways along a row: a cell that nothing leads to from the left, from the right.
+        for n in range(2 * columns):
+            c = n if n < columns else 2 * columns - 1 - n
+            if not variance[i, c] > 0 or (n >= columns and reached[i, c]):
                 continue
             h, x, y = place[0, i, c], place[1, i, c], place[2, i, c]
             if reached[i, c]:
@@ -181,9 +147,12 @@ def _spread(
             noise = np.sqrt(variance[i, c] + seen[c, 3])
             if abs(h - seen[c, 0]) < slope * way + CLEARLY * noise and way < radius:
                 apart += (off[c] - apart) * np.exp(-way / radius)
+            leads = even[i, c] and near and abs(apart) < half
+            if not leads and n < columns:
+                continue
             off[c] = apart
             seen[c] = h, x, y, variance[i, c]
-            if not even[i, c] or not near or abs(apart) >= half:
+            if not leads:
                 continue
             reached[i, c] = True
             kept = 0.0

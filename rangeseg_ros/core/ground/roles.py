@@ -69,7 +69,8 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
         found[upward & (offset < -config.role_height)] = 'lower'
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
-        for k in np.flatnonzero((slope > 2 * config.up_sd) & (slope <= config.ground_slope)):
+        ramp = (slope > 2 * config.up_sd) & (slope <= config.ground_slope)
+        for k in map(int, np.flatnonzero(ramp)):
             off = np.abs(_corners(planes[k]) @ floor.normal + floor.distance)
             if off.min() <= config.role_height:
                 found[k] = 'ramp'
@@ -88,12 +89,12 @@ def unit(direction: ArrayLike) -> NDArray[np.float64]:
 def _floor(candidates: list[Plane], up: NDArray[np.float64], config: Config) -> Plane | None:
     """The floor, by where planes meet the vertical through the sensor or how near they reach."""
     if config.sensor_height > 0:
-        off = [
-            abs(plane.distance / (plane.normal @ up) - config.sensor_height)
-            for plane in candidates
-        ]
-        nearest = min(off, default=np.inf)
-        return candidates[off.index(nearest)] if nearest <= config.role_height else None
+
+        def off(plane: Plane) -> float:
+            return abs(float(plane.distance / (plane.normal @ up)) - config.sensor_height)
+
+        nearest = min(candidates, key=off, default=None)
+        return nearest if nearest and off(nearest) <= config.role_height else None
 
     def reach(plane: Plane) -> float:
         corners = _corners(plane)

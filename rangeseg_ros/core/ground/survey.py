@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.grid import GridOptions, GroundGrid, GroundMemory
-from rangeseg_ros.core.ground.reach import Limits
+from rangeseg_ros.core.ground.grid import GroundGrid, GroundMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Terrain, terrain_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -21,47 +20,35 @@ class Survey:
     """What finding the ground takes.
 
     `up` (3,) is a unit vector in the frame of the image, `sensor_height` that above the ground
-    below the sensor, metres, 0 for unknown, and `height_noise` its standard deviation. `memory` is
-    of the images before the one of `stamp`, nanoseconds; `pose` (rotation, shift) leads from the
-    frame of the image, with the sensor as its origin, to the frame named `fixed_frame`. Clouds
-    have a point per cube of side `cloud_resolution`, metres; 0 = all pixels.
+    below the sensor, metres, 0 for unknown. `memory` is of the images before the one of `stamp`,
+    nanoseconds; `pose` (rotation, shift) leads from the frame of the image, with the sensor as its
+    origin, to the frame named `fixed_frame`.
     """
 
     image: RangeImage
     sensor: SensorModel
+    config: Config
     up: NDArray[np.float64]
     sensor_height: float
-    height_noise: float
-    limits: Limits
     memory: GroundMemory
     stamp: int = 0
     pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
     fixed_frame: str = ''
-    cloud_resolution: float = 0.0
 
     @classmethod
     def of(cls, image: RangeImage, sensor: SensorModel, config: Config) -> Survey:
         """With the parameters of `config`; up is by default that of a level camera."""
-        up = image.level_up if config.level else (config.up_x, config.up_y, config.up_z)
-        return cls(
-            image,
-            sensor,
-            unit(up),
-            config.sensor_height,
-            config.sensor_height_sd,
-            Limits.of(config),
-            GroundMemory(GridOptions.of(config)),
-            cloud_resolution=config.cloud_resolution,
-        )
+        up = unit(image.level_up if config.level else (config.up_x, config.up_y, config.up_z))
+        return cls(image, sensor, config, up, config.sensor_height, GroundMemory(config))
 
     def terrain(self) -> Terrain:
         """Find it."""
-        known = self.sensor_height, self.height_noise
+        known = self.sensor_height, self.config.sensor_height_sd
         if self.sensor_height <= 0:
             remembered = self.memory.recall_height(self.stamp)
             # A robot nods and a floor undulates, by less than an obstacle is high.
-            known = (remembered, self.limits.least) if remembered else (0.0, 0.0)
-        found = terrain_of(self.image, self.sensor, self.up, known, self.limits)
+            known = (remembered, self.config.least_step) if remembered else (0.0, 0.0)
+        found = terrain_of(self.image, self.sensor, self.up, known, self.config)
         if found.stand.found:
             self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found

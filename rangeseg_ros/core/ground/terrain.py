@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import Cells, GroundField, cells_of, classify, ground_field
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
-from rangeseg_ros.core.ground.reach import Limits, reach
+from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
@@ -81,7 +82,7 @@ def terrain_of(
     sensor: SensorModel,
     up: NDArray[np.float64],
     known: tuple[float, float],
-    limits: Limits,
+    config: Config,
 ) -> Terrain:
     """Class and height of every pixel.
 
@@ -90,12 +91,12 @@ def terrain_of(
     """
     right, down, _ = up @ image.axes
     if abs(right) <= abs(down):
-        return _upright(image, sensor, up, known, limits, bool(down > 0))
+        return _upright(image, sensor, up, known, config, bool(down > 0))
     # A camera on its side: columns are along up in the image with rows and columns exchanged.
     rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
     rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
     turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
-    found = _upright(turned, sensor, up, known, limits, bool(right > 0))
+    found = _upright(turned, sensor, up, known, config, bool(right > 0))
     return found._replace(
         classes=np.ascontiguousarray(found.classes.T),
         height=np.ascontiguousarray(found.height.T),
@@ -108,7 +109,7 @@ def _upright(
     sensor: SensorModel,
     up: NDArray[np.float64],
     known: tuple[float, float],
-    limits: Limits,
+    config: Config,
     turned: bool,
 ) -> Terrain:
     """The same for an image whose columns are along up; `turned` where up is down in it."""
@@ -117,10 +118,10 @@ def _upright(
     height, height_sd = known
     height = height or _nearest(place[0, :: 1 if turned else -1])
     place[0] += height
-    reached = reach(place, cells.variance, limits, turned)
+    reached = reach(place, cells.variance, config, turned)
     seen = None
     if reached.any():
-        seen = continued(place[:, reached], cells.variance[reached], height_sd, limits)
+        seen = continued(place[:, reached], cells.variance[reached], height_sd, config)
     if height_sd > 0:
         sure = seen is not None and seen.confidence >= SURE
         reason = _contradiction(height, seen)
@@ -131,12 +132,12 @@ def _upright(
         reason = f'no height is stated, and {size:.1f} m of a surface may be a table'
     if seen is None or not sure:
         confidence = seen.confidence if seen and height_sd > 0 else 0.0
-        stand = Stand(np.zeros(3), confidence, (reason,))
-        return _without_ground(image, cells, seen, stand, known, limits)
+        stand = Stand(np.zeros(3), confidence, (reason,) if seen or height_sd > 0 else ())
+        return _without_ground(image, cells, seen, stand, known, config)
     a, b, c = seen.plane
     lean = np.array([b, c]) @ cells.axes[1:]
     stand = Stand(-(up - lean) / (height - a), seen.confidence)
-    return _with_ground(image, cells, reached, stand, limits, turned)
+    return _with_ground(image, cells, reached, stand, config, turned)
 
 
 def _nearest(above: NDArray[np.float64]) -> float:
@@ -161,7 +162,7 @@ def _with_ground(
     cells: Cells,
     reached: NDArray[np.bool_],
     stand: Stand,
-    limits: Limits,
+    config: Config,
     turned: bool,
 ) -> Terrain:
     """Classes and heights by the ground that was reached, continued."""
@@ -180,17 +181,18 @@ def _with_ground(
     reached, beside = closed > 0, cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
-    least = np.float32(limits.least / 4)
-    near = np.where(reached, np.clip(noise, least, limits.least), np.where(beside, least, -1))
-    lowest = -np.maximum(share * limits.drop, sure)
-    highest = np.maximum(share * limits.obstacle, sure)
+    least = np.float32(config.least_step / 4)
+    near = np.where(reached, np.clip(noise, least, config.least_step), np.where(beside, least, -1))
+    lowest = -np.maximum(share * config.drop_height, sure)
+    highest = np.maximum(share * config.obstacle_height, sure)
     classes, heights = classify(image, field, np.stack([near, lowest, highest], dtype=np.float32))
     kind = np.where(reached & np.isfinite(height), GROUND, UNKNOWN).astype(np.int8)
     kind[height > highest] = OBSTACLE
     kind[height < lowest] = DROP
     # By similar triangles: the ray to a place so high above the ground crosses it farther away.
-    share = 1 + height * np.tensordot(cells.axes[0].astype(np.float32), field.theta, 1)
-    crossing = cells.place[1:] / np.where(share > 0, share, np.float32(np.nan))
+    share = np.float32(1) + height * np.tensordot(cells.axes[0].astype(np.float32), field.theta, 1)
+    share[share <= 0] = np.nan
+    crossing = cells.place[1:] / share
     order = slice(None, None, 1 if turned else -1)
     below = CellTerrain(
         cells.place[:, order], height[order], kind[order], cells.error[order], crossing[:, order]
@@ -204,16 +206,17 @@ def _without_ground(
     seen: Continuation | None,
     stand: Stand,
     known: tuple[float, float],
-    limits: Limits,
+    config: Config,
 ) -> Terrain:
     """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
     height, height_sd = known
-    obstacle = _faces(cells, limits)
+    obstacle = _faces(cells, config)
     if height > 0:
         # What is higher than any step is none, nor the ground by a wrong height.
         apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
         distance = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
+        error = height_sd + np.radians(config.up_sd) * distance
+        bound = config.obstacle_height + apart + _CERTAIN * error
         obstacle |= cells.place[0] + height > bound
     wide = cells.size.enlarged(obstacle, image.shape)
     classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
@@ -221,7 +224,7 @@ def _without_ground(
     return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
 
 
-def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
+def _faces(cells: Cells, config: Config) -> NDArray[np.bool_]:
     """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:
@@ -230,6 +233,6 @@ def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
     way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
     noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
     # Three times as steep as any ground, as what is hidden behind an edge is not.
-    steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
+    steep[1:-1] = rise > 3 * config.steepest * way + noise
     steep[0], steep[-1] = steep[1], steep[-2]
     return steep
