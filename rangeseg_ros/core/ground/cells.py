@@ -29,8 +29,8 @@ from rangeseg_ros.core.significance import OUTLIER
 _ROWS = 120
 # Cells of a block of the ground continued, which is about square.
 _DOWN, _RIGHT = 4, 2
-# The prior counts as so much of a window full of ground.
-_PRIOR = 1 / 4
+# The prior counts as so much of a window full of ground: it decides where little of it is seen.
+_PRIOR = 1 / 16
 
 
 class CellSize(NamedTuple):

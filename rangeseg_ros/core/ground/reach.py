@@ -40,13 +40,12 @@ def reach(
     order = slice(None, None, 1 if turned else -1)
     place, variance, even = place[:, order], variance[order], even[order]
     # Where the ground comes into view, no farther than the robot is wide from the nearest of it,
-    # at the height there that is nearest to 0.
+    # and no step above or below that.
     front, columns = even.argmax(axis=0), np.arange(even.shape[1])
     h, x, y = place[:, front, columns]
     distance = np.where(even.any(axis=0), np.hypot(x, y), np.inf)
     near = distance <= distance.min() + radius
-    level = h[near][np.abs(h[near]).argmin()]
-    start = near & (np.abs(h - level) < step / 2)
+    start = near & (np.abs(h - h[distance.argmin()]) < step / 2)
     reached[front[start], columns[start]] = True
     _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
     return reached[order]
