@@ -14,6 +14,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.ground.estimate import HIGHEST
 from rangeseg_ros.core.significance import CLEARLY, OUTLIER
 
 # Columns on either side whose ground leads to a cell.
@@ -40,12 +41,14 @@ def reach(
     order = slice(None, None, 1 if turned else -1)
     place, variance, even = place[:, order], variance[order], even[order]
     # Where the ground comes into view, no farther than the robot is wide from the nearest of it,
-    # and no step above or below that.
-    front, columns = even.argmax(axis=0), np.arange(even.shape[1])
+    # and no step above or below most of that. It is near height 0, if anything is.
+    begin = even & (np.abs(place[0]) < HIGHEST)
+    begin = begin if begin.any() else even
+    front, columns = begin.argmax(axis=0), np.arange(even.shape[1])
     h, x, y = place[:, front, columns]
-    distance = np.where(even.any(axis=0), np.hypot(x, y), np.inf)
+    distance = np.where(begin.any(axis=0), np.hypot(x, y), np.inf)
     near = distance <= distance.min() + radius
-    start = near & (np.abs(h - h[distance.argmin()]) < step / 2)
+    start = near & (np.abs(h - np.median(h[near])) < step / 2)
     reached[front[start], columns[start]] = True
     _spread(place, variance, even, step / 2, slope, config.ground_gap, radius, reached)
     return reached[order]
