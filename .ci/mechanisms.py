@@ -78,9 +78,8 @@ def _without_distortion_length(original: Any) -> Any:
 
 
 def _near_height_zero(_: Any) -> Any:
-    def near(place: Any, variance: Any, *rest: Any) -> Any:
-        passable = rest[2]
-        return (variance > 0) & (np.abs(place[0]) < passable.step / 2)
+    def near(place: Any, variance: Any, config: Any, *rest: Any) -> Any:
+        return (variance > 0) & (np.abs(place[0]) < config.least_step / 2)
 
     return near
 
@@ -172,11 +171,7 @@ MECHANISMS = (
     # The ground.
     Mechanism('ground reached by a chain', 'ground/reach.py',
               {'ground.terrain.reach': _near_height_zero}, 'terrain'),
-    Mechanism('slopes in any direction', 'ground/reach.py:_find_slopes,_find_steep',
-              {'ground.reach._find_slopes':
-               lambda _: lambda place, variance, *rest: np.zeros(variance.shape, bool)},
-              'terrain'),
-    Mechanism('ground follows what is seen', 'ground/field.py:ground_field,_sums,_halved,_fitted',
+    Mechanism('ground follows what is seen', 'ground/cells.py:ground_field,_sums,_fitted',
               {'ground.terrain.ground_field':
                lambda original: lambda cells, ground, *rest: original(
                    cells, np.zeros_like(ground), *rest)}, 'terrain'),
@@ -184,7 +179,7 @@ MECHANISMS = (
               {'ground.terrain.SURE': 0.0}, 'terrain'),
     Mechanism('steep faces are obstacles', 'ground/terrain.py:_faces',
               {'ground.terrain._faces':
-               lambda _: lambda cells, limits: np.zeros(cells.inverse.shape, bool)}, 'terrain'),
+               lambda _: lambda cells, config: np.zeros(cells.inverse.shape, bool)}, 'terrain'),
     # Ids.
     Mechanism('camera motion by the planes', 'tracking/tracker.py:_camera_motion',
               {'tracking.tracker._camera_motion': _returning((np.eye(3), np.zeros(3)))}, 'tracks'),

@@ -225,6 +225,16 @@ class Config:
         return (self.up_x, self.up_y, self.up_z) == (0, -1, 0)
 
     @property
+    def least_step(self) -> float:
+        """The least step that is none of the ground, metres."""
+        return min(self.obstacle_height, self.drop_height)
+
+    @property
+    def steepest(self) -> float:
+        """Tangent of the steepest ground."""
+        return math.tan(math.radians(self.ground_slope))
+
+    @property
     def map_frame(self) -> str:
         """Frame of the map of planes; empty when there is none."""
         return self.fixed_frame or (self.odometry_frame if self.odometry else '')

@@ -12,7 +12,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
-from rangeseg_ros.core.ground.survey import Survey, grid_options
+from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
@@ -22,6 +22,9 @@ from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.tracker import Tracker
+
+# Parameters of which a grid of the ground is made.
+_OF_GRIDS = 'grid_resolution', 'grid_size'
 
 
 class SequenceSegmenter:
@@ -49,7 +52,7 @@ class SequenceSegmenter:
         self.pose: Transform | None = None
         self.motion: Motion | None = None
         self._odometry = PlaneOdometry(self.config)
-        self._ground = GroundMemory(grid_options(self.config))
+        self._ground = GroundMemory(self.config)
         self._stamp = 0
         self._pose: Transform | None = None
 
@@ -67,9 +70,10 @@ class SequenceSegmenter:
             self._pose = None
         if (config.odometry, config.odometry_frame) != (before.odometry, before.odometry_frame):
             self._odometry, self.motion = PlaneOdometry(config), None
-        if moved or grid_options(config) != grid_options(before):
-            self._ground = GroundMemory(grid_options(config))
         self._tracker.config = self._odometry.config = self.map.config = config
+        if moved or any(getattr(config, n) != getattr(before, n) for n in _OF_GRIDS):
+            self._ground = GroundMemory(config)
+        self._ground.config = config
 
     def segment(
         self,

@@ -60,7 +60,7 @@ def _points(
     def pick(image: RangeImage, result: Segmentation) -> NDArray[np.float32]:
         if result.ground is None:
             return np.zeros((0, 4), np.float32)
-        size = result.survey.cloud_resolution if isinstance(result.survey, Survey) else 0.0
+        size = result.survey.config.cloud_resolution if isinstance(result.survey, Survey) else 0.0
         return points.thinned(find(image, result.ground), size, most)
 
     return Output(CLOUD, clouds.points_message, pick)

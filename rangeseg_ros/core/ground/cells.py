@@ -1,7 +1,12 @@
-"""Cells of a few pixels: what the ground is looked for in.
+"""Cells of a few pixels: what the ground is looked for in, and continued in.
 
 A cell is the mean of its pixels, which for a plane is a point of the plane: theta . ray = inverse
 is linear. Cells are wider than high, because the ground recedes along the columns.
+
+The ground continued is a plane for every cell. Each block's plane is fitted to the ground in a
+window around it, with that of the whole image as its prior, whose own is the plane under the robot
+(ridge regressions): where the ground is seen, it follows undulation and distortion; where it is
+not, it goes on straight.
 """
 
 from __future__ import annotations
@@ -13,16 +18,19 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.sensing.moments import ray_of
+from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
-WINDOW = 9
-"""Side of the square, in cells, over which the slope of the ground is measured."""
+# Cells of a block of the ground continued, which is about square.
+_DOWN, _RIGHT = 4, 2
+# The prior counts as so much of a window full of ground: it decides where little of it is seen.
+_PRIOR = 1 / 16
 
 
 class CellSize(NamedTuple):
@@ -46,23 +54,13 @@ class CellSize(NamedTuple):
 class Cells(NamedTuple):
     """Means of the pixels of cells, (rows, columns).
 
-    Attributes
-    ----------
-    ray : (3, ...) float32
-        Mean ray of the measured pixels.
-    inverse : (...) float32
-        Their mean inverse range, 1/m; 0 where less than half of them are measured.
-    place : (3, ...) float32
-        Height above the sensor along up, and position along two horizontal directions, metres;
-        NaN where not measured.
-    error : (...) float32
-        Standard deviation of the height of a pixel, metres: by the sensor model, or by how much
-        neighbouring pixels differ where that is more, as it is on grass and gravel.
-    variance : (...) float64
-        Of the mean height, metres^2; 0 where not measured, and where the pixels are of two
-        surfaces: they differ by more than by noise.
-    shared : (...) float64
-        How many times that variance a slope over `WINDOW` cells errs, by what cells share.
+    `ray` (3, ...) and `inverse` (...) range, 1/m, of the measured pixels, 0 where less than half
+    of them are; `place` (3, ...) on `axes` (3, 3), height above the sensor along up and position
+    along two horizontal directions, metres, NaN where not measured. `error` is the standard
+    deviation of the height of a pixel, metres: by the sensor model, or by how much neighbouring
+    pixels differ where that is more, as it is on grass and gravel. `variance` is that of the mean
+    height, 0 where not measured and where pixels are of two surfaces: they differ by more than by
+    noise.
     """
 
     ray: NDArray[np.float32]
@@ -70,7 +68,8 @@ class Cells(NamedTuple):
     place: NDArray[np.float32]
     error: NDArray[np.float32]
     variance: NDArray[np.float64]
-    shared: NDArray[np.float64]
+    size: CellSize
+    axes: NDArray[np.float64]
 
 
 def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,27 +80,16 @@ def axes_of(up: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.array([up, ahead, np.cross(up, ahead)])
 
 
-def cells_of(
-    image: RangeImage, size: CellSize, up: NDArray[np.float64], sensor: SensorModel
-) -> Cells:
-    """Cells of an image.
-
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    size : CellSize
-    up : (3,) float64
-        Unit vector in the frame of the image.
-    sensor : SensorModel
-    """
+def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) -> Cells:
+    """Cells of an image; `up` (3,) is a unit vector in its frame."""
+    size, axes = CellSize.for_image(image.shape), axes_of(up)
     shape = -(-image.shape[0] // size.rows), -(-image.shape[1] // size.columns)
     values = np.empty((6, *shape), np.float32)
     ray, inverse, scatter = values[:3], values[3], values[4:]
     means = ray, inverse, scatter
     run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
-        place = np.tensordot(axes_of(up).astype(np.float32), ray, 1) / inverse
+        place = np.tensordot(axes.astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
         # The median: a cell on a jump edge scatters by more than noise.
         variance = np.maximum(random_variance(sensor, inverse**2), cv2.medianBlur(scatter[0], 5))
@@ -109,13 +97,7 @@ def cells_of(
     whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
     of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
-    # Noise that neighbours share counts once, and smooth distortion is a slope: the gradient of a
-    # field smoothed by a Gaussian is 1 / (sqrt(2) length) of the field, per pixel.
-    pixels = size.rows * size.columns
-    alike = max(4 * np.pi * sensor.correlation**2 / pixels, 1.0)
-    bend = WINDOW**4 * pixels / (24 * sensor.distortion_length**2)
-    shared = alike + bend * systematic_variance(sensor, inverse**2) / (variance * share)
-    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, shared)
+    return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -163,3 +145,141 @@ def _means(
             scatter[0, i, c] = squares / (2 * pairs) if pairs > 0 else np.float32(0)
             falls -= fall * fall / max(below, 1)
             scatter[1, i, c] = falls / (2 * max(below - 1, 1))
+
+
+class GroundField(NamedTuple):
+    """The ground continued, by planes of cells: theta (3, rows, columns) . ray = inverse range."""
+
+    theta: NDArray[np.float32]
+    size: CellSize
+    up: NDArray[np.float64]
+
+    def turned(self) -> GroundField:
+        """Of the image with rows and columns exchanged."""
+        theta = np.ascontiguousarray(self.theta.transpose(0, 2, 1))
+        return GroundField(theta, CellSize(self.size.columns, self.size.rows), self.up)
+
+    def heights(self, cells: Cells) -> NDArray[np.float32]:
+        """Heights (rows, columns) of cells above the ground, metres; NaN where not measured."""
+        along = (self.theta * cells.ray).sum(axis=0)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            below = cells.inverse * np.tensordot(self.up.astype(np.float32), self.theta, 1)
+            heights: NDArray[np.float32] = (along - cells.inverse) / below
+        heights[cells.inverse == 0] = np.nan
+        return heights
+
+
+def ground_field(
+    cells: Cells, ground: NDArray[np.bool_], base: NDArray[np.float64]
+) -> GroundField:
+    """The ground continued, from its cells (rows, columns) and the plane (3,) under the robot."""
+    sums = _sums(cells.ray, cells.inverse, ground)
+    whole = _fitted(sums.sum(axis=(1, 2), keepdims=True), base)
+    theta = _fitted(sums, whole[0, 0])
+    rows, columns = ground.shape
+    large = (theta.shape[1] * _RIGHT, theta.shape[0] * _DOWN)
+    spread = cv2.resize(theta, large, interpolation=cv2.INTER_LINEAR)[:rows, :columns]
+    planes = np.ascontiguousarray(spread.transpose(2, 0, 1), np.float32)
+    return GroundField(planes, cells.size, cells.axes[0])
+
+
+@njit(cache=True, nogil=True)
+def _sums(
+    ray: NDArray[np.float32], inverse: NDArray[np.float32], ground: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Sums (2, M, N, 9) over blocks, of the ground and of all that is measured.
+
+    They are those of the regression: ray ray^T (xx, xy, xz, yy, yz, zz) and ray * inverse.
+    """
+    rows, columns = ground.shape
+    sums = np.zeros((2, -(-rows // _DOWN), -(-columns // _RIGHT), 9))
+    for i in range(rows):
+        for c in range(columns):
+            s = inverse[i, c]
+            if s > 0:
+                x, y, z = ray[0, i, c], ray[1, i, c], ray[2, i, c]
+                entries = (x * x, x * y, x * z, y * y, y * z, z * z, x * s, y * s, z * s)
+                for n in range(9):
+                    sums[1, i // _DOWN, c // _RIGHT, n] += entries[n]
+                    if ground[i, c]:
+                        sums[0, i // _DOWN, c // _RIGHT, n] += entries[n]
+    return sums
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _fitted(sums: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Planes (M, N, 3) that fit the ground in windows of 3 x 3 blocks and all rays on plane p."""
+    _, rows, columns, _ = sums.shape
+    theta = np.empty((rows, columns, 3))
+    g, s = np.empty(9), np.empty(9)
+    for i in range(rows):
+        for j in range(columns):
+            g[:], s[:] = 0, 0
+            for k in range(max(i - 1, 0), min(i + 2, rows)):
+                for m in range(max(j - 1, 0), min(j + 2, columns)):
+                    g += sums[0, k, m]
+                    s += sums[1, k, m]
+            theta[i, j] = p
+            total = g + _PRIOR * s
+            # What the ground is off the prior plane.
+            x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]
+            y = g[7] - g[1] * p[0] - g[3] * p[1] - g[4] * p[2]
+            z = g[8] - g[2] * p[0] - g[4] * p[1] - g[5] * p[2]
+            a, b, c, d, e, f = total[0], total[1], total[2], total[3], total[4], total[5]
+            aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
+            if g[0] + g[3] + g[5] != 0 and determinant > 1e-13 * a * d * f:
+                theta[i, j, 0] += (aa * x + bb * y + cc * z) / determinant
+                theta[i, j, 1] += (bb * x + dd * y + ee * z) / determinant
+                theta[i, j, 2] += (cc * x + ee * y + ff * z) / determinant
+    return theta
+
+
+def classify(
+    image: RangeImage, field: GroundField, bounds: NDArray[np.float32]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Class, 0 where not measured, and height above the ground, metres, of every pixel (H, W).
+
+    By `bounds` (3, rows, columns) of the cells, metres: up to the first off the ground a pixel is
+    ground, below the second a drop, above the third an obstacle, and these count more than the
+    first. Heights are NaN where not measured.
+    """
+    classes, heights = np.empty(image.shape, np.uint8), np.empty(image.shape, np.float32)
+    rise = np.tensordot(field.up.astype(np.float32), field.theta, 1)
+    run_rows(_classify, bounds.shape[1], image.inverse, image.rays, image.pinhole, field.theta,
+             rise, field.size, bounds, classes, heights)  # fmt: skip
+    return classes, heights
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _classify(
+    first: int,
+    after: int,
+    inverse: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    pinhole: bool,
+    theta: NDArray[np.float32],
+    rise: NDArray[np.float32],
+    size: CellSize,
+    bounds: NDArray[np.float32],
+    classes: NDArray[np.uint8],
+    heights: NDArray[np.float32],
+) -> None:
+    """Of rows first...after of cells."""
+    height, width = inverse.shape
+    for i in range(first, after):
+        for v in range(i * size.rows, min((i + 1) * size.rows, height)):
+            for c in range(rise.shape[1]):
+                a, b, d, up = theta[0, i, c], theta[1, i, c], theta[2, i, c], rise[i, c]
+                flat, lowest, highest = bounds[0, i, c], bounds[1, i, c], bounds[2, i, c]
+                low, high = max(-flat, lowest), min(flat, highest)
+                for j in range(c * size.columns, min((c + 1) * size.columns, width)):
+                    x, y, z = ray_of(rays, pinhole, v, j)
+                    s = inverse[v, j]
+                    h = (a * x + b * y + d * z - s) / (s * up) if s > 0 else np.float32(np.nan)
+                    heights[v, j] = h
+                    # All of them are false where nothing was measured.
+                    classes[v, j] = (
+                        np.uint8((h >= low) & (h <= high)) * GROUND
+                        + np.uint8(h > highest) * OBSTACLE
+                        + np.uint8(h < lowest) * DROP
+                    )

@@ -14,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import Config
+
 # Metres of ground, from where it begins, that are continued to below the camera: each doubles the
 # one before. A short one is right where a ramp begins, a long one where the ground undulates.
 _WAYS = (0.4, 0.8, 1.6, 3.2)
@@ -24,15 +26,8 @@ _STEPS, HIGHEST = 0.1, 0.35
 class Stand(NamedTuple):
     """Where a robot stands.
 
-    Attributes
-    ----------
-    theta : (3,) float64
-        Plane of the ground under the robot: theta . ray is its inverse range; zeros where that is
-        not known.
-    confidence : float
-        0...1: probability that the ground seen is the one that the robot stands on.
-    reasons : tuple of str
-        What contradicts, in words.
+    The plane of the ground under it, theta . ray = inverse range, zeros where it is not known; the
+    probability that the ground seen is the one it stands on; and what contradicts, in words.
     """
 
     theta: NDArray[np.float64]
@@ -52,22 +47,13 @@ class Stand(NamedTuple):
 class Continuation(NamedTuple):
     """The ground that is seen, continued to below the camera, against the one that is stated.
 
-    Attributes
-    ----------
-    plane : (a, b, c)
-        Of the ground seen, above the stated ground.
-    error : float
-        Standard deviation of a, that of the stated height included, metres.
-    confidence : float
-        That there is no step out of view between the robot and the ground it sees.
-    size : float
-        The longer side of the rectangle around the ground seen, metres.
+    `plane` is (a, b, c), `error` the standard deviation of a, that of the stated height included,
+    metres, and `confidence` the probability that there is no step out of view.
     """
 
     plane: tuple[float, float, float]
     error: float
     confidence: float
-    size: float
 
 
 def no_step(a: float, sd: float, least: float) -> float:
@@ -82,45 +68,30 @@ def no_step(a: float, sd: float, least: float) -> float:
 
 
 def continued(
-    place: NDArray[np.float64],
-    variance: NDArray[np.float64],
-    height_sd: float,
-    slope: float,
-    least: float,
+    place: NDArray[np.float64], variance: NDArray[np.float64], height_sd: float, config: Config
 ) -> Continuation:
     """The ground seen, continued to below the camera by the scale at which it agrees best.
 
-    Parameters
-    ----------
-    place : (3, N) float64
-        Of the cells of the ground: heights above the stated ground, metres. At least one.
-    variance : (N,) float64
-        Of a cell's height, if all that errs alike were one measurement, metres^2.
-    height_sd : float
-        Standard deviation of the stated height, metres.
-    slope : float
-        Tangent of the steepest ground.
-    least : float
-        The least step, metres.
+    `place` (3, N) of cells of the ground is height above the stated ground and horizontal
+    position, metres, `variance` (N,) that of a height, and `height_sd` the standard deviation of
+    the stated height. At least one cell.
     """
     h, x, y = place
     distance = np.hypot(x, y)
     start = float(np.partition(distance, len(distance) // 100)[len(distance) // 100])
-    size = float(max(np.ptp(x), np.ptp(y)))
     terms = np.stack([np.ones(len(x)), x, y, h])
+    weighted = terms / (4 * variance)  # of a height, if all that errs alike were one measurement
+    # The ground is level where it does not show its slope.
+    prior = np.diag([1e-6, *2 * [4 / max(config.steepest, 1e-3) ** 2]])
     found = []
     for way in _WAYS:
-        near = distance <= start + way
-        rows, weight = terms[:, near], 1 / variance[near]
-        sums = (rows * weight) @ rows.T
-        # The ground is level where it does not show its slope.
-        covariance = np.linalg.inv(sums[:3, :3] + np.diag([1e-6, *2 * [(2 / slope) ** 2]]))
+        sums = (weighted * (distance <= start + way)) @ terms.T
+        covariance = np.linalg.inv(sums[:3, :3] + prior)
         plane = covariance @ sums[:3, 3]
         # What the ground is off its plane goes on unseen: it tells two points, a way apart.
-        residual = rows[3] - plane @ rows[:3]
-        bent = (1 + 2 * start / way) * math.sqrt(weight @ residual**2 / sums[0, 0])
+        off = np.append(-plane, 1)
+        bent = (1 + 2 * start / way) * math.sqrt(max(off @ sums @ off, 0) / sums[0, 0])
         sd = math.sqrt(height_sd**2 + covariance[0, 0] + bent**2)
-        confidence = no_step(float(plane[0]), sd, least)
         a, b, c = map(float, plane)
-        found.append(Continuation((a, b, c), sd, confidence, size))
+        found.append(Continuation((a, b, c), sd, no_step(a, sd, config.least_step)))
     return max(found, key=lambda one: one.confidence)

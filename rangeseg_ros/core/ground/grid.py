@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import axes_of
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
@@ -21,33 +22,6 @@ from rangeseg_ros.core.significance import OUTLIER
 # Log-odds that a sight of danger adds, that one of ground takes away, and their bounds: those of
 # OctoMap.
 _HIT, _MISS, _BOUNDS = 0.85, 0.4, (-2.0, 3.5)
-_LAYERS = '_odds', '_height', '_variance', '_danger', '_seen'
-# Points between a cell of the ground and the next one in its column: far away, rows are far apart.
-_BETWEEN = 4
-
-
-class GridOptions(NamedTuple):
-    """How large the grid is.
-
-    Attributes
-    ----------
-    resolution : float
-        Side of a cell, metres.
-    size : float
-        Side of the grid, metres.
-    memory : float
-        Seconds after which a cell that is not seen is forgotten.
-    clearance : float
-        What hangs higher above the ground is not in the way, metres.
-    patience : float
-        Seconds for which the height of the camera holds while no ground is seen.
-    """
-
-    resolution: float
-    size: float
-    memory: float
-    clearance: float
-    patience: float
 
 
 class GroundGrid(NamedTuple):
@@ -90,15 +64,10 @@ def empty_grid() -> GroundGrid:
 
 
 class GroundMemory:
-    """What one camera has seen of the ground: the grid, and how high it is above the ground.
+    """What one camera has seen of the ground: the grid, and how high it is above the ground."""
 
-    Parameters
-    ----------
-    options : GridOptions
-    """
-
-    def __init__(self, options: GridOptions) -> None:
-        self.options = options
+    def __init__(self, config: Config) -> None:
+        self.config = config
         self.forget()
 
     def forget(self) -> None:
@@ -109,18 +78,17 @@ class GroundMemory:
     def recall_height(self, stamp: int) -> float:
         """The height, metres, as it was found last; 0 for unknown."""
         age = stamp - self._height_stamp
-        return self._height_found if age <= 1e9 * self.options.patience else 0.0
+        return self._height_found if age <= 1e9 * self.config.track_time else 0.0
 
     def keep_height(self, height: float, stamp: int) -> None:
         """Take a height that was found, metres, in the image of a time, nanoseconds."""
         self._height_found, self._height_stamp = height, stamp
 
     def _forget_grid(self) -> None:
-        count = max(round(self.options.size / self.options.resolution), 1)
-        shape = count, count
-        self._odds, self._height, self._variance = np.zeros((3, *shape))
-        self._danger = np.zeros(shape, np.uint8)
-        self._seen = np.full(shape, -np.inf)
+        """Have layers (5, N, N) of nothing: odds, height, variance, danger, second last seen."""
+        count = max(round(self.config.grid_size / self.config.grid_resolution), 1)
+        self._layers = np.zeros((5, count, count))
+        self._layers[4] = -np.inf
         self._corner = np.zeros(2, np.int64)
 
     def add(
@@ -132,24 +100,12 @@ class GroundMemory:
         pose: tuple[NDArray[np.float64], NDArray[np.float64]] | None,
         frame: str = '',
     ) -> GroundGrid:
-        """The grid with what an image shows.
+        """The grid with the terrain of an image taken at `stamp`, nanoseconds.
 
-        Parameters
-        ----------
-        terrain : Terrain
-            Of the image.
-        up : (3,) float64
-            Unit vector in the frame of the image.
-        stamp : int
-            When the image was taken, nanoseconds.
-        place : (3,) float64
-            Of the sensor in the frame of the image, metres.
-        pose : (rotation (3, 3), shift (3,)) or None
-            Fixed frame, with z up, from the frame of the image with the sensor as its origin.
-        frame : str
-            Name of the fixed frame.
+        `up` and `place` (3,) of the sensor are in the frame of the image; `pose` (rotation, shift)
+        leads from there, with the sensor as origin, to the fixed frame named `frame`, with z up.
         """
-        side, seconds = self.options.resolution, stamp * 1e-9
+        side, seconds = self.config.grid_resolution, stamp * 1e-9
         axes = axes_of(up)[[1, 2, 0]]  # ahead, left, up
         fixed = pose is not None and (pose[0] @ up)[2] > np.cos(np.pi / 4)
         rotation, shift = pose if fixed and pose else (axes, np.zeros(3))
@@ -158,20 +114,21 @@ class GroundMemory:
         self._move_to(shift)
         if terrain.cells is not None:
             turn = rotation @ axes.T
-            for danger, points, variance in _evidence(terrain.cells, self.options.clearance):
-                self._count(danger, points @ turn.T + shift, variance, seconds)
-        age = seconds - self._seen
-        known = age <= self.options.memory
+            for kind, points, errors in _evidence(terrain.cells, self.config):
+                self._count(kind, points @ turn.T + shift, errors, seconds)
+        odds, height, variance, danger, seen = self._layers
+        age = seconds - seen
+        known = age <= self.config.grid_memory
         level = terrain.stand.height(up)
         origin = np.append(self._corner * side, shift[2] - (0 if np.isnan(level) else level))
         if not fixed:
             origin = axes.T @ origin + place
-        classes = np.where(self._odds > 0, self._danger, np.where(self._odds < 0, GROUND, UNKNOWN))
-        ground = known & (self._variance > 0)
+        classes = np.where(odds > 0, danger, np.where(odds < 0, GROUND, UNKNOWN))
+        ground = known & (variance > 0)
         return GroundGrid(
             np.where(known, classes, UNKNOWN).astype(np.uint8),
-            np.where(ground, self._height, np.nan).astype(np.float32),
-            np.where(ground, self._variance, np.nan).astype(np.float32),
+            np.where(ground, height, np.nan).astype(np.float32),
+            np.where(ground, variance, np.nan).astype(np.float32),
             np.where(known, age, np.inf).astype(np.float32),
             side,
             origin,
@@ -179,74 +136,81 @@ class GroundMemory:
             frame if fixed else '',
         )
 
+    def _cells_of(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Numbers (..., 2) of the cells of points."""
+        return np.floor(points[..., :2] / self.config.grid_resolution).astype(np.int64)
+
     def _move_to(self, centre: NDArray[np.float64]) -> None:
         """Have the grid around a place; what leaves it is forgotten."""
-        before = self._corner
-        kept = {name: getattr(self, name) for name in _LAYERS}
+        before, kept = self._corner, self._layers
         self._forget_grid()
-        count = len(self._odds)
-        self._corner = np.floor(centre[:2] / self.options.resolution).astype(np.int64) - count // 2
+        count = kept.shape[1]
+        self._corner = self._cells_of(centre) - count // 2
         x, y = np.clip(self._corner - before, -count, count)
         # Of the old grid, the cells that are in the new one.
         old = slice(max(y, 0), count + min(y, 0)), slice(max(x, 0), count + min(x, 0))
         new = slice(max(-y, 0), count + min(-y, 0)), slice(max(-x, 0), count + min(-x, 0))
-        for name, values in kept.items():
-            getattr(self, name)[new] = values[old]
+        self._layers[(slice(None), *new)] = kept[(slice(None), *old)]
 
     def _count(
         self,
-        danger: int,
+        kind: int,
         points: NDArray[np.float64],
-        variance: NDArray[np.float64],
+        errors: NDArray[np.float64],
         seconds: float,
     ) -> None:
-        """Add points (N, 3) of the ground, or of a kind of danger, and what their heights err."""
-        count = len(self._odds)
-        index = np.floor(points[:, :2] / self.options.resolution).astype(np.int64) - self._corner
+        """Add points (N, 3) of the ground, or of a kind of danger; variances (N,) of heights."""
+        odds, height, variance, danger, seen = (layer.reshape(-1) for layer in self._layers)
+        count = self._layers.shape[1]
+        index = self._cells_of(points) - self._corner
         inside = ((index >= 0) & (index < count)).all(axis=1)
-        cell = index[inside, 1] * count + index[inside, 0]
-        number = np.bincount(cell, minlength=count * count).reshape(count, count)
-        hit = number > 0
-        self._seen[hit] = seconds
-        if danger != GROUND:
-            self._danger[hit] = danger
-            self._odds[hit] = np.minimum(np.maximum(self._odds[hit], 0) + _HIT, _BOUNDS[1])
+        cells = index[inside, 1] * count + index[inside, 0]
+        number = np.bincount(cells, minlength=count * count)
+        hit = np.flatnonzero(number)
+        seen[hit] = seconds
+        if kind != GROUND:
+            danger[hit] = kind
+            odds[hit] = np.minimum(np.maximum(odds[hit], 0) + _HIT, _BOUNDS[1])
             return
-        self._odds[hit] = np.maximum(self._odds[hit] - _MISS, _BOUNDS[0])
-        height, square = (
-            np.bincount(cell, values[inside], minlength=count * count).reshape(count, count)[hit]
-            / number[hit]
-            for values in (points[:, 2], variance)
+        odds[hit] = np.maximum(odds[hit] - _MISS, _BOUNDS[0])
+        mean, square = (
+            np.bincount(cells, values[inside])[hit] / number[hit]
+            for values in (points[:, 2], errors)
         )
-        old, before = self._height[hit], self._variance[hit]
+        old, before = height[hit], variance[hit]
         # A Kalman filter; what differs by more than it errs begins anew.
-        anew = (before == 0) | ((height - old) ** 2 > OUTLIER**2 * (before + square))
+        anew = (before == 0) | ((mean - old) ** 2 > OUTLIER**2 * (before + square))
         gain = np.where(anew, 1.0, before / np.maximum(before + square, 1e-12))
-        self._height[hit] = old + gain * (height - old)
-        self._variance[hit] = np.where(anew, square, (1 - gain) * before)
+        height[hit] = old + gain * (mean - old)
+        variance[hit] = np.where(anew, square, (1 - gain) * before)
 
 
 def _evidence(
-    cells: CellTerrain, clearance: float
+    cells: CellTerrain, config: Config
 ) -> list[tuple[int, NDArray[np.float64], NDArray[np.float64]]]:
     """Classes, points (N, 3) on axes ahead, left, up, metres, and the variances of their heights.
 
-    Ground first, so that danger in the same cell counts more. A drop is where the ground ends: its
-    rays cross the ground continued.
+    Ground first, so that danger in the same cell counts more; far away its rows are far apart,
+    and it is there between them as well. A drop is where the ground ends: its rays cross the
+    ground continued.
     """
     place = cells.place[[1, 2, 0]].astype(np.float64)
     variance = cells.error.astype(np.float64) ** 2
     ground = cells.kind == GROUND
     both = ground[1:] & ground[:-1]
-    share = np.arange(_BETWEEN) / _BETWEEN
-    low, high = place[:, 1:][:, both], place[:, :-1][:, both]
-    between = low[..., None] + share * (high - low)[..., None]
-    points = np.concatenate([place[:, ground], between.reshape(3, -1)], axis=1)
-    errors = np.concatenate([variance[ground], np.repeat(variance[1:][both], _BETWEEN)])
-    found = [(GROUND, points.T, errors)]
-    obstacle = (cells.kind == OBSTACLE) & (cells.height < clearance)
-    found.append((OBSTACLE, place[:, obstacle].T, variance[obstacle]))
+    near, far = place[:, :-1][:, both], place[:, 1:][:, both]
+    way = np.hypot(*(far - near)[:2])
+    number = np.maximum(np.ceil(way / config.grid_resolution), 1).astype(np.int64)
+    pair = np.repeat(np.arange(len(number)), number)
+    share = (np.arange(len(pair)) - np.repeat(number.cumsum() - number, number)) / number[pair]
+    between = near[:, pair] + share * (far - near)[:, pair]
+    points = np.concatenate([place[:, ground], between], axis=1)
+    errors = np.concatenate([variance[ground], variance[1:][both][pair]])
+    obstacle = (cells.kind == OBSTACLE) & (cells.height < config.grid_clearance)
     drop = (cells.kind == DROP) & np.isfinite(cells.crossing).all(axis=0)
     crossing = np.concatenate([cells.crossing, np.zeros((1, *drop.shape))])
-    found.append((DROP, crossing[:, drop].T, variance[drop]))
-    return found
+    return [
+        (GROUND, points.T, errors),
+        (OBSTACLE, place[:, obstacle].T, variance[obstacle]),
+        (DROP, crossing[:, drop].T, variance[drop]),
+    ]

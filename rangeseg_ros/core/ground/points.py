@@ -6,15 +6,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from rangeseg_ros.core.description.outlines import TOLERANCE
 from rangeseg_ros.core.ground.classes import DROP, GROUND
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.clouds import completed_rays
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
+# Points of a thinned cloud: as many as layers of costmaps take in the time of a frame.
 MOST_POINTS = 20_000
-"""Points of a thinned cloud: as many as layers of costmaps take in the time of a frame."""
-# Pixels that an outline may differ from the border of the ground.
-_TOLERANCE = 2.0
 
 
 def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[np.float32]:
@@ -32,15 +31,10 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[n
 def thinned(
     points: NDArray[np.float32], resolution: float, most: int = MOST_POINTS
 ) -> NDArray[np.float32]:
-    """One point of each cube that has any, with larger cubes where there are still too many.
+    """One of the points (N, K), that begin with x, y, z, of each cube that has any.
 
-    Parameters
-    ----------
-    points : (N, K) float32
-        x, y, z and more.
-    resolution : float
-        Side of the cubes, metres; 0 for all points.
-    most : int
+    Cubes have sides of `resolution` metres, 0 for all points, and are larger where more than
+    `most` points would be left.
     """
     while resolution > 0 and len(points):
         cubes = np.floor(points[:, :3] / resolution).astype(np.int64)
@@ -111,13 +105,12 @@ def _cross(
     columns: NDArray[np.intp],
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Where rays meet the ground (N, 3), and their inverse range there, > 0 where they do."""
-    field = terrain.field
-    theta = field.theta[:, rows // field.size.rows, columns // field.size.columns].T
+    theta, size = terrain.field.theta, terrain.field.size
     rays = rays[rows, columns]
-    inverse = (theta * rays).sum(axis=1)
+    inverse = (theta[:, rows // size.rows, columns // size.columns].T * rays).sum(axis=1)
     with np.errstate(divide='ignore', invalid='ignore'):
         points = rays / inverse[:, None] + image.place
-    return points.astype(np.float32), inverse.astype(np.float32)
+    return points.astype(np.float32), inverse
 
 
 def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
@@ -126,7 +119,7 @@ def outlines(image: RangeImage, terrain: Terrain) -> list[NDArray[np.float32]]:
     rings, _ = cv2.findContours(ground, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     lines = []
     for ring in rings:
-        line = cv2.approxPolyDP(ring, _TOLERANCE, True)[:, 0]
+        line = cv2.approxPolyDP(ring, TOLERANCE, True)[:, 0]
         if len(line) > 2:  # holes of single pixels have no outline
             points, inverse = _cross(image.rays, image, terrain, line[:, 1], line[:, 0])
             lines.append(points[inverse > 0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +17,6 @@ from rangeseg_ros.core.significance import CLEARLY
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
 """All roles; their indices are their numbers in messages."""
-# Largest tilt that is looked for, degrees: beyond, a floor is nearer to a wall.
-_LARGEST = 45.0
 
 
 class RolesError(ValueError):
@@ -25,11 +24,11 @@ class RolesError(ValueError):
 
 
 def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) -> list[str]:
-    """Role of each plane.
+    """Role of each plane of an image.
 
     A plane is horizontal when its normal is within `role_tolerance` of up (facing up) or down
-    (facing down), vertical when it is within `role_tolerance` of a right angle to it. The size
-    of a plane is that of its surface, so that all parts of a floor count together.
+    (facing down), vertical when it is within `role_tolerance` of a right angle to it. A surface is
+    large from the area `role_area` on, and all parts of a floor count together.
 
     - floor: the large surface facing up at `sensor_height` below the sensor, within
       `role_height`; without a height, the one that reaches nearest to below the sensor; and all
@@ -43,20 +42,8 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
     - wall: large vertical planes
     - other: the rest
 
-    Parameters
-    ----------
-    planes : sequence of Plane
-        Of one image.
-    config : Config
-        `role_tolerance`, `role_height`, `role_area`: the area from which a surface is large;
-        `ground_slope`, `sensor_height`, and `up_x`, `up_y`, `up_z`.
-    up : (3,) float, optional
-        Direction, of any length, in the frame of the image; the configured one when not given.
-
-    Raises
-    ------
-    RolesError
-        `up` is zero, not finite or not a vector.
+    `up` (3,), of any length, in the frame of the image, is the configured one when not given;
+    RolesError where it is zero, not finite or not a vector.
     """
     if not planes:
         return []
@@ -70,22 +57,22 @@ def roles(planes: Sequence[Plane], config: Config, up: ArrayLike | None = None) 
 
     found = np.full(len(planes), 'other', dtype='<U7')
     found[large & (np.abs(rise) <= config.role_tolerance)] = 'wall'
-    ceiling = _farthest(planes, downward & large)
-    if ceiling:
-        offset = _offsets(planes, ceiling)
+    high = _largest(planes, downward & large)
+    if high:
+        offset = _offsets(planes, max(high, key=lambda plane: plane.distance))
         found[downward & (np.abs(offset) <= config.role_height)] = 'ceiling'
-    floor = _floor(planes, upward & large, up, config)
+    floor = _floor(_largest(planes, upward & large), up, config)
     if floor:
         offset = _offsets(planes, floor)
-        found[upward & (offset > config.role_height)] = 'step'
+        found[upward] = 'step'
         found[upward & (offset > RISE[1])] = 'table'
         found[upward & (offset < -config.role_height)] = 'lower'
         found[upward & (np.abs(offset) <= config.role_height)] = 'floor'
         slope = np.degrees(np.arccos(np.clip(normal @ floor.normal, -1, 1)))
         ramp = (slope > 2 * config.up_sd) & (slope <= config.ground_slope)
         for k in map(int, np.flatnonzero(ramp)):
-            foot = np.abs(corners_of(planes[k]) @ floor.normal + floor.distance).min()
-            if foot <= config.role_height:
+            off = np.abs(corners_of(planes[k]) @ floor.normal + floor.distance)
+            if off.min() <= config.role_height:
                 found[k] = 'ramp'
     return [str(role) for role in found]
 
@@ -99,17 +86,15 @@ def unit(direction: ArrayLike) -> NDArray[np.float64]:
     return vector / length
 
 
-def _floor(
-    planes: Sequence[Plane], candidates: NDArray[np.bool_], up: NDArray[np.float64], config: Config
-) -> Plane | None:
-    """The largest plane of the surface that is the floor."""
-    largest = _largest(planes, candidates)
+def _floor(candidates: list[Plane], up: NDArray[np.float64], config: Config) -> Plane | None:
+    """The floor, by where planes meet the vertical through the sensor or how near they reach."""
     if config.sensor_height > 0:
-        # Where the plane meets the vertical through the sensor.
-        depth = [plane.distance / (plane.normal @ up) for plane in largest]
-        off = np.abs(np.array(depth) - config.sensor_height)
-        near = np.flatnonzero(off <= config.role_height)
-        return largest[near[off[near].argmin()]] if len(near) else None
+
+        def off(plane: Plane) -> float:
+            return abs(float(plane.distance / (plane.normal @ up)) - config.sensor_height)
+
+        nearest = min(candidates, key=off, default=None)
+        return nearest if nearest and off(nearest) <= config.role_height else None
 
     def reach(plane: Plane) -> float:
         corners = corners_of(plane)
@@ -117,21 +102,13 @@ def _floor(
         across = np.linalg.norm(corners + depth[:, None] * up, axis=1)
         return float((across / np.maximum(depth, 1e-3)).min())
 
-    return min(largest, key=reach, default=None)
+    return min(candidates, key=reach, default=None)
 
 
-def _farthest(planes: Sequence[Plane], candidates: NDArray[np.bool_]) -> Plane | None:
-    """The plane of a large surface that is farthest from the sensor."""
-    return max(_largest(planes, candidates), key=lambda plane: plane.distance, default=None)
-
-
-def _largest(planes: Sequence[Plane], candidates: NDArray[np.bool_]) -> list[Plane]:
-    """The largest plane of each surface that has a candidate."""
-    largest: dict[int, Plane] = {}
-    for plane, candidate in zip(planes, candidates, strict=True):
-        if candidate and plane.area > getattr(largest.get(plane.surface), 'area', 0):
-            largest[plane.surface] = plane
-    return list(largest.values())
+def _largest(planes: Sequence[Plane], chosen: NDArray[np.bool_]) -> list[Plane]:
+    """The largest plane of each surface that has a chosen one."""
+    by_area = sorted(compress(planes, chosen), key=lambda plane: plane.area)
+    return list({plane.surface: plane for plane in by_area}.values())
 
 
 def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
@@ -148,18 +125,10 @@ def corners_of(plane: Plane) -> NDArray[np.float64]:
 
 
 class Ramp(NamedTuple):
-    """A plane with the role `ramp`.
+    """A plane with the role `ramp`, by its id.
 
-    Attributes
-    ----------
-    plane : int
-        Its id.
-    slope : float
-        Between it and level, degrees.
-    centre : (3,) float64
-        Centroid of the plane, metres, in the frame of the image.
-    climb : (3,) float64
-        Unit vector along the plane, in the direction that climbs most steeply.
+    Its `slope` against level is in degrees, `centre` (3,) its centroid in metres in the frame of
+    the image, `climb` (3,) the unit vector along it that climbs most steeply.
     """
 
     plane: int
@@ -176,26 +145,17 @@ def ramps_of(planes: Sequence[Plane], up: NDArray[np.float64]) -> list[Ramp]:
     """The ramps among planes with roles; `up` (3,) is a unit vector in their frame."""
     found = []
     for plane in planes:
-        if plane.role != 'ramp':
-            continue
-        rise = float(plane.normal @ up)
-        along = up - rise * plane.normal
-        length = float(np.linalg.norm(along))  # the sine of the slope
-        slope = float(np.degrees(np.arctan2(length, rise)))
-        found.append(Ramp(plane.id, slope, plane.centroid, along / length))
+        if plane.role == 'ramp':
+            rise = float(plane.normal @ up)
+            along = up - rise * plane.normal
+            length = float(np.linalg.norm(along))  # the sine of the slope
+            slope = float(np.degrees(np.arctan2(length, rise)))
+            found.append(Ramp(plane.id, slope, plane.centroid, along / length))
     return found
 
 
 class Tilt(NamedTuple):
-    """A camera that stands otherwise than is said.
-
-    Attributes
-    ----------
-    degrees : float
-        Between the stated up and that of the planes.
-    up : (3,) float64
-        Of the planes, in the frame of the image.
-    """
+    """A camera that stands otherwise than is said, by the up (3,) of the planes."""
 
     degrees: float
     up: NDArray[np.float64]
@@ -218,29 +178,18 @@ def tilt_of(
 ) -> Tilt | None:
     """The tilt that the planes show; None where they agree with `up`, or do not tell.
 
-    Most of what is built is level or vertical: the direction that most of the planes agree with
-    is up, and where the stated one is far from it, a camera is mounted otherwise than is said.
-
-    Parameters
-    ----------
-    planes : sequence of Plane
-        Of one image.
-    up : (3,) float64
-        Stated, unit vector in the frame of the image.
-    tolerance : float
-        Angle up to which planes agree with what is stated, degrees.
-    area : float
-        Smallest plane that shows where up is, square metres.
-    slope : float
-        Of a ramp that may fill the view, degrees: no tilt up to that.
+    Most of what is built is level or vertical, within `tolerance` degrees: the normal that most of
+    the planes agree with is up, of planes of at least `area` square metres. A ramp of up to
+    `slope` degrees may fill the view.
     """
     normals = np.array([plane.normal for plane in planes]).reshape(-1, 3)
     pixels = np.array([plane.count for plane in planes], np.float64)
     steep = np.degrees(np.arccos(np.clip(normals @ up, -1, 1)))
     stated = _agree(normals, up, tolerance)
     found: list[tuple[float, int]] = []
-    # Only what may be a floor tells: a lone slanted wall or ceiling stands in many rooms.
-    for k in map(int, np.flatnonzero((steep > max(tolerance, slope)) & (steep <= _LARGEST))):
+    # Only what may be a floor tells: a lone slanted wall or ceiling stands in many rooms. What
+    # leans by more than 45 degrees is nearer to a wall.
+    for k in map(int, np.flatnonzero((steep > max(tolerance, slope)) & (steep <= 45))):
         seen = _agree(normals, normals[k], tolerance)
         # Walls that the camera would turn about agree with both.
         alone = pixels[seen & ~stated].sum(), pixels[stated & ~seen].sum()

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.ground.cells import axes_of
@@ -27,13 +26,11 @@ The rise from the International Building Code (1011.5.2, four inches at least) t
 (24 cm at most), the run from private stairs to those of general access in the British Approved
 Document K, table 1.1.
 """
-# Tangent of the flattest stairs: what is flatter is level.
-_FLATTEST = RISE[0] / _RUN[1]
 # Treads and noses are within so much of a rise and a run of where they should be: nearer to that
 # than to the middle between two.
 _UNEVEN = 1 / 4
-# The histogram of heights: width of a bin, and its end, metres.
-_BIN, _HIGHEST = 0.005, 2.5
+# Width of the bins of the histogram of heights, metres.
+_BIN = 0.005
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,21 +64,15 @@ class Stairs:
 
 
 def stairs_of(terrain: Terrain) -> list[Stairs]:
-    """Staircases in sight: none or one up, none or one down.
-
-    Parameters
-    ----------
-    terrain : Terrain
-        The ground of the image.
-    """
+    """Staircases in sight: none or one up, none or one down."""
     cells = terrain.cells
     if cells is None:
         return []
     found = []
     for sign in (1, -1):
         # Nobody sees a tread from below.
-        highest = terrain.stand.height(terrain.field.up) if sign > 0 else _HIGHEST
-        level = _find_level(cells, sign, min(highest, _HIGHEST))
+        highest = terrain.stand.height(terrain.field.up) if sign > 0 else np.inf
+        level = _find_level(cells, sign, highest)
         sums = np.bincount((level[level > 0] / _BIN).astype(np.int64), minlength=1)
         rise, count = _find_rise(sums)
         if count > 1 and (stairs := _staircase(cells, level, sign, rise, count, terrain)):
@@ -97,7 +88,8 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
     before = np.maximum.accumulate(np.where(measured, rows, 0), axis=0)[:-1]
     # A tread that is too thin to be measured is still seen between two risers.
     apart = cells.place[:, 1:] - cells.place[:, before, columns]
-    flat = np.abs(apart[0]) < _FLATTEST * np.hypot(apart[1], apart[2])
+    flattest = RISE[0] / _RUN[1]  # stairs; what is flatter is level
+    flat = np.abs(apart[0]) < flattest * np.hypot(apart[1], apart[2])
     level = np.zeros(measured.shape, np.bool_)
     level[1:] = flat
     level[before[flat], np.nonzero(flat)[1]] = True
@@ -106,35 +98,28 @@ def _find_level(cells: CellTerrain, sign: int, highest: float) -> NDArray[np.flo
     return np.where(level & (OUTLIER * cells.error <= _UNEVEN * RISE[1]), height, np.float32(0))
 
 
-@njit(cache=True, nogil=True)
 def _find_rise(sums: NDArray[np.int64]) -> tuple[float, int]:
     """The period of a histogram of heights, and how many periods there are from its start.
 
     A tread has at least `SAMPLES` cells, twice as many in the half of a period around its height
     as in the other half, and is the better the nearer they are to it.
     """
-    rise, count, most = 0.0, 0, 0.0
-    for k in range(int((RISE[1] - RISE[0]) / _BIN * 2) + 1):
-        period = RISE[0] / _BIN + k / 2  # in bins
-        score, treads = 0.0, 0
-        while (treads + 1.5) * period < len(sums) + period:
-            middle = (treads + 1) * period
-            on = off = 0
-            apart = 0.0
-            for b in range(int(middle - period / 2), min(int(middle + period / 2), len(sums))):
-                far = abs(b + 0.5 - middle)
-                if far <= _UNEVEN * period:
-                    on += sums[b]
-                    apart += far * sums[b]
-                else:
-                    off += sums[b]
-            if on < SAMPLES or on < 2 * off:
-                break
-            treads += 1
-            score += 1 - apart / on / (_UNEVEN * period)
-        if score > most:
-            rise, count, most = period * _BIN, treads, score
-    return rise, count
+    rises = np.arange(RISE[0], RISE[1], _BIN / 2)
+    heights = (np.arange(len(sums)) + 0.5) * _BIN / rises[:, None]  # in periods
+    tread = np.rint(heights).astype(np.int64)
+    off = np.abs(heights - tread)
+    on = off <= _UNEVEN
+    most = int(tread.max()) + 2
+    cell = tread + most * np.arange(len(rises))[:, None]
+    inside, outside, apart = (
+        np.bincount(cell.ravel(), (sums * share).ravel(), most * len(rises)).reshape(-1, most)
+        for share in (on, ~on, on * off)
+    )
+    enough = (inside >= SAMPLES) & (inside >= 2 * outside)
+    enough = np.logical_and.accumulate(enough[:, 1:], axis=1)
+    quality = enough * (1 - apart / np.maximum(inside, 1) / _UNEVEN)[:, 1:]
+    best = quality.sum(axis=1).argmax()
+    return float(rises[best]), int(enough[best].sum())
 
 
 def _find_noses(
@@ -175,15 +160,11 @@ def _staircase(
     # Treads that follow each other, each with a nose but the landing at the foot of stairs down.
     enough = np.bincount(number, minlength=count + 2) >= SAMPLES
     last = first + int(enough[first:].argmin())
-    if last - first < 2:
-        return None
     number, place = number[number < last], place[number < last]
-    fitted = _fit_noses(number, place)
+    fitted = _fit_noses(number, place) if last - first > 1 else None
     if fitted is None:
         return None
     start, ahead, run, fits = fitted
-    if not _RUN[0] <= run <= _RUN[1]:
-        return None
     across = np.array([-ahead[1], ahead[0]])
     sides = []
     for k in range(first, last):
@@ -214,7 +195,7 @@ def _staircase(
 def _fit_noses(
     number: NDArray[np.int64], place: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64], float, NDArray[np.bool_]] | None:
-    """Where tread 0 has its nose, direction, run, and which noses fit; None if most do not."""
+    """Where tread 0 has its nose, direction, run, and which noses fit; None for no stairs."""
     design = np.column_stack([np.ones(len(place)), place])
     fits = np.ones(len(design), np.bool_)
     for _ in range(4):
@@ -223,7 +204,7 @@ def _fit_noses(
         fits = off <= max(_UNEVEN, float(np.median(off)))
     fits = off <= _UNEVEN
     slope = float(np.linalg.norm(solved[1:]))
-    if 2 * fits.sum() < len(fits) or slope == 0:
+    if 2 * fits.sum() < len(fits) or not 1 / _RUN[1] <= slope <= 1 / _RUN[0]:
         return None
     ahead = solved[1:] / slope
     return -float(solved[0]) / slope, ahead, 1 / slope, fits

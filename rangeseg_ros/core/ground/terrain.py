@@ -13,69 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.cells import WINDOW, Cells, CellSize, axes_of, cells_of
+from rangeseg_ros.core.ground.cells import Cells, GroundField, cells_of, classify, ground_field
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
-from rangeseg_ros.core.ground.field import GroundField, classify, ground_field
-from rangeseg_ros.core.ground.reach import Passable, reach
+from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Standard deviations of the noise within which the ground is the ground, and beyond which it is
 # known to be none.
 _CERTAIN = 3.0
-_SQUARE = np.ones((5, 5), np.uint8)
+# Cells among which noise keeps some out of a chain, and over which relief is measured.
+_AROUND = np.ones((5, 5), np.uint8)
 SURE = 0.99
 """Confidence from which on the ground is the ground; less is unknown."""
 FURNITURE = 1.5
 """Metres: what is longer, along or across the view, is no table (without a stated height)."""
 
 
-class Limits(NamedTuple):
-    """What is ground.
-
-    Attributes
-    ----------
-    slope : float
-        Steepest ground, radians.
-    obstacle : float
-        What stands so high is an obstacle, metres.
-    drop : float
-        What lies so deep is a drop, metres.
-    tilt : float
-        Standard deviation of the direction that is up, radians.
-    gap, radius : float
-        See `Passable`.
-    """
-
-    slope: float
-    obstacle: float
-    drop: float
-    tilt: float = float(np.radians(Config().up_sd))
-    gap: float = Config().ground_gap
-    radius: float = Config().robot_radius
-
-    @property
-    def least(self) -> float:
-        """The least step that is none of the ground, metres."""
-        return min(self.obstacle, self.drop)
-
-
 class CellTerrain(NamedTuple):
     """What the cells of an image are, (rows, columns), with the nearest row first.
 
-    Attributes
-    ----------
-    place : (3, ...) float32
-        See `Cells`.
-    height : (...) float32
-        Above the ground, metres; NaN where not measured.
-    kind : (...) int8
-        See `classes`.
-    error : (...) float32
-        See `Cells`.
-    crossing : (2, ...) float32
-        Where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
+    `place` (3, ...) and `error` (...) are those of `Cells`, `height` (...) is above the ground,
+    metres, NaN where not measured, `kind` (...) one of `classes`, and `crossing` (2, ...) where
+    the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     """
 
     place: NDArray[np.float32]
@@ -121,30 +82,21 @@ def terrain_of(
     sensor: SensorModel,
     up: NDArray[np.float64],
     known: tuple[float, float],
-    limits: Limits,
+    config: Config,
 ) -> Terrain:
     """Class and height of every pixel.
 
-    Parameters
-    ----------
-    image : RangeImage
-        (H, W).
-    sensor : SensorModel
-    up : (3,) float64
-        Unit vector in the frame of the image.
-    known : (float, float)
-        Height of the camera above the ground below it and its standard deviation, metres; 0, 0
-        when nothing is known.
-    limits : Limits
+    `up` (3,) is a unit vector in the frame of the image, `known` the height of the camera above
+    the ground below it and its standard deviation, metres; 0, 0 when nothing is known.
     """
     right, down, _ = up @ image.axes
     if abs(right) <= abs(down):
-        return _upright(image, sensor, up, known, limits, bool(down > 0))
+        return _upright(image, sensor, up, known, config, bool(down > 0))
     # A camera on its side: columns are along up in the image with rows and columns exchanged.
     rays = np.ascontiguousarray(image.rays.transpose(1, 0, 2))
     rays.flags.writeable = False  # as all rays are, or every kernel is compiled twice
     turned = RangeImage(rays, np.ascontiguousarray(image.inverse.T))
-    found = _upright(turned, sensor, up, known, limits, bool(right > 0))
+    found = _upright(turned, sensor, up, known, config, bool(right > 0))
     return found._replace(
         classes=np.ascontiguousarray(found.classes.T),
         height=np.ascontiguousarray(found.height.T),
@@ -157,33 +109,35 @@ def _upright(
     sensor: SensorModel,
     up: NDArray[np.float64],
     known: tuple[float, float],
-    limits: Limits,
+    config: Config,
     turned: bool,
 ) -> Terrain:
     """The same for an image whose columns are along up; `turned` where up is down in it."""
-    size = CellSize.for_image(image.shape)
-    cells = cells_of(image, size, up, sensor)
-    place, variance = cells.place.astype(np.float64), cells.variance
+    cells = cells_of(image, up, sensor)
+    place = cells.place.astype(np.float64)
     height, height_sd = known
     height = height or _nearest(place[0, :: 1 if turned else -1])
     place[0] += height
-    slope = float(np.tan(limits.slope))
-    passable = Passable(limits.least, slope, limits.gap, limits.radius)
-    found = None
-    # Where nothing is near the stated height, what is elsewhere tells how wrong that is.
-    for highest in (HIGHEST, np.inf) if height_sd > 0 else (np.inf,):
-        reached = reach(place, variance, cells.shared, highest, passable, turned)
-        if reached.any():
-            near = place[:, reached], 4 * variance[reached]
-            found = continued(*near, height_sd, slope, limits.least)
-            break
-    # Without a height the ground is what the camera stands on: a table tells by its size.
-    if not found or (found.confidence < SURE if height_sd > 0 else found.size < FURNITURE):
-        return _without_ground(image, cells, size, found, up, known, limits)
-    a, b, c = found.plane
-    lean = np.array([b, c]) @ axes_of(up)[1:]
-    stand = Stand(-(up - lean) / (height - a), found.confidence)
-    return _with_ground(image, cells, size, reached, stand, up, limits, turned)
+    reached = reach(place, cells.variance, config, turned)
+    seen = None
+    if reached.any():
+        seen = continued(place[:, reached], cells.variance[reached], height_sd, config)
+    if height_sd > 0:
+        sure = seen is not None and seen.confidence >= SURE
+        reason = _contradiction(height, seen)
+    else:
+        # Without a height the ground is what the camera stands on: a table tells by its size.
+        size = float(np.ptp(place[1:, reached], axis=1).max()) if seen else 0.0
+        sure = size >= FURNITURE
+        reason = f'without sensor_height, {size:.1f} m of a surface may be a table'
+    if seen is None or not sure:
+        confidence = seen.confidence if seen and height_sd > 0 else 0.0
+        stand = Stand(np.zeros(3), confidence, (reason,) if seen or height_sd > 0 else ())
+        return _without_ground(image, cells, seen, stand, known, config)
+    a, b, c = seen.plane
+    lean = np.array([b, c]) @ cells.axes[1:]
+    stand = Stand(-(up - lean) / (height - a), seen.confidence)
+    return _with_ground(image, cells, reached, stand, config, turned)
 
 
 def _nearest(above: NDArray[np.float64]) -> float:
@@ -192,47 +146,53 @@ def _nearest(above: NDArray[np.float64]) -> float:
     return max(-float(np.nanmedian(nearest)), 0.02) if np.isfinite(nearest).any() else 1.0
 
 
+def _contradiction(height: float, seen: Continuation | None) -> str:
+    """What a stated height, metres, and the ground that is seen say of each other."""
+    if seen is None:
+        return f'no ground that is seen is {height:.2f} m below, as is known'
+    off, below = abs(seen.plane[0]), height - seen.plane[0]
+    why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
+    if off > _CERTAIN * seen.error:
+        return f'{why}, {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
+    return f'{why} +- {seen.error:.2f} m: a step out of view would not be noticed'
+
+
 def _with_ground(
     image: RangeImage,
     cells: Cells,
-    size: CellSize,
     reached: NDArray[np.bool_],
     stand: Stand,
-    up: NDArray[np.float64],
-    limits: Limits,
+    config: Config,
     turned: bool,
 ) -> Terrain:
-    """Classes and heights by the ground that was reached, continued.
-
-    More than seven parameters: all that was found on the way.
-    """
-    field = ground_field(cells, reached, stand.theta, size, up)
+    """Classes and heights by the ground that was reached, continued."""
+    field = ground_field(cells, reached, stand.theta)
     height = field.heights(cells)
     # Relief counts as noise: what the cells of the ground scatter by.
-    count = cv2.blur(reached.astype(np.float32), (WINDOW, WINDOW))
-    squares = cv2.blur(np.where(reached, height, 0) ** 2, (WINDOW, WINDOW))
-    with np.errstate(divide='ignore', invalid='ignore'):
-        relief = np.where(count > 0, squares / count, 0)
-    noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief, dtype=np.float32)
+    squares, count = (
+        cv2.blur(values, _AROUND.shape)
+        for values in (np.where(reached, height, 0) ** 2, reached.astype(np.float32))
+    )
+    relief = np.maximum(squares, 0) / np.maximum(count, np.finfo(np.float32).eps)
+    sure = np.float32(_CERTAIN) * cells.error
+    noise = np.float32(_CERTAIN) * np.sqrt(cells.error**2 + relief)
     # Among cells that a chain leads to, noise keeps some out of it.
-    closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _SQUARE)
-    reached, beside = closed > 0, cv2.dilate(closed, _SQUARE[1:-1, 1:-1]) > 0
+    closed = cv2.morphologyEx(reached.view(np.uint8), cv2.MORPH_CLOSE, _AROUND)
+    reached, beside = closed > 0, cv2.dilate(closed, np.ones((3, 3), np.uint8)) > 0
     # Where no chain leads, half as much is no ground.
     share = np.where(reached, np.float32(1), np.float32(0.5))
-    sure = np.float32(_CERTAIN) * cells.error
-    bounds = np.empty((3, *reached.shape), np.float32)
-    bounds[0] = np.where(beside, np.clip(noise, limits.least / 4, share * limits.least), -1)
-    bounds[1] = -np.maximum(share * limits.drop, sure)
-    bounds[2] = np.maximum(share * limits.obstacle, sure)
-    classes, heights = classify(image, field, bounds)
+    least = np.float32(config.least_step / 4)
+    near = np.where(reached, np.clip(noise, least, config.least_step), np.where(beside, least, -1))
+    lowest = -np.maximum(share * config.drop_height, sure)
+    highest = np.maximum(share * config.obstacle_height, sure)
+    classes, heights = classify(image, field, np.stack([near, lowest, highest], dtype=np.float32))
     kind = np.where(reached & np.isfinite(height), GROUND, UNKNOWN).astype(np.int8)
-    kind[height > bounds[2]] = OBSTACLE
-    kind[height < bounds[1]] = DROP
-    along = (field.theta * cells.ray).sum(axis=0)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        flat_axes = axes_of(up)[1:].astype(np.float32)
-        along[along <= 0] = np.nan
-        crossing: NDArray[np.float32] = np.tensordot(flat_axes, cells.ray, 1) / along
+    kind[height > highest] = OBSTACLE
+    kind[height < lowest] = DROP
+    # By similar triangles: the ray to a place so high above the ground crosses it farther away.
+    share = np.float32(1) + height * np.tensordot(cells.axes[0].astype(np.float32), field.theta, 1)
+    share[share <= 0] = np.nan
+    crossing = cells.place[1:] / share
     order = slice(None, None, 1 if turned else -1)
     below = CellTerrain(
         cells.place[:, order], height[order], kind[order], cells.error[order], crossing[:, order]
@@ -240,7 +200,31 @@ def _with_ground(
     return Terrain(classes, heights, stand, field, below)
 
 
-def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
+def _without_ground(
+    image: RangeImage,
+    cells: Cells,
+    seen: Continuation | None,
+    stand: Stand,
+    known: tuple[float, float],
+    config: Config,
+) -> Terrain:
+    """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
+    height, height_sd = known
+    obstacle = _faces(cells, config)
+    if height > 0:
+        # What is higher than any step is none, nor the ground by a wrong height.
+        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
+        distance = np.hypot(cells.place[1], cells.place[2])
+        error = height_sd + np.radians(config.up_sd) * distance
+        bound = config.obstacle_height + apart + _CERTAIN * error
+        obstacle |= cells.place[0] + height > bound
+    wide = cells.size.enlarged(obstacle, image.shape)
+    classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
+    nowhere = GroundField(np.zeros((3, *obstacle.shape), np.float32), cells.size, cells.axes[0])
+    return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
+
+
+def _faces(cells: Cells, config: Config) -> NDArray[np.bool_]:
     """Cells (rows, columns) of surfaces that rise more steeply than any ground."""
     steep = np.zeros(cells.inverse.shape, np.bool_)
     if len(steep) < 3:
@@ -249,45 +233,6 @@ def _faces(cells: Cells, limits: Limits) -> NDArray[np.bool_]:
     way = np.hypot(*(cells.place[1:, 2:] - cells.place[1:, :-2]))
     noise = np.float32(2**0.5 * _CERTAIN) * cells.error[1:-1]
     # Three times as steep as any ground, as what is hidden behind an edge is not.
-    steep[1:-1] = rise > 3 * np.tan(limits.slope) * way + noise
+    steep[1:-1] = rise > 3 * config.steepest * way + noise
     steep[0], steep[-1] = steep[1], steep[-2]
     return steep
-
-
-def _without_ground(
-    image: RangeImage,
-    cells: Cells,
-    size: CellSize,
-    seen: Continuation | None,
-    up: NDArray[np.float64],
-    known: tuple[float, float],
-    limits: Limits,
-) -> Terrain:
-    """No ground that is sure: obstacles are what is above where it can be, the rest unknown."""
-    height, height_sd = known
-    reasons: tuple[str, ...] = ()
-    obstacle = _faces(cells, limits)
-    if height > 0:
-        # What is higher than any step is none, nor the ground by a wrong height.
-        apart = abs(seen.plane[0]) if seen and seen.plane[0] < HIGHEST else 0.0
-        distance = np.hypot(cells.place[1], cells.place[2])
-        bound = limits.obstacle + apart + _CERTAIN * (height_sd + limits.tilt * distance)
-        obstacle |= cells.place[0] + height > bound
-    wide = size.enlarged(obstacle, image.shape)
-    classes = np.where(image.valid & wide, OBSTACLE, UNKNOWN).astype(np.uint8)
-    if seen and height > 0:
-        off, below = abs(seen.plane[0]), height - seen.plane[0]
-        why = f'the stated height is {height:.2f} m, the ground seen is {below:.2f} m below'
-        if off > _CERTAIN * seen.error:
-            why += f', {off / seen.error:.0f} sd: a step or ramp out of view, or a wrong height'
-        else:
-            why += f' +- {seen.error:.2f} m: a step out of view would not be noticed'
-        reasons = (why,)
-    elif height > 0:
-        reasons = (f'no ground that is seen is {height:.2f} m below, as is known',)
-    elif seen:
-        reasons = (f'without sensor_height, what is below {FURNITURE:g} m long may be a table',)
-    confidence = seen.confidence if seen and height > 0 else 0.0
-    nowhere = GroundField(np.zeros((3, *cells.inverse.shape), np.float32), size, up)
-    stand = Stand(np.zeros(3), confidence, reasons)
-    return Terrain(classes, np.full(image.shape, np.nan, np.float32), stand, nowhere)
