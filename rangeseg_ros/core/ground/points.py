@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.description.outlines import TOLERANCE
+from rangeseg_ros.core.description.shapes import TOLERANCE
 from rangeseg_ros.core.ground.classes import DROP, GROUND
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.clouds import completed_rays
