@@ -25,22 +25,14 @@ import cv2
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
-from rangeseg_ros.compilation.rehearsal import rehearse
+from rangeseg_ros.compilation.preparation import rehearse
 from rangeseg_ros.core.runtime import cache
 
 _MOST_PROCESSES = 4
 
 
 class Kernel(NamedTuple):
-    """A kernel to be compiled.
-
-    Attributes
-    ----------
-    module, name : str
-        Where its dispatcher is.
-    signature : tuple
-        Types of its arguments.
-    """
+    """A kernel to be compiled: where its dispatcher is, and the types of its arguments."""
 
     module: str
     name: str

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import fields
 from threading import Condition, Thread
 
-from rangeseg_ros.compilation.preparation import needs, prepare
-from rangeseg_ros.compilation.rehearsal import FIRST
+from rangeseg_ros.compilation.preparation import FIRST, needs, prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.latest_ready import LatestReady
@@ -134,7 +133,7 @@ def _needs(config: NodeConfig) -> tuple[object, ...]:
 
 
 def _kind(config: NodeConfig) -> str:
-    """Of `rehearsal.KINDS`."""
+    """Of `preparation.KINDS`."""
     return 'points' if config.input == 'points' else 'image'
 
 
