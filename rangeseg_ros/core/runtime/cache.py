@@ -49,10 +49,8 @@ def choose_cache() -> None:
     if folder is None and writable(PACKAGE / 'core' / '__pycache__'):
         drop_outdated(PACKAGE)
     elif folder is None:
-        home = os.environ.get('HOME')
-        user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
-        folder = _own_folder(Path(user, 'rangeseg_ros')) if user else None
-        folder = folder or _temporary_folder()
+        user = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
+        folder = _own_folder(Path(user, 'rangeseg_ros')) or _temporary_folder()
         _copy_compiled(folder)
     if folder:
         # Of processes started from here, too.
@@ -63,11 +61,8 @@ def choose_cache() -> None:
 
 def _choose_processor() -> None:
     """Have numba compile for the processor of the kernels in the package, as numba names these."""
-    try:
-        target = json.loads((PACKAGE / _TARGET).read_text())
-    except (OSError, ValueError):
-        return
-    if 'NUMBA_CPU_NAME' in os.environ:
+    target = _read(PACKAGE / _TARGET)
+    if not target or 'NUMBA_CPU_NAME' in os.environ:
         return
     from importlib import metadata
 
@@ -131,24 +126,17 @@ def _temporary_folder() -> Path:
             'no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one'
         ) from None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _warn(
-        'compiled kernels cannot be kept, so that every start compiles them: neither the package '
-        'nor a cache folder can be written to by this user alone; set NUMBA_CACHE_DIR to one that '
-        'can'
-    )
+    _warn('compiled kernels last as long as the process; set NUMBA_CACHE_DIR to a folder of yours')
     return folder
 
 
 def drop_outdated(package: Path) -> None:
     """Remove kernels compiled beside sources that have changed, or that import such sources."""
     note, now = package / _SOURCES, _digests(package)
-    try:
-        before = json.loads(note.read_text())
-    except (OSError, ValueError):
-        before = {}
+    before = _read(note)
     if now == before:
         return
-    changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
+    changed = {name for name, _ in now.items() ^ before.items()}
     for name in _dependents(package, changed):
         source = package.parent / name.replace('.', '/')
         for compiled in (source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'):
@@ -156,6 +144,14 @@ def drop_outdated(package: Path) -> None:
     part = note.with_name(f'{note.name}.{os.getpid()}')
     part.write_text(json.dumps(now))
     os.replace(part, note)
+
+
+def _read(note: Path) -> dict[str, str]:
+    """What was noted; nothing where that cannot be read."""
+    try:
+        return dict(json.loads(note.read_text()))
+    except (OSError, ValueError):
+        return {}
 
 
 def _digests(package: Path) -> dict[str, str]:
