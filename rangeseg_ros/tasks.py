@@ -44,13 +44,7 @@ class Task(Protocol[R_co]):
 
 @dataclass(frozen=True)
 class Failure:
-    """What came of a task in place of its result.
-
-    Attributes
-    ----------
-    error : Exception
-        A ValueError, an OSError or a MemoryError.
-    """
+    """What came of a task in place of its result: one of the errors that are `EXPECTED`."""
 
     error: Exception
 
@@ -62,10 +56,7 @@ class SchedulerError(ValueError):
 def run_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R]:
     """Run tasks on all cores (or `jobs` processes); yields their results in order.
 
-    Raises
-    ------
-    ValueError, OSError, MemoryError
-        The first task's that fails; those that have not begun are dropped.
+    Raises the error of the first task that fails; those that have not begun are dropped.
     """
     for result in attempt_all(tasks, jobs):
         if isinstance(result, Failure):
@@ -100,7 +91,7 @@ def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R
                 while given in results:
                     yield results.pop(given)
                     given += 1
-        for number in sorted(running.values()):
+        for number in running.values():
             results[number] = _attempted_alone(tasks[number])
         while given in results:
             yield results.pop(given)
@@ -190,21 +181,8 @@ def attempt_on_cluster(tasks: Sequence[Task[R]], scheduler: str) -> Iterator[R |
     A task whose worker is lost is run again on another one, up to as many times as Dask's
     `distributed.scheduler.allowed-failures` says. Workers and scheduler need this package, workers
     the same files under the same names. Whoever reaches a scheduler runs code on its workers.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    scheduler : str
-        Address of the scheduler, e.g. 'tcp://host:8786'.
-
-    Raises
-    ------
-    ImportError
-        `distributed` is not installed.
-    SchedulerError
-        Not an address.
-    OSError
-        No scheduler at that address, or no longer.
+    Raises ImportError without `distributed`, `SchedulerError` for what is no address, and OSError
+    where there is no scheduler, or no longer.
     """
     check_scheduler(scheduler)
     from distributed import Client, KilledWorker

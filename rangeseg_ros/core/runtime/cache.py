@@ -49,8 +49,10 @@ def choose_cache() -> None:
     if folder is None and writable(PACKAGE / 'core' / '__pycache__'):
         drop_outdated(PACKAGE)
     elif folder is None:
-        user = os.environ.get('XDG_CACHE_HOME') or os.path.expanduser('~/.cache')
-        folder = _own_folder(Path(user, 'rangeseg_ros')) or _temporary_folder()
+        home = os.environ.get('HOME')
+        user = os.environ.get('XDG_CACHE_HOME') or (home and os.path.join(home, '.cache'))
+        folder = _own_folder(Path(user, 'rangeseg_ros')) if user else None
+        folder = folder or _temporary_folder()
         _copy_compiled(folder)
     if folder:
         # Of processes started from here, too.

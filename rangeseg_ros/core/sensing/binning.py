@@ -34,20 +34,10 @@ _STEEPEST = 1 / np.tan(np.radians(5))
 
 
 class Bins(NamedTuple):
-    """Squares of pixels of an image.
+    """Squares of `side` x `side` pixels of an image (H, W), and a pixel for each in `means`.
 
-    Attributes
-    ----------
-    side : int
-        Pixels along the side of each.
-    pixels : RangeImage
-        (H, W), the image.
-    means : RangeImage
-        (ceil(H / side), ceil(W / side)), a pixel for each: the mean of what was measured.
-    spread : (rows, columns) float32
-        Largest difference in each, 1/m.
-    area : float
-        Of a bin, see `pixel_area`.
+    That is the mean of what was measured, (ceil(H / side), ceil(W / side)); `spread` of the same
+    shape is the largest difference in each, 1/m. The `area` is that of a bin, see `pixel_area`.
     """
 
     side: int
@@ -68,16 +58,13 @@ class Bins(NamedTuple):
         camera = Cells(side, 0, 0).camera(image.camera) if image.camera else None
         rays = camera.rays if camera else np.empty((rows, columns, 3), np.float32)
         body = image.body
-        if body is not None:
-            margin = rows * side - len(body), columns * side - body.shape[1]
-            body = np.pad(body, [(0, more) for more in margin])
-            body = body.reshape(rows, side, columns, side).any(axis=(1, 3))
+        for axis in (0, 1) if body is not None else ():
+            body = np.logical_or.reduceat(body, np.arange(0, image.shape[axis], side), axis)
         means = replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
         bins = cls(side, image, means, spread, area)
         if camera is None:
-            endless = np.full((1, 1), np.inf, np.float32)
-            all_of_them = bins._replace(spread=np.full_like(spread, np.inf))
-            bins = bins._replace(means=all_of_them._averaged(endless, max(rows, columns)))
+            endless = np.full_like(spread, np.inf)
+            bins = bins._replace(means=bins._replace(spread=endless)._averaged(endless))
         return bins
 
     def noise_of_pixels(self, sensor: SensorModel) -> float:
@@ -103,24 +90,20 @@ class Bins(NamedTuple):
     def of_one_surface(self, steps: NDArray[np.float32]) -> RangeImage:
         """Means of the measurements near each bin's median: a jump mixes no two surfaces.
 
-        Parameters
-        ----------
-        steps : (rows, columns) float32
-            Smallest jump in blocks of 4 x 4 bins, 1/m.
+        `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
         """
-        return self._averaged(steps, BLOCK)
+        return self._averaged(steps)
 
-    def _averaged(self, steps: NDArray[np.float32], block: int) -> RangeImage:
-        inverse, rays = self.means.inverse.copy(), np.empty((0, 0, 3), np.float32)
-        if self.means.camera is None:
-            rays = self.means.rays.copy()
+    def _averaged(self, steps: NDArray[np.float32]) -> RangeImage:
+        inverse = self.means.inverse.copy()
+        # A camera has the rays of its bins.
+        rays = (self.means.rays if self.means.camera is None else self.means.rays[:0]).copy()
         slope = np.float32(_STEEPEST * self.area**0.5)
-        given = self.pixels.inverse, self.pixels.rays, self.side, self.spread, steps, block, slope
+        given = self.pixels.inverse, self.pixels.rays, self.side, self.spread, steps, slope
         run_rows(_average, len(inverse), *given, inverse, rays)
         # Like those of cameras, or every kernel that reads them is compiled twice.
         rays.flags.writeable = False
-        rays = rays if self.means.camera is None else self.means.rays
-        return replace(self.means, inverse=inverse, rays=rays)
+        return replace(self.means, inverse=inverse, rays=rays if rays.size else self.means.rays)
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
@@ -168,19 +151,18 @@ def _average(
     side: int,
     spread: NDArray[np.float32],
     steps: NDArray[np.float32],
-    block: int,
     slope: np.float32,
     inverse: NDArray[np.float32],
     means: NDArray[np.float32],
 ) -> None:
-    """Average what lies within a step of the median, in some rows of bins that spread farther.
+    """Average inverse ranges within a step of the median in some rows of bins that spread farther.
 
-    Inverse ranges, and rays where there is room for them.
+    And rays where there is room for them.
     """
     values = np.empty(side * side, np.float32)
     for i in range(first, after):
         for j in range(inverse.shape[1]):
-            step = steps[i // block, j // block] + slope * inverse[i, j]
+            step = steps[i // BLOCK, j // BLOCK] + slope * inverse[i, j]
             if spread[i, j] < step:
                 continue
             count = 0

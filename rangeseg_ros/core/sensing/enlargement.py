@@ -79,9 +79,8 @@ def enlargement(image: RangeImage) -> Cells | None:
 def replication(image: RangeImage) -> Cells | None:
     """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
 
-    Neighbours differ at the borders of the cells only, so that the columns at which any differ are
-    multiples of the factor apart, and so are the rows. At least half of the borders must show it:
-    a few edges of an exact scene may lie at multiples by chance.
+    The columns and rows at which neighbours differ are multiples of the factor apart. At least half
+    of the borders must show it: a few edges of an exact scene may lie at multiples by chance.
     """
     (factor, columns), (other, rows) = _period(image.inverse), _period(image.inverse.T)
     return Cells(factor, rows, columns) if 0 < factor == other else None
@@ -102,10 +101,9 @@ def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
 def interpolation(image: RangeImage) -> Cells | None:
     """Cells between whose centres the depth is linear; None where it is not.
 
-    Second differences along a line vanish but beside the centres, at every k-th pixel: their
-    mean size per column has a line in its spectrum (Fisher, Tests of significance in harmonic
-    analysis, 1929). For k = 2, third differences have one. Which pixels are the centres does not
-    matter: one of every k x k pixels is as good as another.
+    Second differences vanish but beside the centres, at every k-th pixel: their mean size per
+    column has a line in its spectrum (Fisher, Tests of significance in harmonic analysis, 1929),
+    for k = 2 that of third differences. One of every k x k pixels is as good as another.
     """
     amplitude = np.full(_LARGEST + 1, np.inf)
     for lines in (image.inverse, image.inverse.T):

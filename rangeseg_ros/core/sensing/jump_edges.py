@@ -33,22 +33,16 @@ def plane_deviation(
 ) -> GridEdges:
     """Jumps to the right of pixels (H, W-1) and below (H-1, W) from plane to plane (thesis 2.3).
 
-    In inverse range a plane is a ramp. Along rows and columns, the step between the means of two
-    adjoining 3 x 3 windows is compared to the steps on either side of it: on a plane all three
-    are equal, over a crease the middle one lies between the others, and only a jump exceeds both.
+    In inverse range a plane is a ramp: the step between the means of adjoining 3 x 3 windows is
+    that on either side of it, over a crease it lies between these, and only a jump exceeds both.
     The pixels beside such boundaries are candidates. The jump runs between candidates of which
     one lies above the mean of the 7 x 7 pixels around it and one below: the zero crossing, which
-    closes contours by itself.
+    closes contours. At corners, pixels beside candidates are compared as the windows are; where
+    three surfaces meet, every clear step that the next one does not continue is a jump, too. No
+    jump is beside a pixel that was not measured.
 
-    Where three surfaces meet, two may lie on the same side of the mean: every clear step between
-    two pixels is a jump, too, unless the next one continues it, as on a steep face. At corners,
-    where the windows hold little of one surface, contours would have gaps: beside candidates, the
-    pixels by themselves are compared as the windows are. No jump is beside a pixel that was not
-    measured.
-
-    Of all of the image, or of every block of 4 x 4 pixels, in 1/m: the deviation of windows that
-    makes a `step`, that `between` two pixels, if larger, and the `slope` of surfaces, that is the
-    change of the inverse range from pixel to pixel.
+    In 1/m, of the image or of every block of 4 x 4 pixels: the deviation of windows that makes a
+    `step`, that `between` two pixels, if larger, and the `slope` of surfaces from pixel to pixel.
     """
     height, width = image.shape
     step, slope, between = (np.asarray(a, np.float32) for a in (step, slope, between))
