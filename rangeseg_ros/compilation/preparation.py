@@ -1,6 +1,6 @@
 """Everything that a configuration needs compiled, by several processes, and loaded.
 
-What it needs is told by a rehearsal: the pipeline on frames as small as it takes to run through all
+A rehearsal tells what it needs: the pipeline on frames as small as it takes to run through all
 of it.
 """
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.runtime.kernels import NotCompiledError, not_ahead, nothing_compiled
+from rangeseg_ros.core.runtime.kernels import compiled_by
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -67,14 +67,12 @@ def prepare(
     takes as long as to load it.
     """
     size = _EXACT_SIZE if config.exact else _SIZE
-    with not_ahead():
-        try:
-            with nothing_compiled():
-                rehearse(config, kinds, outputs, size)
-        except NotCompiledError:
-            report(_BEGIN)
-            _compile(report, config, kinds, outputs)
-            rehearse(config, kinds, outputs, size)
+
+    def ahead() -> None:
+        report(_BEGIN)
+        _compile(report, config, kinds, outputs)
+
+    compiled_by(ahead, lambda: rehearse(config, kinds, outputs, size))
 
 
 def show(progress: str) -> None:

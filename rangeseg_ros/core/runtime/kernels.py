@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,25 +34,25 @@ def compile_ahead_by(ahead: Callable[..., None]) -> None:
 
 
 def with_kernels(run: Callable[[], T], *needed: Any) -> T:
-    """Result of run(); where kernels are not compiled, after ahead(*needed) has compiled them."""
+    """Result of run(); where kernels are not compiled, after they were as `compile_ahead_by` says.
+
+    Not in a run of `compiled_by`, which does that itself.
+    """
     if _ahead is None or _inside.get():
         return run()
+    return compiled_by(partial(_ahead, *needed), run)
+
+
+def compiled_by(ahead: Callable[[], None], run: Callable[[], T]) -> T:
+    """Result of run(), after ahead() where kernels are not compiled."""
+    inside = copy_context()
+    inside.run(_inside.set, True)
     try:
         with nothing_compiled():
-            return run()
+            return inside.run(run)
     except NotCompiledError:
-        _ahead(*needed)
-    return run()
-
-
-@contextmanager
-def not_ahead() -> Iterator[None]:
-    """Compile nothing ahead in this thread: for what does that, and runs frames itself."""
-    token = _inside.set(True)
-    try:
-        yield
-    finally:
-        _inside.reset(token)
+        ahead()
+    return inside.run(run)
 
 
 @contextmanager

@@ -58,8 +58,9 @@ class Bins(NamedTuple):
         camera = Cells(side, 0, 0).camera(image.camera) if image.camera else None
         rays = camera.rays if camera else np.empty((rows, columns, 3), np.float32)
         body = image.body
-        for axis in (0, 1) if body is not None else ():
-            body = np.logical_or.reduceat(body, np.arange(0, image.shape[axis], side), axis)
+        if body is not None:
+            for axis, length in enumerate(image.shape):
+                body = np.logical_or.reduceat(body, np.arange(0, length, side), axis)
         means = replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
         bins = cls(side, image, means, spread, area)
         if camera is None:

@@ -86,7 +86,7 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 def completed_rays(
     rays: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
-    """Rays (H, W, 3) of a cloud, those that are not valid (H, W) by a polynomial through the others.
+    """Rays (H, W, 3) of a cloud; a polynomial through the valid (H, W) ones tells the others.
 
     Only between these, in their row or column; with the pixels that have a ray then. None where
     rays do not change smoothly over the grid.

@@ -79,8 +79,8 @@ def enlargement(image: RangeImage) -> Cells | None:
 def replication(image: RangeImage) -> Cells | None:
     """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
 
-    The columns and rows at which neighbours differ are multiples of the factor apart. At least half
-    of the borders must show it: a few edges of an exact scene may lie at multiples by chance.
+    Columns and rows at which neighbours differ are multiples of the factor apart. At least half of
+    the borders must show it: a few edges of an exact scene may lie at multiples by chance.
     """
     (factor, columns), (other, rows) = _period(image.inverse), _period(image.inverse.T)
     return Cells(factor, rows, columns) if 0 < factor == other else None
