@@ -9,11 +9,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.runtime.work import step_within
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.enlargement import Cells
@@ -52,15 +50,15 @@ class Bins(NamedTuple):
         area = side**2 * pixel_area(image.rays)
         if side == 1:
             return cls(1, image, image, np.zeros(image.shape, np.float32), area)
-        rows, columns = (-(-length // side) for length in image.shape)
-        inverse, spread = np.empty((2, rows, columns), np.float32)
-        run_rows(_mean, rows, image.inverse, side, inverse, spread)
+        each = _squares(image.inverse, side)
+        each = each.reshape(side**2, *each.shape[2:])
+        count = (each > 0).sum(axis=0, dtype=np.float32)
+        inverse = each.sum(axis=0) / np.maximum(count, 1)
+        least = np.where(each > 0, each, np.float32(np.inf)).min(axis=0)
+        spread = np.maximum(each.max(axis=0) - least, 0)
         camera = Cells(side, 0, 0).camera(image.camera) if image.camera else None
-        rays = camera.rays if camera else np.empty((rows, columns, 3), np.float32)
-        body = image.body
-        if body is not None:
-            for axis, length in enumerate(image.shape):
-                body = np.logical_or.reduceat(body, np.arange(0, length, side), axis)
+        rays = camera.rays if camera else np.zeros((*inverse.shape, 3), np.float32)
+        body = None if image.body is None else _squares(image.body, side).any(axis=(0, 1))
         means = replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
         bins = cls(side, image, means, spread, area)
         if camera is None:
@@ -93,18 +91,42 @@ class Bins(NamedTuple):
 
         `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
         """
-        return self._averaged(steps)
-
-    def _averaged(self, steps: NDArray[np.float32]) -> RangeImage:
-        inverse = self.means.inverse.copy()
-        # A camera has the rays of its bins.
-        rays = (self.means.rays if self.means.camera is None else self.means.rays[:0]).copy()
+        rows, columns = self.spread.shape
+        limits = steps.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:rows, :columns]
         slope = np.float32(_STEEPEST * self.area**0.5)
-        given = self.pixels.inverse, self.pixels.rays, self.side, self.spread, steps, slope
-        run_rows(_average, len(inverse), *given, inverse, rays)
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
-        return replace(self.means, inverse=inverse, rays=rays if rays.size else self.means.rays)
+        return self._averaged(limits + slope * self.means.inverse)
+
+    def _averaged(self, limits: NDArray[np.float32]) -> RangeImage:
+        """Means of what is within a limit of the median, in bins that spread farther."""
+        wide = (self.spread >= limits) & self.means.valid
+        values = _squares(self.pixels.inverse, self.side)[:, :, wide].reshape(self.side**2, -1)
+        known = values > 0
+        # Of two surfaces that are as large, the nearer one.
+        ordered = np.sort(np.where(known, values, np.float32(np.inf)), axis=0)
+        middle = np.take_along_axis(ordered, known.sum(axis=0)[None] // 2, axis=0)
+        kept = known & (np.abs(values - middle) <= limits[wide])
+        inverse, rays = self.means.inverse.copy(), self.means.rays
+        inverse[wide] = _means(values, kept)
+        if self.means.camera is None:
+            some = _squares(self.pixels.rays, self.side)[:, :, wide]
+            rays = rays.copy()
+            rays[wide] = _means(some.reshape(*values.shape, 3), kept[..., None])
+        return replace(self.means, inverse=inverse, rays=rays)
+
+
+def _squares(pixels: NDArray, side: int) -> NDArray:
+    """Pixels (H, W, ...) by their place in a bin: (side, side, rows, columns, ...)."""
+    margin = [(0, -length % side) for length in pixels.shape[:2]]
+    padded = np.pad(pixels, margin + [(0, 0)] * (pixels.ndim - 2))
+    rows, columns = (length // side for length in padded.shape[:2])
+    squares = padded.reshape(rows, side, columns, side, *pixels.shape[2:])
+    return np.moveaxis(squares, (1, 3), (0, 1))
+
+
+def _means(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Means (N, ...) of those of the values (K, N, ...) that are kept."""
+    total: NDArray[np.float64] = np.where(kept, values, 0).astype(np.float64).sum(axis=0)
+    return total / kept.sum(axis=0)
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
@@ -119,69 +141,3 @@ def pixel_area(rays: NDArray[np.float32]) -> float:
     across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
     area = np.linalg.norm(np.cross(across, down), axis=2) / step**2
     return float(np.median(area)) if area.size else 0.0
-
-
-@njit(cache=True, nogil=True)
-def _mean(
-    first: int,
-    after: int,
-    pixels: NDArray[np.float32],
-    side: int,
-    inverse: NDArray[np.float32],
-    spread: NDArray[np.float32],
-) -> None:
-    """Fill in means and spreads of all that was measured in some rows of bins."""
-    for i in range(first, after):
-        for j in range(inverse.shape[1]):
-            total, count, least, most = np.float32(0), 0, np.float32(np.inf), np.float32(0)
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    y = pixels[u, v]
-                    total, count, most = total + y, count + (y > 0), max(most, y)
-                    least = min(least, y if y > 0 else least)
-            inverse[i, j] = total / np.float32(max(count, 1))
-            spread[i, j] = most - least if count > 0 else np.float32(0)
-
-
-@njit(cache=True, nogil=True)
-def _average(
-    first: int,
-    after: int,
-    pixels: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    side: int,
-    spread: NDArray[np.float32],
-    steps: NDArray[np.float32],
-    slope: np.float32,
-    inverse: NDArray[np.float32],
-    means: NDArray[np.float32],
-) -> None:
-    """Average inverse ranges within a step of the median in some rows of bins that spread farther.
-
-    And rays where there is room for them.
-    """
-    values = np.empty(side * side, np.float32)
-    for i in range(first, after):
-        for j in range(inverse.shape[1]):
-            step = steps[i // BLOCK, j // BLOCK] + slope * inverse[i, j]
-            if spread[i, j] < step:
-                continue
-            count = 0
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    if pixels[u, v] > 0:
-                        values[count] = pixels[u, v]
-                        count += 1
-            if count == 0:
-                continue
-            # Of two surfaces that are as large, the nearer one.
-            middle = np.sort(values[:count])[count // 2] if step < np.inf else values[0]
-            total, used, x, y, z = 0.0, 0, 0.0, 0.0, 0.0
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    if pixels[u, v] > 0 and abs(pixels[u, v] - middle) <= step:
-                        total, used = total + pixels[u, v], used + 1
-                        x, y, z = x + rays[u, v, 0], y + rays[u, v, 1], z + rays[u, v, 2]
-            inverse[i, j] = total / used
-            if len(means) > 0:
-                means[i, j, 0], means[i, j, 1], means[i, j, 2] = x / used, y / used, z / used

@@ -37,8 +37,6 @@ def bridge_holes(
     # A camera has rays everywhere; those of a cloud lie between its points.
     rays = (image.rays if image.camera is None else image.rays[:0]).copy()
     run_rows(_bridge, len(inverse), holes, image.inverse, steps, slopes, inverse, rays)
-    # Like those it was made from, or every kernel that reads them is compiled twice.
-    rays.flags.writeable = False
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
 
 

@@ -39,8 +39,6 @@ class Cells(NamedTuple):
         picked = np.ix_(*middles)
         camera = self.camera(image.camera) if image.camera else None
         rays = image.rays[picked] if camera is None else camera.rays
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
         body = None if image.body is None else image.body[picked]
         return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
 
