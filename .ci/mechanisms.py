@@ -152,7 +152,7 @@ MECHANISMS = (
     Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'runtime/work.py', {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',
               {'segmenter.bin_side': _returning(1)}),
-    Mechanism('bins of one surface', 'sensing/binning.py:_average',
+    Mechanism('bins of one surface', 'sensing/binning.py:of_one_surface',
               {'sensing.binning.Bins.of_one_surface': lambda _: lambda bins, steps: bins.means}),
     Mechanism('borders of pixels, not of bins', 'by_planes/borders.py',
               {'segmenter.with_sharp_borders': lambda _: lambda regions, surfaces, models, image,

@@ -5,6 +5,7 @@ Planes are smooth, so that they are found in bins; pixels are looked at where bo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -50,21 +51,20 @@ class Bins(NamedTuple):
         area = side**2 * pixel_area(image.rays)
         if side == 1:
             return cls(1, image, image, np.zeros(image.shape, np.float32), area)
-        each = _squares(image.inverse, side)
-        each = each.reshape(side**2, *each.shape[2:])
-        count = (each > 0).sum(axis=0, dtype=np.float32)
-        inverse = each.sum(axis=0) / np.maximum(count, 1)
-        least = np.where(each > 0, each, np.float32(np.inf)).min(axis=0)
+        each = np.stack(_places(image.inverse, side))
+        known = each > 0
+        least = np.where(known, each, np.float32(np.inf)).min(axis=0)
         spread = np.maximum(each.max(axis=0) - least, 0)
-        camera = Cells(side, 0, 0).camera(image.camera) if image.camera else None
-        rays = camera.rays if camera else np.zeros((*inverse.shape, 3), np.float32)
-        body = None if image.body is None else _squares(image.body, side).any(axis=(0, 1))
-        means = replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
-        bins = cls(side, image, means, spread, area)
-        if camera is None:
-            endless = np.full_like(spread, np.inf)
-            bins = bins._replace(means=bins._replace(spread=endless)._averaged(endless))
-        return bins
+        if image.camera:
+            camera = Cells(side, 0, 0).camera(image.camera)
+            inverse = each.sum(axis=0) / np.maximum(known.sum(axis=0, dtype=np.float32), 1)
+            means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)
+        else:
+            rays = _means(_places(image.rays, side), known[..., None])
+            means = replace(image, rays=rays, inverse=_means(each, known))
+        if image.body is not None:
+            means = replace(means, body=np.any(_places(image.body, side), axis=0))
+        return cls(side, image, means, spread, area)
 
     def noise_of_pixels(self, sensor: SensorModel) -> float:
         """Random variance of a pixel over that of its bin, which `sensor` tells.
@@ -93,13 +93,9 @@ class Bins(NamedTuple):
         """
         rows, columns = self.spread.shape
         limits = steps.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:rows, :columns]
-        slope = np.float32(_STEEPEST * self.area**0.5)
-        return self._averaged(limits + slope * self.means.inverse)
-
-    def _averaged(self, limits: NDArray[np.float32]) -> RangeImage:
-        """Means of what is within a limit of the median, in bins that spread farther."""
+        limits = limits + np.float32(_STEEPEST * self.area**0.5) * self.means.inverse
         wide = (self.spread >= limits) & self.means.valid
-        values = _squares(self.pixels.inverse, self.side)[:, :, wide].reshape(self.side**2, -1)
+        values = np.stack([each[wide] for each in _places(self.pixels.inverse, self.side)])
         known = values > 0
         # Of two surfaces that are as large, the nearer one.
         ordered = np.sort(np.where(known, values, np.float32(np.inf)), axis=0)
@@ -108,25 +104,26 @@ class Bins(NamedTuple):
         inverse, rays = self.means.inverse.copy(), self.means.rays
         inverse[wide] = _means(values, kept)
         if self.means.camera is None:
-            some = _squares(self.pixels.rays, self.side)[:, :, wide]
             rays = rays.copy()
-            rays[wide] = _means(some.reshape(*values.shape, 3), kept[..., None])
+            some = [each[wide] for each in _places(self.pixels.rays, self.side)]
+            rays[wide] = _means(some, kept[..., None])
         return replace(self.means, inverse=inverse, rays=rays)
 
 
-def _squares(pixels: NDArray, side: int) -> NDArray:
-    """Pixels (H, W, ...) by their place in a bin: (side, side, rows, columns, ...)."""
+def _places(pixels: NDArray, side: int) -> list[NDArray]:
+    """The first pixel of every bin, the second, ...: views (rows, columns, ...) of (H, W, ...)."""
     margin = [(0, -length % side) for length in pixels.shape[:2]]
-    padded = np.pad(pixels, margin + [(0, 0)] * (pixels.ndim - 2))
-    rows, columns = (length // side for length in padded.shape[:2])
-    squares = padded.reshape(rows, side, columns, side, *pixels.shape[2:])
-    return np.moveaxis(squares, (1, 3), (0, 1))
+    if np.any(margin):
+        pixels = np.pad(pixels, margin + [(0, 0)] * (pixels.ndim - 2))
+    return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
-def _means(values: NDArray[np.float32], kept: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Means (N, ...) of those of the values (K, N, ...) that are kept."""
-    total: NDArray[np.float64] = np.where(kept, values, 0).astype(np.float64).sum(axis=0)
-    return total / kept.sum(axis=0)
+def _means(values: Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Means (N, ...) of those of the values (K, N, ...) that are kept; 0 of none."""
+    total = np.zeros(values[0].shape)
+    for each, some in zip(values, kept, strict=True):
+        total += np.where(some, each, 0)
+    return (total / np.maximum(kept.sum(axis=0), 1)).astype(np.float32)
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
