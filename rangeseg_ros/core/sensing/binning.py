@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.work import step_within
-from rangeseg_ros.core.sensing.blocks import BLOCK
+from rangeseg_ros.core.sensing.blocks import BLOCK, for_pixels
 from rangeseg_ros.core.sensing.enlargement import Cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -91,9 +91,8 @@ class Bins(NamedTuple):
 
         `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
         """
-        rows, columns = self.spread.shape
-        limits = steps.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:rows, :columns]
-        limits = limits + np.float32(_STEEPEST * self.area**0.5) * self.means.inverse
+        slope = np.float32(_STEEPEST * self.area**0.5)
+        limits = for_pixels(steps, self.means.shape) + slope * self.means.inverse
         wide = (self.spread >= limits) & self.means.valid
         values = np.stack([each[wide] for each in _places(self.pixels.inverse, self.side)])
         known = values > 0
