@@ -143,9 +143,7 @@ def drop_outdated(package: Path) -> None:
         source = package.parent / name.replace('.', '/')
         for compiled in (source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'):
             compiled.unlink(missing_ok=True)
-    part = note.with_name(f'{note.name}.{os.getpid()}')
-    part.write_text(json.dumps(now))
-    os.replace(part, note)
+    _replace(note, json.dumps(now).encode())
 
 
 def _read(note: Path) -> dict[str, str]:
@@ -185,12 +183,16 @@ def _copy_compiled(folder: Path) -> None:
     for compiled in PACKAGE.rglob('__pycache__/*.nb[ic]'):
         source = compiled.parents[1] / '__init__.py'
         target = folder / _CacheLocator.get_suitable_cache_subpath(source) / compiled.name
-        if target.exists():
-            continue
-        target.parent.mkdir(exist_ok=True)
-        part = target.with_name(f'{target.name}.{os.getpid()}')
-        shutil.copy2(compiled, part)
-        os.replace(part, target)
+        if not target.exists():
+            target.parent.mkdir(exist_ok=True)
+            _replace(target, compiled.read_bytes())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file that is complete whenever it is there."""
+    part = path.with_name(f'{path.name}.{os.getpid()}')
+    part.write_bytes(content)
+    os.replace(part, path)
 
 
 def _warn(text: str) -> None:

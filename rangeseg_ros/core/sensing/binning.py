@@ -57,7 +57,8 @@ class Bins(NamedTuple):
         spread = np.maximum(each.max(axis=0) - least, 0)
         if image.camera:
             camera = Cells(side, 0, 0).camera(image.camera)
-            inverse = each.sum(axis=0) / np.maximum(known.sum(axis=0, dtype=np.float32), 1)
+            count = np.maximum(known.sum(axis=0), 1).astype(np.float32)
+            inverse: NDArray[np.float32] = np.divide(each.sum(axis=0), count)
             means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)
         else:
             rays = _means(_places(image.rays, side), known[..., None])
@@ -117,7 +118,7 @@ def _places(pixels: NDArray, side: int) -> list[NDArray]:
     return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
-def _means(values: Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _means(values: NDArray | Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Means (N, ...) of those of the values (K, N, ...) that are kept; 0 of none."""
     total = np.zeros(values[0].shape)
     for each, some in zip(values, kept, strict=True):

@@ -136,8 +136,7 @@ def shows_range(
     """Whether the planes are bent as those are whose range was taken for depth.
 
     Of a plane theta . ray = 1/z the range gives (theta . ray) / |ray|. Each plane tells its share
-    of that bend, 0 for depth and 1 for range; the likelihoods of the two are compared, with the
-    tails of Cauchy's distribution, as not everything that is labelled is flat.
+    of that bend, 0 for depth and 1 for range; Cauchy's distribution gives the likelihoods.
     """
     if image.camera is None:
         return False
