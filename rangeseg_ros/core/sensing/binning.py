@@ -61,8 +61,8 @@ class Bins(NamedTuple):
             inverse: NDArray[np.float32] = np.divide(each.sum(axis=0), count)
             means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)
         else:
-            rays = _means(_places(image.rays, side), known[..., None])
-            means = replace(image, rays=rays, inverse=_means(each, known))
+            xyz = [_means(_places(image.rays[..., k], side), known) for k in range(3)]
+            means = replace(image, rays=np.stack(xyz, axis=2), inverse=_means(each, known))
         if image.body is not None:
             means = replace(means, body=np.any(_places(image.body, side), axis=0))
         return cls(side, image, means, spread, area)
@@ -105,21 +105,21 @@ class Bins(NamedTuple):
         inverse[wide] = _means(values, kept)
         if self.means.camera is None:
             rays = rays.copy()
-            some = [each[wide] for each in _places(self.pixels.rays, self.side)]
-            rays[wide] = _means(some, kept[..., None])
+            for k in range(3):
+                places = _places(self.pixels.rays[..., k], self.side)
+                rays[wide, k] = _means([each[wide] for each in places], kept)
         return replace(self.means, inverse=inverse, rays=rays)
 
 
 def _places(pixels: NDArray, side: int) -> list[NDArray]:
-    """The first pixel of every bin, the second, ...: views (rows, columns, ...) of (H, W, ...)."""
-    margin = [(0, -length % side) for length in pixels.shape[:2]]
-    if np.any(margin):
-        pixels = np.pad(pixels, margin + [(0, 0)] * (pixels.ndim - 2))
+    """The first pixel of every bin, the second, ...: views (rows, columns) of pixels (H, W)."""
+    margin = [(0, -length % side) for length in pixels.shape]
+    pixels = np.pad(pixels, margin) if np.any(margin) else pixels
     return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
 def _means(values: NDArray | Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Means (N, ...) of those of the values (K, N, ...) that are kept; 0 of none."""
+    """Means (...) of those of the values (K, ...) that are kept; 0 of none."""
     total = np.zeros(values[0].shape)
     for each, some in zip(values, kept, strict=True):
         total += np.where(some, each, 0)
