@@ -34,9 +34,9 @@ def compile_ahead_by(ahead: Callable[..., None]) -> None:
 
 
 def with_kernels(run: Callable[[], T], *needed: Any) -> T:
-    """Result of run(); where kernels are not compiled, after they were as `compile_ahead_by` says.
+    """Result of run(), after what `compile_ahead_by` was given has compiled kernels it lacks.
 
-    Not in a run of `compiled_by`, which does that itself.
+    `compiled_by` does that itself for all that it runs.
     """
     if _ahead is None or _inside.get():
         return run()

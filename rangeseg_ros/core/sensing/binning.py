@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.work import step_within
 from rangeseg_ros.core.sensing.blocks import BLOCK, for_pixels
-from rangeseg_ros.core.sensing.enlargement import Cells
+from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import chi2_quantile
@@ -56,7 +56,7 @@ class Bins(NamedTuple):
         least = np.where(known, each, np.float32(np.inf)).min(axis=0)
         spread = np.maximum(each.max(axis=0) - least, 0)
         if image.camera:
-            camera = Cells(side, 0, 0).camera(image.camera)
+            camera = camera_of_cells(Cells(side, 0, 0), image.camera)
             count = np.maximum(known.sum(axis=0), 1).astype(np.float32)
             inverse: NDArray[np.float32] = np.divide(each.sum(axis=0), count)
             means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)

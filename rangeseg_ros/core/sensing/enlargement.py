@@ -37,14 +37,10 @@ class Cells(NamedTuple):
             for size, cropped in ((height, self.rows), (width, self.columns))
         )
         picked = np.ix_(*middles)
-        camera = self.camera(image.camera) if image.camera else None
+        camera = camera_of_cells(self, image.camera) if image.camera else None
         rays = image.rays[picked] if camera is None else camera.rays
         body = None if image.body is None else image.body[picked]
         return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
-
-    def camera(self, camera: Camera) -> Camera:
-        """The camera that has a pixel for each cell."""
-        return _camera_of_cells(self, camera)
 
     def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
         """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""
@@ -54,8 +50,8 @@ class Cells(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
-    # Kept, as its rays are worked out only once. A cell's measurement is of its centre.
+def camera_of_cells(cells: Cells, camera: Camera) -> Camera:
+    """The camera that has a pixel for each cell, at its centre; kept, as its rays are."""
     k, middle = cells.factor, (cells.factor - 1) / 2
     return replace(
         camera,
