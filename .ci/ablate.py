@@ -140,13 +140,13 @@ def source_of(modules: str) -> tuple[int, int]:
     for entry in modules.split():
         name, _, functions = entry.partition(':')
         text = (CORE / name).read_text()
-        body = ast.parse(text).body
-        assigned = [s for s in body if isinstance(s, ast.Assign)]
+        tree = ast.parse(text)
+        assigned = [s for s in tree.body if isinstance(s, ast.Assign)]
         names = [n for s in assigned for n in ast.walk(s.targets[0]) if isinstance(n, ast.Name)]
         known = {name.id for name in names if name.id.isupper()}
         if not functions:
             lines, constants = lines + len(text.splitlines()), constants + len(known)
-        for node in body:
+        for node in ast.walk(tree):
             if getattr(node, 'name', None) in functions.split(',') and functions:
                 first = min([node.lineno, *(item.lineno for item in node.decorator_list)])
                 used = {item.id for item in ast.walk(node) if isinstance(item, ast.Name)}

@@ -67,8 +67,7 @@ def run_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R]:
 def attempt_all(tasks: Sequence[Task[R]], jobs: int | None = None) -> Iterator[R | Failure]:
     """Run tasks as `run_all` does, each to its result or `Failure`.
 
-    Tasks that are lost with a worker that dies are run again, each by itself. Workers end when
-    this process does, whatever ends it.
+    Tasks that are lost with a worker that dies are run again, each by itself.
     """
     jobs = min(jobs or os.cpu_count() or 1, len(tasks))
     if jobs <= 1:

@@ -15,8 +15,7 @@ from numba import types
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.compilation import preparation
-from rangeseg_ros.compilation.preparation import needs, prepare
-from rangeseg_ros.compilation.rehearsal import FIRST, KINDS, rehearse
+from rangeseg_ros.compilation.preparation import FIRST, KINDS, needs, prepare, rehearse
 from rangeseg_ros.compilation.worker import discover
 from rangeseg_ros.core.runtime.kernels import nothing_compiled
 from rangeseg_ros.core.runtime.work import STEPS

@@ -6,7 +6,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
-from rangeseg_ros.compilation.rehearsal import FIRST
+from rangeseg_ros.compilation.preparation import FIRST
 from rangeseg_ros.ros import settings
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.ros.settings import Settings

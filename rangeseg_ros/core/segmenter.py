@@ -19,8 +19,7 @@ from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
-from rangeseg_ros.core.runtime.kernels import load_lazily, with_kernels
-from rangeseg_ros.core.runtime.memory import keep_freed_memory
+from rangeseg_ros.core.runtime.kernels import with_kernels
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.runtime.work import Stopwatch
 from rangeseg_ros.core.segmentation import Segmentation
@@ -45,8 +44,6 @@ class Segmenter:
 
     def __init__(self, config: Config | None = None) -> None:
         self.config = config or Config()
-        keep_freed_memory()
-        load_lazily()
 
     def __repr__(self) -> str:
         changed = (

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from threading import Condition, Thread
 
-from rangeseg_ros.compilation.preparation import needs, prepare
-from rangeseg_ros.compilation.rehearsal import FIRST
+from rangeseg_ros.compilation.preparation import FIRST, needs, prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.ros.latest_ready import LatestReady

@@ -63,11 +63,8 @@ def choose_cache() -> None:
 
 def _choose_processor() -> None:
     """Have numba compile for the processor of the kernels in the package, as numba names these."""
-    try:
-        target = json.loads((PACKAGE / _TARGET).read_text())
-    except (OSError, ValueError):
-        return
-    if 'NUMBA_CPU_NAME' in os.environ:
+    target = _read(PACKAGE / _TARGET)
+    if not target or 'NUMBA_CPU_NAME' in os.environ:
         return
     from importlib import metadata
 
@@ -131,31 +128,30 @@ def _temporary_folder() -> Path:
             'no folder for compiled kernels can be written to; set NUMBA_CACHE_DIR to one'
         ) from None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    _warn(
-        'compiled kernels cannot be kept, so that every start compiles them: neither the package '
-        'nor a cache folder can be written to by this user alone; set NUMBA_CACHE_DIR to one that '
-        'can'
-    )
+    _warn('compiled kernels last as long as the process; set NUMBA_CACHE_DIR to a folder of yours')
     return folder
 
 
 def drop_outdated(package: Path) -> None:
     """Remove kernels compiled beside sources that have changed, or that import such sources."""
     note, now = package / _SOURCES, _digests(package)
-    try:
-        before = json.loads(note.read_text())
-    except (OSError, ValueError):
-        before = {}
+    before = _read(note)
     if now == before:
         return
-    changed = {name for name in now.keys() | before.keys() if now.get(name) != before.get(name)}
+    changed = {name for name, _ in now.items() ^ before.items()}
     for name in _dependents(package, changed):
         source = package.parent / name.replace('.', '/')
         for compiled in (source.parent / '__pycache__').glob(f'{source.name}.*.nb[ic]'):
             compiled.unlink(missing_ok=True)
-    part = note.with_name(f'{note.name}.{os.getpid()}')
-    part.write_text(json.dumps(now))
-    os.replace(part, note)
+    _replace(note, json.dumps(now).encode())
+
+
+def _read(note: Path) -> dict[str, str]:
+    """What was noted; nothing where that cannot be read."""
+    try:
+        return dict(json.loads(note.read_text()))
+    except (OSError, ValueError):
+        return {}
 
 
 def _digests(package: Path) -> dict[str, str]:
@@ -187,12 +183,16 @@ def _copy_compiled(folder: Path) -> None:
     for compiled in PACKAGE.rglob('__pycache__/*.nb[ic]'):
         source = compiled.parents[1] / '__init__.py'
         target = folder / _CacheLocator.get_suitable_cache_subpath(source) / compiled.name
-        if target.exists():
-            continue
-        target.parent.mkdir(exist_ok=True)
-        part = target.with_name(f'{target.name}.{os.getpid()}')
-        shutil.copy2(compiled, part)
-        os.replace(part, target)
+        if not target.exists():
+            target.parent.mkdir(exist_ok=True)
+            _replace(target, compiled.read_bytes())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Write a file that is complete whenever it is there."""
+    part = path.with_name(f'{path.name}.{os.getpid()}')
+    part.write_bytes(content)
+    os.replace(part, path)
 
 
 def _warn(text: str) -> None:

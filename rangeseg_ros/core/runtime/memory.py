@@ -1,4 +1,4 @@
-"""Memory that one frame frees and the next one needs again."""
+"""Memory that is freed, but that the system does not have back, of glibc's malloc."""
 
 from __future__ import annotations
 
@@ -6,22 +6,8 @@ import ctypes
 import os
 from collections.abc import Callable
 
-import numpy as np
-
-# What glibc's malloc learns from at most.
-_BLOCK = 30 << 20
 # M_ARENA_MAX of glibc's malloc.h.
 _ARENA_MAX = -8
-
-
-def keep_freed_memory() -> None:
-    """Have malloc keep freed memory for the next frame.
-
-    By itself glibc gives freed memory back to the system where there is more than twice the
-    largest block ever given back, and fresh pages cost a third of a frame's time. So it is
-    given back a large one. With another malloc nothing happens.
-    """
-    np.empty(_BLOCK, np.uint8)
 
 
 def share_memory() -> None:

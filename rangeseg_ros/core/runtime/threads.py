@@ -71,11 +71,7 @@ _lock = Lock()
 
 @contextmanager
 def sharing_cores() -> Iterator[None]:
-    """Work on one of several frames: threads that do so at the same time share the cores.
-
-    Where there is one core for each of them, they have no helpers, which would take from one frame
-    what they give to another.
-    """
+    """Work on one of several frames: threads that do so at the same time share the cores."""
     global _sharing
     with _lock:
         _sharing += 1
@@ -93,8 +89,7 @@ def _threads() -> int:
 def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
     """Run kernel(first, after, *arguments) on strips of the rows at the same time.
 
-    What one strip writes no other may touch: then the result is the same for any number of
-    threads.
+    What one strip writes no other may touch.
     """
     threads = _threads()
     count = max(min(_STRIPS * threads, rows // _ROWS), 1) if threads > 1 else 1
@@ -120,8 +115,7 @@ def map_halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T,
 def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> None:
     """Run kernel(rows, *arguments) on both halves of an image at once, then where they meet.
 
-    Two rows in the middle are left to the end, so that neither half sees the other change: the
-    result is the same for any number of threads.
+    Two rows in the middle are left to the end, so that neither half sees the other change.
     """
     middle = height // 2
     lower = Task(kernel, (min(middle + 1, height), height), *arguments)

@@ -5,18 +5,17 @@ Planes are smooth, so that they are found in bins; pixels are looked at where bo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.runtime.work import step_within
-from rangeseg_ros.core.sensing.blocks import BLOCK
-from rangeseg_ros.core.sensing.enlargement import Cells
+from rangeseg_ros.core.sensing.blocks import BLOCK, for_pixels
+from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import chi2_quantile
@@ -34,20 +33,10 @@ _STEEPEST = 1 / np.tan(np.radians(5))
 
 
 class Bins(NamedTuple):
-    """Squares of pixels of an image.
+    """Squares of `side` x `side` pixels of an image (H, W), and a pixel for each in `means`.
 
-    Attributes
-    ----------
-    side : int
-        Pixels along the side of each.
-    pixels : RangeImage
-        (H, W), the image.
-    means : RangeImage
-        (ceil(H / side), ceil(W / side)), a pixel for each: the mean of what was measured.
-    spread : (rows, columns) float32
-        Largest difference in each, 1/m.
-    area : float
-        Of a bin, see `pixel_area`.
+    That is the mean of what was measured, (ceil(H / side), ceil(W / side)); `spread` of the same
+    shape is the largest difference in each, 1/m. The `area` is that of a bin, see `pixel_area`.
     """
 
     side: int
@@ -62,23 +51,21 @@ class Bins(NamedTuple):
         area = side**2 * pixel_area(image.rays)
         if side == 1:
             return cls(1, image, image, np.zeros(image.shape, np.float32), area)
-        rows, columns = (-(-length // side) for length in image.shape)
-        inverse, spread = np.empty((2, rows, columns), np.float32)
-        run_rows(_mean, rows, image.inverse, side, inverse, spread)
-        camera = Cells(side, 0, 0).camera(image.camera) if image.camera else None
-        rays = camera.rays if camera else np.empty((rows, columns, 3), np.float32)
-        body = image.body
-        if body is not None:
-            margin = rows * side - len(body), columns * side - body.shape[1]
-            body = np.pad(body, [(0, more) for more in margin])
-            body = body.reshape(rows, side, columns, side).any(axis=(1, 3))
-        means = replace(image, rays=rays, inverse=inverse, camera=camera, body=body)
-        bins = cls(side, image, means, spread, area)
-        if camera is None:
-            endless = np.full((1, 1), np.inf, np.float32)
-            all_of_them = bins._replace(spread=np.full_like(spread, np.inf))
-            bins = bins._replace(means=all_of_them._averaged(endless, max(rows, columns)))
-        return bins
+        each = np.stack(_places(image.inverse, side))
+        known = each > 0
+        least = np.where(known, each, np.float32(np.inf)).min(axis=0)
+        spread = np.maximum(each.max(axis=0) - least, 0)
+        if image.camera:
+            camera = camera_of_cells(Cells(side, 0, 0), image.camera)
+            count = np.maximum(known.sum(axis=0), 1).astype(np.float32)
+            inverse: NDArray[np.float32] = np.divide(each.sum(axis=0), count)
+            means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)
+        else:
+            xyz = [_means(_places(image.rays[..., k], side), known) for k in range(3)]
+            means = replace(image, rays=np.stack(xyz, axis=2), inverse=_means(each, known))
+        if image.body is not None:
+            means = replace(means, body=np.any(_places(image.body, side), axis=0))
+        return cls(side, image, means, spread, area)
 
     def noise_of_pixels(self, sensor: SensorModel) -> float:
         """Random variance of a pixel over that of its bin, which `sensor` tells.
@@ -103,24 +90,40 @@ class Bins(NamedTuple):
     def of_one_surface(self, steps: NDArray[np.float32]) -> RangeImage:
         """Means of the measurements near each bin's median: a jump mixes no two surfaces.
 
-        Parameters
-        ----------
-        steps : (rows, columns) float32
-            Smallest jump in blocks of 4 x 4 bins, 1/m.
+        `steps` are the smallest jumps in blocks of 4 x 4 bins, 1/m.
         """
-        return self._averaged(steps, BLOCK)
-
-    def _averaged(self, steps: NDArray[np.float32], block: int) -> RangeImage:
-        inverse, rays = self.means.inverse.copy(), np.empty((0, 0, 3), np.float32)
-        if self.means.camera is None:
-            rays = self.means.rays.copy()
         slope = np.float32(_STEEPEST * self.area**0.5)
-        given = self.pixels.inverse, self.pixels.rays, self.side, self.spread, steps, block, slope
-        run_rows(_average, len(inverse), *given, inverse, rays)
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
-        rays = rays if self.means.camera is None else self.means.rays
+        limits = for_pixels(steps, self.means.shape) + slope * self.means.inverse
+        wide = (self.spread >= limits) & self.means.valid
+        values = np.stack([each[wide] for each in _places(self.pixels.inverse, self.side)])
+        known = values > 0
+        # Of two surfaces that are as large, the nearer one.
+        ordered = np.sort(np.where(known, values, np.float32(np.inf)), axis=0)
+        middle = np.take_along_axis(ordered, known.sum(axis=0)[None] // 2, axis=0)
+        kept = known & (np.abs(values - middle) <= limits[wide])
+        inverse, rays = self.means.inverse.copy(), self.means.rays
+        inverse[wide] = _means(values, kept)
+        if self.means.camera is None:
+            rays = rays.copy()
+            for k in range(3):
+                places = _places(self.pixels.rays[..., k], self.side)
+                rays[wide, k] = _means([each[wide] for each in places], kept)
         return replace(self.means, inverse=inverse, rays=rays)
+
+
+def _places(pixels: NDArray, side: int) -> list[NDArray]:
+    """The first pixel of every bin, the second, ...: views (rows, columns) of pixels (H, W)."""
+    margin = [(0, -length % side) for length in pixels.shape]
+    pixels = np.pad(pixels, margin) if np.any(margin) else pixels
+    return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
+
+
+def _means(values: NDArray | Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Means (...) of those of the values (K, ...) that are kept; 0 of none."""
+    total = np.zeros(values[0].shape)
+    for each, some in zip(values, kept, strict=True):
+        total += np.where(some, each, 0)
+    return (total / np.maximum(kept.sum(axis=0), 1)).astype(np.float32)
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
@@ -135,70 +138,3 @@ def pixel_area(rays: NDArray[np.float32]) -> float:
     across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
     area = np.linalg.norm(np.cross(across, down), axis=2) / step**2
     return float(np.median(area)) if area.size else 0.0
-
-
-@njit(cache=True, nogil=True)
-def _mean(
-    first: int,
-    after: int,
-    pixels: NDArray[np.float32],
-    side: int,
-    inverse: NDArray[np.float32],
-    spread: NDArray[np.float32],
-) -> None:
-    """Fill in means and spreads of all that was measured in some rows of bins."""
-    for i in range(first, after):
-        for j in range(inverse.shape[1]):
-            total, count, least, most = np.float32(0), 0, np.float32(np.inf), np.float32(0)
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    y = pixels[u, v]
-                    total, count, most = total + y, count + (y > 0), max(most, y)
-                    least = min(least, y if y > 0 else least)
-            inverse[i, j] = total / np.float32(max(count, 1))
-            spread[i, j] = most - least if count > 0 else np.float32(0)
-
-
-@njit(cache=True, nogil=True)
-def _average(
-    first: int,
-    after: int,
-    pixels: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    side: int,
-    spread: NDArray[np.float32],
-    steps: NDArray[np.float32],
-    block: int,
-    slope: np.float32,
-    inverse: NDArray[np.float32],
-    means: NDArray[np.float32],
-) -> None:
-    """Average what lies within a step of the median, in some rows of bins that spread farther.
-
-    Inverse ranges, and rays where there is room for them.
-    """
-    values = np.empty(side * side, np.float32)
-    for i in range(first, after):
-        for j in range(inverse.shape[1]):
-            step = steps[i // block, j // block] + slope * inverse[i, j]
-            if spread[i, j] < step:
-                continue
-            count = 0
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    if pixels[u, v] > 0:
-                        values[count] = pixels[u, v]
-                        count += 1
-            if count == 0:
-                continue
-            # Of two surfaces that are as large, the nearer one.
-            middle = np.sort(values[:count])[count // 2] if step < np.inf else values[0]
-            total, used, x, y, z = 0.0, 0, 0.0, 0.0, 0.0
-            for u in range(i * side, min((i + 1) * side, pixels.shape[0])):
-                for v in range(j * side, min((j + 1) * side, pixels.shape[1])):
-                    if pixels[u, v] > 0 and abs(pixels[u, v] - middle) <= step:
-                        total, used = total + pixels[u, v], used + 1
-                        x, y, z = x + rays[u, v, 0], y + rays[u, v, 1], z + rays[u, v, 2]
-            inverse[i, j] = total / used
-            if len(means) > 0:
-                means[i, j, 0], means[i, j, 1], means[i, j, 2] = x / used, y / used, z / used

@@ -69,6 +69,12 @@ class Blocks(NamedTuple):
         return cls(moments, *(np.empty((rows, columns)) for _ in range(4)))
 
 
+def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
+    """Values of the blocks, or one for all, for the pixels (H, W) of each."""
+    blocks = np.broadcast_to(values, [-(-length // BLOCK) for length in shape])
+    return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=0)[: shape[0], : shape[1]]
+
+
 @njit(cache=True, nogil=True)
 def _sum_pixels(
     first: int,

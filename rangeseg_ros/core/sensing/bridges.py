@@ -24,12 +24,10 @@ def bridge_holes(
 ) -> RangeImage:
     """The image with small holes interpolated.
 
-    Holes in a pattern come from registration to another camera, confidence masks and interlaced
-    readout: they part no surface. A missing pixel lies between two measured ones in its row,
-    column or diagonals. All such pairs must continue each other: their inverse ranges differ by
-    no more than a jump and the slope of the surface over their distance, which the two sides of a
-    shadow do not. The closest pair is interpolated. `steps` and `slopes` are the smallest jump,
-    and the change of the inverse range from pixel to pixel on surfaces, of every block, 1/m.
+    A missing pixel lies between two measured ones in its row, column or diagonals. All such pairs
+    must continue each other: their inverse ranges differ by no more than a jump and the slope of
+    the surface over their distance, which the two sides of a shadow do not. The closest pair is
+    interpolated. `steps` and `slopes`, from pixel to pixel, are those of every block, 1/m.
     """
     known = image.valid.view(np.uint8)
     holes = cv2.dilate(known, np.ones((2 * SPAN - 1, 2 * SPAN - 1), np.uint8)) > known
@@ -39,8 +37,6 @@ def bridge_holes(
     # A camera has rays everywhere; those of a cloud lie between its points.
     rays = (image.rays if image.camera is None else image.rays[:0]).copy()
     run_rows(_bridge, len(inverse), holes, image.inverse, steps, slopes, inverse, rays)
-    # Like those it was made from, or every kernel that reads them is compiled twice.
-    rays.flags.writeable = False
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
 
 

@@ -32,10 +32,9 @@ _SMOOTH = 0.5  # largest error, in pixels, of a grid that is smooth
 def camera_of(points: NDArray[np.floating], valid: NDArray[np.bool_]) -> Camera | None:
     """The pinhole camera that points (H, W, 3), metres, lie on the rays of where valid (H, W).
 
-    In its optical frame x / z is linear in the column then, and y / z in the row. Lenses and
-    scanners bend the lines by far more than what is let pass. The camera is at the origin where
-    points tell no other place, as those of a single plane. None where points lie on no such rays,
-    or fill less than half of the rows or columns: rays of the others would be guessed.
+    In its optical frame x / z is linear in the column then, and y / z in the row. The camera is at
+    the origin where points tell no other place, as those of a single plane. None where points lie
+    on no such rays, or fill less than half of the rows or columns.
     """
     height, width = valid.shape
     # Odd steps, as holes come in every second row or column.
@@ -87,11 +86,10 @@ def axes_of_frame(rays: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArra
 def completed_rays(
     rays: NDArray[np.float32], valid: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]] | None:
-    """Rays (H, W, 3) of a cloud, with unit vectors between others where they are not valid (H, W).
+    """Rays (H, W, 3) of a cloud; a polynomial through the valid (H, W) ones tells the others.
 
-    They change so smoothly over the grid that a polynomial through the others tells them; None
-    where they do not. And the pixels with measured ones on either side, in their row or column:
-    beyond these, a polynomial goes anywhere.
+    Only between these, in their row or column; with the pixels that have a ray then. None where
+    rays do not change smoothly over the grid.
     """
     down, across = (max(size // _GRID, 1) for size in valid.shape)
     v, u = np.nonzero(valid[::down, ::across])
@@ -111,8 +109,8 @@ def completed_rays(
         before = np.logical_or.accumulate(valid, axis)
         between |= before & np.flip(np.logical_or.accumulate(np.flip(valid, axis), axis), axis)
     v, u = np.nonzero(between & ~valid)
-    completed = rays.copy()
     found = _basis(v, u, valid.shape) @ coefficients
+    completed = rays.copy()
     completed[v, u] = found / np.linalg.norm(found, axis=1, keepdims=True)
     return completed, between
 

@@ -37,16 +37,10 @@ class Cells(NamedTuple):
             for size, cropped in ((height, self.rows), (width, self.columns))
         )
         picked = np.ix_(*middles)
-        camera = self.camera(image.camera) if image.camera else None
+        camera = camera_of_cells(self, image.camera) if image.camera else None
         rays = image.rays[picked] if camera is None else camera.rays
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
         body = None if image.body is None else image.body[picked]
         return replace(image, rays=rays, inverse=image.inverse[picked], camera=camera, body=body)
-
-    def camera(self, camera: Camera) -> Camera:
-        """The camera that has a pixel for each cell."""
-        return _camera_of_cells(self, camera)
 
     def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
         """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""
@@ -56,8 +50,8 @@ class Cells(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
-    # Kept, as its rays are worked out only once. A cell's measurement is of its centre.
+def camera_of_cells(cells: Cells, camera: Camera) -> Camera:
+    """The camera that has a pixel for each cell, at its centre; kept, as its rays are."""
     k, middle = cells.factor, (cells.factor - 1) / 2
     return replace(
         camera,
@@ -79,9 +73,8 @@ def enlargement(image: RangeImage) -> Cells | None:
 def replication(image: RangeImage) -> Cells | None:
     """Cells of equal values, as nearest neighbours enlarge an image; None where there are none.
 
-    Neighbours differ at the borders of the cells only, so that the columns at which any differ are
-    multiples of the factor apart, and so are the rows. At least half of the borders must show it:
-    a few edges of an exact scene may lie at multiples by chance.
+    Columns and rows at which neighbours differ are multiples of the factor apart. At least half of
+    the borders must show it: a few edges of an exact scene may lie at multiples by chance.
     """
     (factor, columns), (other, rows) = _period(image.inverse), _period(image.inverse.T)
     return Cells(factor, rows, columns) if 0 < factor == other else None
@@ -102,10 +95,9 @@ def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
 def interpolation(image: RangeImage) -> Cells | None:
     """Cells between whose centres the depth is linear; None where it is not.
 
-    Second differences along a line vanish but beside the centres, at every k-th pixel: their
-    mean size per column has a line in its spectrum (Fisher, Tests of significance in harmonic
-    analysis, 1929). For k = 2, third differences have one. Which pixels are the centres does not
-    matter: one of every k x k pixels is as good as another.
+    Second differences vanish but beside the centres, at every k-th pixel: their mean size per
+    column has a line in its spectrum (Fisher, Tests of significance in harmonic analysis, 1929),
+    for k = 2 that of third differences. One of every k x k pixels is as good as another.
     """
     amplitude = np.full(_LARGEST + 1, np.inf)
     for lines in (image.inverse, image.inverse.T):

@@ -54,17 +54,14 @@ def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 
     2 m / (m + d) with the distance d of the points and its median m over the image.
     """
     valid = image.valid
-    across, down = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
+    connected = [valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]]
     if jumps is not None:
-        across, down = across & ~jumps[0], down & ~jumps[1]
-    horizontal, vertical = across.astype(np.float32), down.astype(np.float32)
+        connected = [edges & ~jump for edges, jump in zip(connected, jumps, strict=True)]
+    found = [edges.astype(np.float32) for edges in connected]
     if weighting == 'distance':
-        points = image.points
-        width = np.linalg.norm(points[:, 1:] - points[:, :-1], axis=2)
-        height = np.linalg.norm(points[1:] - points[:-1], axis=2)
-        known = np.concatenate([width[np.isfinite(width)], height[np.isfinite(height)]])
+        apart = [np.linalg.norm(np.diff(image.points, axis=axis), axis=2) for axis in (1, 0)]
+        known = np.concatenate([lengths[np.isfinite(lengths)] for lengths in apart])
         median = np.median(known) if known.size else np.float32(1)
-        with np.errstate(invalid='ignore'):
-            horizontal = np.where(across, 2 * median / (median + width), 0)
-            vertical = np.where(down, 2 * median / (median + height), 0)
-    return Grid(horizontal, vertical)
+        for edges, lengths, weight in zip(connected, apart, found, strict=True):
+            weight[edges] = 2 * median / (median + lengths[edges])
+    return Grid(*found)

@@ -73,10 +73,10 @@ def add_pixel(
     weight: float,
     ratio: float,
 ) -> None:
-    """Add a pixel, or as many as it stands for, to a moment vector (13,), but for the count.
+    """Add a pixel to a moment vector (13,), but for the count.
 
-    `weight` is 1 / random variance of its inverse range, `ratio` the systematic over the random
-    variance, each times these pixels.
+    `weight` is 1 / random variance, `ratio` the systematic over the random variance, each times
+    the pixels that it stands for.
     """
     x, y, z = np.float64(ray[0]), np.float64(ray[1]), np.float64(ray[2])
     for entry, value in enumerate(plus_pixel(NO_PIXEL, x, y, z, inverse, weight)):
@@ -139,10 +139,7 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 @njit(cache=True, error_model='numpy')
 def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
-    """What `fit` returns for the sum of two of N moment vectors (N, 13).
-
-    Without views and their reference counts: growing spends its time here.
-    """
+    """What `fit` returns for the sum of two of N moment vectors (N, 13), without views of them."""
     sums = (
         moments[k, 0] + moments[m, 0],
         moments[k, 1] + moments[m, 1],

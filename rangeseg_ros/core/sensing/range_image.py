@@ -54,6 +54,10 @@ class RangeImage:
     corrected: bool = False
     body: NDArray[np.bool_] | None = None
 
+    def __post_init__(self) -> None:
+        # Like those of cameras, or every kernel that reads them is compiled twice.
+        self.rays.flags.writeable = False
+
     def __repr__(self) -> str:
         kind = 'organised cloud' if self.camera is None else 'depth image'
         measured, said = self.inverse[self.valid], 'nothing measured'
@@ -167,8 +171,6 @@ class RangeImage:
         with np.errstate(over='ignore'):
             inverse = _reciprocal(np.sqrt(np.einsum('ijk,ijk->ij', cloud, cloud)), 1.0)
         rays = (cloud * inverse[..., None]).astype(np.float32)
-        # Like those of cameras, or every kernel that reads them is compiled twice.
-        rays.flags.writeable = False
         image = cls(rays, inverse)
         image._doubt_unit('points')
         return image

@@ -29,9 +29,7 @@ class SensorModel(NamedTuple):
     correlation: float  # width of the Gaussian the rest looks smoothed with, pixels; 0 for white
     distortion: float  # systematic, smooth
     range_distortion: float
-    distortion_length: (
-        float  # width of the Gaussian it is smoothed with at most, pixels, as stated
-    )
+    distortion_length: float  # width of the Gaussian it is smoothed with at most, pixels
     # Random error of a pixel's direction, pixels: what surfaces at grazing angles are noisier by.
     column_noise: float = 0.0
     row_noise: float = 0.0
@@ -70,13 +68,7 @@ class SensorModel(NamedTuple):
             alike = np.exp(-((line[:, None] - line) ** 2) / (4 * self.correlation**2))
         white = self.white / side**2
         left = white + (1 - self.white) * max(float(alike.mean()) ** 2, 1 / side**2)
-        return self.every(side)._replace(
-            noise=self.noise * left**0.5,
-            range_noise=self.range_noise * left**0.5,
-            white=white / left,
-            column_noise=self.column_noise * left**0.5 / side,
-            row_noise=self.row_noise * left**0.5 / side,
-        )
+        return self.every(side)._with_variance(left)._replace(white=white / left)
 
     def of_pixels(self, side: int, excess: float) -> SensorModel:
         """The model of pixels, of the means of whose squares this one is.
@@ -84,12 +76,16 @@ class SensorModel(NamedTuple):
         Their random variance is `excess` times that of the means, and what it is more is new in
         every pixel.
         """
-        return self.every(1 / side)._replace(
-            noise=self.noise * excess**0.5,
-            range_noise=self.range_noise * excess**0.5,
-            white=1 - (1 - self.white) / excess,
-            column_noise=self.column_noise * excess**0.5 * side,
-            row_noise=self.row_noise * excess**0.5 * side,
+        pixels = self.every(1 / side)._with_variance(excess)
+        return pixels._replace(white=1 - (1 - self.white) / excess)
+
+    def _with_variance(self, share: float) -> SensorModel:
+        """The model whose random variance is this share of it."""
+        return self._replace(
+            noise=self.noise * share**0.5,
+            range_noise=self.range_noise * share**0.5,
+            column_noise=self.column_noise * share**0.5,
+            row_noise=self.row_noise * share**0.5,
         )
 
     def __str__(self) -> str:

@@ -73,7 +73,7 @@ def judge(
             'enlarged; use the original.'
         )
     elif (share := filled_share(image)) > 0.01:
-        found[f'filled {share:.0%}'.replace('%', ' %')] = (
+        found[f'filled {100 * share:.0f} %'] = (
             'Pixels beside edges copy their neighbours: holes were filled; switch that off.'
         )
     if disparity:
@@ -124,22 +124,20 @@ def filled_share(image: RangeImage) -> float:
         jumps &= np.abs(before - after) > 0.05 * np.maximum(before, after)
         ending = _runs(lines)[:, :-1][jumps]
         beginning = _runs(lines[:, ::-1])[:, ::-1][:, 1:][jumps]
-        ending, beginning = ending[ending > 3], beginning[beginning > 3]
-        for one, other in ((ending, beginning), (beginning, ending)):
-            excess = len(one) - len(other)
-            certain = excess > SIGNIFICANT * (len(one) + len(other)) ** 0.5
-            if certain and one.sum() > 2 * other.sum():
-                most = max(most, float(one.sum() - other.sum()) / measured)
+        short, long = sorted(
+            (runs[runs > 3] for runs in (ending, beginning)), key=lambda runs: len(runs)
+        )
+        certain = len(long) - len(short) > SIGNIFICANT * (len(long) + len(short)) ** 0.5
+        if certain and long.sum() > 2 * short.sum():
+            most = max(most, float(long.sum() - short.sum()) / measured)
     return most
 
 
 def _runs(lines: NDArray[np.float32]) -> NDArray[np.int32]:
     """How many pixels up to each one have its value."""
     places = np.arange(lines.shape[1], dtype=np.int32)
-    begins = np.ones(lines.shape, np.bool_)
-    begins[:, 1:] = lines[:, 1:] != lines[:, :-1]
-    first = np.maximum.accumulate(np.where(begins, places, 0), axis=1)
-    runs: NDArray[np.int32] = places - first + 1
+    begins = np.diff(lines, axis=1, prepend=np.float32(-1)) != 0
+    runs: NDArray[np.int32] = places - np.maximum.accumulate(places * begins, axis=1) + 1
     return runs
 
 
@@ -149,8 +147,7 @@ def shows_range(
     """Whether the planes are bent as those are whose range was taken for depth.
 
     Of a plane theta . ray = 1/z the range gives (theta . ray) / |ray|. Each plane tells its share
-    of that bend, 0 for depth and 1 for range; the likelihoods of the two are compared, with the
-    tails of Cauchy's distribution, as not everything that is labelled is flat.
+    of that bend, 0 for depth and 1 for range; Cauchy's distribution gives the likelihoods.
     """
     if image.camera is None:
         return False
@@ -197,7 +194,5 @@ def improbable_scale(image: RangeImage) -> float:
     step = np.median(steps)
     if np.mean(np.abs(steps - step) < 0.1 * step) < 0.5:
         return 0.0
-    for factor in _WRONG_UNITS:
-        if abs(step * factor / _KINECT_STEP - 1) < 0.05:
-            return factor
-    return 0.0
+    fitting = (f for f in _WRONG_UNITS if abs(step * f / _KINECT_STEP - 1) < 0.05)
+    return next(fitting, 0.0)
