@@ -8,6 +8,7 @@ from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 
 @pytest.fixture(scope='module')
@@ -52,3 +53,12 @@ def test_nothing_is_told_from_little():
     camera = simulate_kinect(kinect_room(731), seed=731).camera
     for depth in (np.zeros(camera.shape, np.uint16), np.full(camera.shape, 2000, np.uint16)):
         assert not shows_disparity(RangeImage.from_depth(depth, camera))
+
+
+@pytest.mark.parametrize('size', [(160, 120), (320, 240), (640, 480)])
+def test_a_crease_is_no_bend(size):
+    """Along a floor that meets a wall every block beside the other shows the same."""
+    camera = kinect_camera(*size)
+    depth = np.minimum(0.8 / np.maximum(camera.rays[..., 1], 1e-6), 3)
+    assert not shows_disparity(RangeImage.from_depth(depth, camera))
+    assert shows_disparity(RangeImage.from_depth(1 / depth, camera))

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.verdict import ODDS, SPREAD
+from rangeseg_ros.core.significance import CLEARLY
 
 # Pixels of VGA along the side of a block, wide enough to show the bend, and those that tell it.
 _SIDE, _SAMPLES = 48, 8
@@ -37,11 +38,14 @@ def shows_disparity(image: RangeImage) -> bool:
     share = (left * bend).sum(axis=1) / square
     noise = ((left - share[:, None] * bend) ** 2).sum(axis=1) / (_SAMPLES**2 - 4)
     noise += (np.finfo(np.float32).eps * inverse.max(axis=(1, 2))) ** 2
+    # What is rougher than most, as where surfaces meet, is no part of a plane.
+    rough = noise / inverse.max(axis=(1, 2)) ** 2
+    flat = rough <= CLEARLY * np.median(rough)
     # Real planes differ by more than their noise tells.
     variance = noise / square + SPREAD**2
     odds = np.log1p(share**2 / variance) - np.log1p((share - 1) ** 2 / variance)
     # Of a curved surface, neighbours tell the same: two blocks count as one.
-    return bool(odds.sum() / 2 > ODDS)
+    return bool(odds[flat].sum() / 2 > ODDS)
 
 
 def from_disparity(image: RangeImage) -> RangeImage:
