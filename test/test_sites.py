@@ -19,11 +19,10 @@ def test_a_band_has_the_sites_so_near_to_a_label(reach):
         )
         links[0, :, -1] = links[1, -1] = 0
         pixels = labels.ravel(), links.reshape(2, -1)
-        start, sites = fronts(*pixels, width, count, rows)
+        data = np.zeros(labels.size, np.float32)
+        start, sites = fronts(GridLabelling.of(pixels[0], data, pixels[1], width), count, rows)
         for alpha in range(count):
-            labelling = GridLabelling.of(
-                pixels[0], np.zeros(labels.size, np.float32), *pixels[1:], width
-            )
+            labelling = GridLabelling.of(pixels[0], data, pixels[1], width)
             front = sites[start[alpha] : start[alpha + 1]]
             found = band(alpha, front, reach, labelling, rows)
             inside = np.zeros(labels.shape, bool)

@@ -35,36 +35,18 @@ class _Flow(NamedTuple):
     """State of a maximum flow: n nodes with up to four neighbours.
 
     The source stands for staying, the sink for switching.
-
-    Attributes
-    ----------
-    neighbour : (n, 4) int32
-        Node on each side, -1 for none.
-    residual : (n, 4) float64
-        What the edge to that side can still take.
-    terminal : (n,) float64
-        What the edge from the source, or to the sink where negative, can still take.
-    parent : (n,) int8
-        Side of the parent in its tree.
-    sink : (n,) bool
-        Whether the tree is that of the sink.
-    stamp, depth : (n,) int32
-        When the distance to the terminal was last known, and that distance.
-    queue : (n,) int32
-        Ring of the nodes from which the trees grow.
-    queued : (n,) bool
-        Whether a node is in it.
     """
 
-    neighbour: NDArray[np.int32]
-    residual: NDArray[np.float64]
+    neighbour: NDArray[np.int32]  # (n, 4), node on each side, -1 for none
+    residual: NDArray[np.float64]  # (n, 4), what the edge to that side can still take
+    # (n,), what the edge from the source, or to the sink where negative, can still take
     terminal: NDArray[np.float64]
-    parent: NDArray[np.int8]
-    sink: NDArray[np.bool_]
-    stamp: NDArray[np.int32]
-    depth: NDArray[np.int32]
-    queue: NDArray[np.int32]
-    queued: NDArray[np.bool_]
+    parent: NDArray[np.int8]  # (n,), side of the parent in its tree
+    sink: NDArray[np.bool_]  # (n,), whether the tree is that of the sink
+    stamp: NDArray[np.int32]  # (n,), when the distance to the terminal was last known
+    depth: NDArray[np.int32]  # (n,), that distance
+    queue: NDArray[np.int32]  # (n,), ring of the nodes from which the trees grow
+    queued: NDArray[np.bool_]  # (n,), whether a node is in it
 
 
 @njit(cache=True, nogil=True)
@@ -73,18 +55,10 @@ def minimum_cut(
 ) -> NDArray[np.bool_]:
     """Choice x (n,) bool that minimises sum excess x + sum link |x - x of the neighbour|.
 
-    Of several, the one that chooses fewest nodes.
-
-    Parameters
-    ----------
-    excess : (n,) float64
-        Cost of choosing a node, of either sign.
-    neighbour : (n, 4) int32
-        Node on each side of a grid, -1 for none: that node has this one on the opposite side,
-        k ^ 2 for side k.
-    link : (n, 4) float64
-        Cost of the edge to that side if its ends are not chosen alike, not negative; the same
-        seen from either end.
+    Of several, the one that chooses fewest nodes. `excess` (n,) is the cost of choosing a node, of
+    either sign. `neighbour` (n, 4) are the nodes on each side of a grid, -1 for none: that node
+    has this one on the opposite side, k ^ 2 for side k. `link` (n, 4) is the cost, not negative,
+    of the edge to that side if its ends are not chosen alike; the same seen from either end.
     """
     count = len(excess)
     flow = _Flow(
@@ -189,55 +163,35 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
         p, side = neighbour[p, side], side ^ 2
     pushed = residual[p, side]
     # From p up to the source, against the flow, and from its neighbour on to the sink.
-    a = p
-    while parent[a] != _TERMINAL:
-        k = parent[a]
-        above = neighbour[a, k]
-        pushed = min(pushed, residual[above, k ^ 2])
-        a = above
-    pushed = min(pushed, terminal[a])
-    b = neighbour[p, side]
-    while parent[b] != _TERMINAL:
-        k = parent[b]
-        pushed = min(pushed, residual[b, k])
-        b = neighbour[b, k]
-    pushed = min(pushed, -terminal[b])
-
+    for sink in range(2):
+        a = neighbour[p, side] if sink else p
+        while parent[a] != _TERMINAL:
+            k = parent[a]
+            above = neighbour[a, k]
+            pushed = min(pushed, residual[a, k] if sink else residual[above, k ^ 2])
+            a = above
+        pushed = min(pushed, abs(terminal[a]))
     found = 0
     residual[p, side] -= pushed
-    b = neighbour[p, side]
-    residual[b, side ^ 2] += pushed
-    a = p
-    while parent[a] != _TERMINAL:
-        k = parent[a]
-        above = neighbour[a, k]
-        residual[a, k] += pushed
-        residual[above, k ^ 2] -= pushed
-        if residual[above, k ^ 2] <= 0:
+    residual[neighbour[p, side], side ^ 2] += pushed
+    for sink in range(2):
+        a = neighbour[p, side] if sink else p
+        way = pushed if sink else -pushed
+        while parent[a] != _TERMINAL:
+            k = parent[a]
+            above = neighbour[a, k]
+            residual[a, k] -= way
+            residual[above, k ^ 2] += way
+            if (residual[a, k] if sink else residual[above, k ^ 2]) <= 0:
+                parent[a] = _ORPHAN
+                orphans[found] = a
+                found += 1
+            a = above
+        terminal[a] += way
+        if terminal[a] == 0:
             parent[a] = _ORPHAN
             orphans[found] = a
             found += 1
-        a = above
-    terminal[a] -= pushed
-    if terminal[a] <= 0:
-        parent[a] = _ORPHAN
-        orphans[found] = a
-        found += 1
-    while parent[b] != _TERMINAL:
-        k = parent[b]
-        above = neighbour[b, k]
-        residual[above, k ^ 2] += pushed
-        residual[b, k] -= pushed
-        if residual[b, k] <= 0:
-            parent[b] = _ORPHAN
-            orphans[found] = b
-            found += 1
-        b = above
-    terminal[b] += pushed
-    if terminal[b] >= 0:
-        parent[b] = _ORPHAN
-        orphans[found] = b
-        found += 1
     return found
 
 

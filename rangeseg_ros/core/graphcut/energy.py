@@ -20,17 +20,7 @@ from rangeseg_ros.core.sensing.grid import Grid
 def energy(
     data: NDArray[np.floating], labels: NDArray[np.integer], grid: Grid, smoothness: float
 ) -> float:
-    """Value of E for a labelling.
-
-    Parameters
-    ----------
-    data : (H, W) float
-        Data cost of each pixel's label.
-    labels : (H, W) int
-    grid : Grid
-    smoothness : float
-        Lambda.
-    """
+    """Value of E for labels (H, W) of data costs (H, W), lambda = `smoothness`."""
     across = grid.right[labels[:, 1:] != labels[:, :-1]]
     down = grid.below[labels[1:] != labels[:-1]]
     boundary = across.sum(dtype=float) + down.sum(dtype=float)
@@ -38,21 +28,11 @@ def energy(
 
 
 def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
-    """Lambda u of every edge, in the order of the sites.
+    """Lambda u of every edge of a grid (H, W), in the order of the sites; lambda = `smoothness`.
 
-    Parameters
-    ----------
-    grid : Grid
-        (H, W).
-    smoothness : float
-        Lambda.
-
-    Returns
-    -------
-    (2, H * W) float32
-        Of each pixel's edges to the right and down; 0 at the border. The edge between p and its
-        neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
-        the first pixel, where this counts from the end, there is a border as well.
+    (2, H * W): of each pixel's edges to the right and down; 0 at the border. The edge between p
+    and its neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
+    the first pixel, where this counts from the end, there is a border as well.
     """
     height, width = len(grid.right), grid.below.shape[1]
     result = np.empty((2, height, width), np.float32)
