@@ -33,24 +33,10 @@ def with_sharp_borders(
     sensor: SensorModel,
     prior: float,
 ) -> NDArray[np.uint16]:
-    """Labels (H, W) of the pixels of an image; 0 where nothing was measured.
+    """Labels (H, W) of the pixels of an image of errors `sensor`; 0 where nothing was measured.
 
-    Parameters
-    ----------
-    regions : (h, w) uint16
-        Labels of bins.
-    surfaces : (h, w) int32
-        Labels of the bins among those of `models`.
-    models : Models
-        Planes of the surfaces.
-    image : RangeImage
-        (H, W).
-    side : int
-        Pixels along the side of a bin.
-    sensor : SensorModel
-        Errors of the pixels.
-    prior : float
-        What a border between two pixels costs.
+    Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
+    (h, w) of these among the planes of `models`. A border between two pixels costs `prior`.
     """
     labels = np.empty(image.shape, np.uint16)
     run_rows(_enlarge, len(regions), regions, image.inverse, side, labels)

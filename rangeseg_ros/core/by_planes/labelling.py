@@ -33,26 +33,11 @@ def refine(
     moments: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.int32], Models]:
-    """Label the pixels with the planes of surfaces.
+    """Label the pixels with the planes of surfaces (rows, columns), which are those of blocks.
 
-    Parameters
-    ----------
-    problem : Problem
-    surfaces : (rows, columns) int32
-        Surface of each block, 0...K, 0 for none.
-    blocks : (rows, columns, 13) float64
-        Moments of the blocks, weighted.
-    moments : (K + 1, 13) float64
-        Of the surfaces.
-    sensor : SensorModel
-        Errors of the image that the blocks are of.
-
-    Returns
-    -------
-    labels : (n,) int32
-        0 = no plane.
-    models : Models
-        The planes the labelling was found for.
+    Given are the moments of the blocks (rows, columns, 13) and of the surfaces (K + 1, 13), and
+    the errors of the image. Returns the labels (n,), 0 for no plane, and the planes they were
+    found for.
     """
     models = Models.of(moments, sensor.distortion_pixels)
     # Windows as wide as the distortion tell the shifts: where it changes, larger ones tell
@@ -86,14 +71,14 @@ def _label_block_row(
     lowest cost among those of the blocks around it. Expansions that begin with these have less to
     change than those that begin with no plane, and end with a lower energy.
     """
-    size, width = NODE, problem.width
+    width = problem.width
     around = np.empty(9, np.int32)
     for bi in range(first, after):
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
             count = 0 if own > 0 else _labels_around(bi, bj, surfaces, around)
-            for i in range(bi * size, min((bi + 1) * size, len(labels) // width)):
-                for p in range(i * width + bj * size, i * width + min((bj + 1) * size, width)):
+            for i in range(bi * NODE, min((bi + 1) * NODE, len(labels) // width)):
+                for p in range(i * width + bj * NODE, i * width + min((bj + 1) * NODE, width)):
                     labels[p] = own if problem.weight[p] > 0 else 0
                     if count == 0 or problem.weight[p] == 0:
                         continue
@@ -129,7 +114,7 @@ def _expand_near(
     Label 0 is not expanded: what no plane explains costs it little more, and it gains nothing.
     """
     count = len(models.theta)
-    start, sites = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
+    start, sites = fronts(labelling, count, rows)
     for alpha in range(1, count):
         front = sites[start[alpha] : start[alpha + 1]]
         _expand(alpha, front, rows, _BAND, labelling, problem, models)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
-from rangeseg_ros.core.by_planes.region_graph import renumbered
+from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -20,8 +18,8 @@ _CHI2_LIMIT = chi2_quantile(3)
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
 # are merged at once: quantile 0.996.
 _CLEAR = 24.0
-WITHIN_PATCH = 2.0
-"""Systematic variances granted between blocks of a patch: that of a difference is twice one."""
+# Systematic variances granted between blocks of a patch: that of a difference is twice one.
+_GRANTED = 2.0
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = OUTLIER**2
 # Steps of a variance by which patches are told to be flatter: the mean residual of the largest
@@ -33,61 +31,34 @@ _LEVELS = 16 * _PER_VARIANCE
 _NONE = np.uint32(0xFFFFFFFF)
 
 
-class Patches(NamedTuple):
+def find_patches(
+    nodes: Nodes, sensor: SensorModel
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Connected blocks on one plane, over which the distortion is nearly constant.
 
-    Attributes
-    ----------
-    labels : (rows, columns) int32
-        Patch of each block: 0 for none, otherwise 1...P.
-    moments : (P + 1, 13) float64
-        Of the patches; zeros for 0.
+    The patch (rows, columns) of each block, 0 for none, otherwise 1...P, and moments (P + 1, 13).
     """
-
-    labels: NDArray[np.int32]
-    moments: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, nodes: Nodes, sensor: SensorModel) -> Patches:
-        """Patches of blocks (rows, columns)."""
-        shape = nodes.residual.shape
-        # No patch reaches over the middle, but neither does any reach across a large surface.
-        # Not even in a small image is one smaller than four blocks.
-        largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
-        halves = map_halves(_patches, shape[0], nodes, largest, sensor.agreement)
-        labels, moments = _put_together(*halves[0], *halves[1])
-        return cls(labels.reshape(shape), moments)
+    # No patch reaches over the middle, but neither does any reach across a large surface.
+    # Not even in a small image is one smaller than four blocks.
+    largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
+    halves = map_halves(_patches, len(nodes.residual), nodes, largest, sensor.agreement)
+    (upper, first), (lower, second) = halves
+    lower[lower > 0] += len(first) - 1
+    labels, moments = np.concatenate([upper, lower]), np.concatenate([first, second[1:]])
+    return labels.reshape(nodes.residual.shape), moments
 
 
 @njit(cache=True, nogil=True)
-def grow_patches(
-    first: int,
-    after: int,
-    nodes: Nodes,
-    largest: float,
-    agreement: float,
-) -> NDArray[np.intp]:
-    """Group some rows of blocks into patches.
+def _patches(
+    first: int, after: int, nodes: Nodes, largest: float, agreement: float
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Patches of at most `largest` pixels in some rows of blocks, 1...P, and their moments.
 
-    Parameters
-    ----------
-    first, after : int
-        The rows.
-    nodes : Nodes
-        The blocks.
-    largest : float
-        Pixels of the largest patch.
-    agreement : float
-        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
-
-    Returns
-    -------
-    ((after - first) * columns,) int
-        Number of the block that stands for each block's patch, its own for a block in none.
+    `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.
     """
     shape = after - first, nodes.residual.shape[1]
-    blocks = nodes.moments[first:after].copy().reshape(-1, SIZE)
-    residual = nodes.residual[first:after].copy().reshape(-1)
+    given = nodes.moments[first:after].copy().reshape(-1, SIZE)
+    blocks, residual = given.copy(), nodes.residual[first:after].copy().reshape(-1)
     right, below = nodes.right[first:after], nodes.below[first : max(after - 1, first)]
     smooth = np.zeros(len(blocks), np.bool_)
     for a in range(len(blocks)):
@@ -103,7 +74,7 @@ def grow_patches(
     for a in range(len(root)):
         if smooth[a]:
             root[a] = kept[grown[number[root[a]]]]
-    return root + first * shape[1]
+    return renumbered(root, given, 1.0)
 
 
 @njit(cache=True)
@@ -129,33 +100,12 @@ def _pairs(
 
 
 @njit(cache=True, error_model='numpy')
-def misfit(
-    extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float, agreement: float
-) -> float:
-    """How far two parts leave a common plane, in what noise and distortion are granted.
-
-    Parameters
-    ----------
-    extra : float
-        Chi-squared of the common plane less those of the parts' own.
-    moments : (N, 13) float64
-        Of all parts.
-    k, m : int
-        The two.
-    granted : float
-        Systematic variances.
-    agreement : float
-        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
-
-    Returns
-    -------
-    float
-        1 is too far.
-    """
+def _misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, agreement: float) -> float:
+    """Extra chi-squared of one plane for two of the parts (N, 13), in what it may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]
     pixels = first + second
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
-    return extra / (agreement * _CHI2_LIMIT + granted * ratio * first * second / pixels)
+    return extra / (agreement * _CHI2_LIMIT + _GRANTED * ratio * first * second / pixels)
 
 
 @njit(cache=True)
@@ -275,7 +225,7 @@ def _grow(
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
                     common = common_residual(moments, a, b)
                     extra = common - residual[a] - residual[b]
-                    apart = misfit(extra, moments, a, b, WITHIN_PATCH, agreement)
+                    apart = _misfit(extra, moments, a, b, agreement)
                     if apart < best:
                         best, partner, together = apart, b, common
             e = following
@@ -307,39 +257,3 @@ def _wait(
         after[last[level]] = a
     last[level], after[a] = a, _NONE
     return level
-
-
-@njit(cache=True)
-def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
-    """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
-    root = np.empty_like(parent)
-    for a in range(len(parent)):
-        b = a
-        while parent[b] != b:
-            b = parent[b]
-        root[a] = b
-    return root
-
-
-@njit(cache=True, nogil=True)
-def _patches(
-    first: int, after: int, nodes: Nodes, largest: float, agreement: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Patches in some rows of blocks, 1...P, and their moments."""
-    begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
-    roots = grow_patches(first, after, nodes, largest, agreement) - begin
-    return renumbered(roots, nodes.moments.reshape(-1, SIZE)[begin:end], 1.0)
-
-
-@njit(cache=True, nogil=True)
-def _put_together(
-    upper: NDArray[np.int32],
-    first: NDArray[np.float64],
-    lower: NDArray[np.int32],
-    second: NDArray[np.float64],
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Labels and moments of two halves as those of the whole."""
-    labels = np.concatenate((upper, lower))
-    for a in range(len(upper), len(labels)):
-        labels[a] += (labels[a] > 0) * (len(first) - 1)
-    return labels, np.concatenate((first, second[1:]))

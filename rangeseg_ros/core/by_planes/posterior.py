@@ -45,19 +45,9 @@ _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
 def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
-    """Posterior probability of each region to be a plane and no curved surface.
+    """Posterior probability (M + 1,) of each region to be a plane and no curved surface.
 
-    Parameters
-    ----------
-    fits : Fits
-        Of M + 1 regions.
-    prior : float
-        Share of planes among regions.
-
-    Returns
-    -------
-    (M + 1,) float64
-        The prior where nothing tells; 0 for region 0.
+    `prior` is the share of planes among regions: the result where nothing tells. 0 for region 0.
     """
     sums, sensor = fits.sums, fits.sensor
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)

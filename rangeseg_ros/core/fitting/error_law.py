@@ -54,22 +54,12 @@ class Law(NamedTuple):
 
 
 class Strata(NamedTuple):
-    """Blocks alike in range and slope: of each range first those of the smallest slope.
+    """Blocks alike in range and slope: of each range first those of the smallest slope."""
 
-    Attributes
-    ----------
-    blocks : (S, N) int
-        Flat indices of the blocks of each stratum.
-    squared, slope : (S,) float64
-        Medians of the squared inverse range, and of what is taken for the slope.
-    slopes : int
-        Strata of a range.
-    """
-
-    blocks: NDArray[np.intp]
-    squared: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    slopes: int
+    blocks: NDArray[np.intp]  # (S, N), flat indices of the blocks of each stratum
+    squared: NDArray[np.float64]  # (S,), medians of the squared inverse range
+    slope: NDArray[np.float64]  # (S,), of what is taken for the slope
+    slopes: int  # strata of a range
 
     @classmethod
     def of(cls, blocks: Blocks, used: NDArray[np.intp], slope: NDArray[np.float64]) -> Strata:

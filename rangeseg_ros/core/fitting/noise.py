@@ -50,17 +50,9 @@ _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 def measured_sensor(
     image: RangeImage, blocks: Blocks, prior: SensorModel, quanta: tuple[float, float]
 ) -> SensorModel:
-    """The errors that an image shows.
+    """The errors that an image shows in its blocks; the `prior` as far as it says too little.
 
-    Parameters
-    ----------
-    image : RangeImage
-    blocks : Blocks
-        Of the image.
-    prior : SensorModel
-        Taken as far as the image says too little.
-    quanta : tuple of 2 float
-        Steps that it is rounded to, see `quantisation`.
+    `quanta` are the steps that it is rounded to, see `quantisation`.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
@@ -115,22 +107,9 @@ def _over_scales(
 ) -> tuple[list[float], float, float, Law] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    Parameters
-    ----------
-    rays : (H, W, 3) float32
-        Of the image.
-    blocks, coarse : Blocks
-        Of 4 and 8 pixels.
-    noise : Law
-        What blocks of 8 pixels show.
-    least : Law
-        Of the noise.
-
-    Returns
-    -------
-    tuple or None
-        V(4), V(8), ... relative to `noise`; M(8) relative to it; the measured share of most
-        blocks; the largest distortion that any scale shows. None where too few blocks are flat.
+    Given are the rays (H, W, 3), blocks of 4 and 8 pixels, what the latter show, and the least
+    noise. V(4), V(8), ... relative to `noise`; M(8) relative to it; the measured share of most
+    blocks; the largest distortion that any scale shows. None where too few blocks are flat.
     """
     variance = _variances(noise, coarse)
     level = variance.repeat(2, axis=0).repeat(2, axis=1)

@@ -19,9 +19,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, sum_cells
+from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
 # Standard deviations of a correlation beyond which it is zero.
@@ -42,24 +42,12 @@ class Field(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Cells of regions as a field sees them; see `RegionSums` for which are whose.
+    """Cells of regions as a field sees them; see `RegionSums` for which are whose."""
 
-    Attributes
-    ----------
-    place : (N, 4) float64
-        Mean row and column of the pixels, and their variances.
-    pixels : (N,) float64
-        Number of them.
-    ray : (N, 3) float64
-        Sum of the weighted rays, times the standard deviation of the field.
-    deviation : (N,) float64
-        That deviation.
-    """
-
-    place: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    ray: NDArray[np.float64]
-    deviation: NDArray[np.float64]
+    place: NDArray[np.float64]  # (N, 4), mean row and column of the pixels, and their variances
+    pixels: NDArray[np.float64]  # (N,), number of them
+    ray: NDArray[np.float64]  # (N, 3), sum of the weighted rays, times the deviation
+    deviation: NDArray[np.float64]  # (N,), standard deviation of the field
 
     @classmethod
     def of(cls, sums: RegionSums, level: NDArray[np.float64], field: Field) -> Cells:
@@ -84,22 +72,9 @@ def distortion_field(sensor: SensorModel) -> Field:
 def theta_covariances(
     sums: RegionSums, theta: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
-    """Covariance of each plane in the form theta . ray = inverse range.
+    """Covariances (M + 1, 3, 3) of planes theta . ray = inverse range (M + 1, 3) of regions.
 
-    Parameters
-    ----------
-    sums : RegionSums
-        Of M + 1 regions.
-    theta : (M + 1, 3) float64
-        Their planes; zeros where there is none.
-    inverse : (M + 1, 3, 3) float64
-        A^-1.
-    sensor : SensorModel
-
-    Returns
-    -------
-    (M + 1, 3, 3) float64
-        Zeros where there is no plane.
+    `inverse` (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
     """
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
@@ -118,14 +93,15 @@ def theta_covariances(
             own += (_within(cells, field.width) * mean)[:, None] * centred
             upper, lower = map_halves(_between, len(theta), sums.start, cells, field.width)
             middle += upper + lower
-    middle += sum_cells(sums.start, own)[:, _FULL].reshape(-1, 3, 3)
+    upper = sum_by_label(sums.regions(), own, len(theta))
+    middle += upper[:, _FULL].reshape(-1, 3, 3)
     return sandwiches(inverse, middle)
 
 
 def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
-    plane = np.repeat(theta, np.diff(sums.start), axis=0)
-    total: NDArray[np.float64] = (plane * sums.cells[:, RAY : RAY + 3]).sum(axis=1)
+    plane, rays = theta[sums.regions()], sums.cells[:, RAY : RAY + 3]
+    total: NDArray[np.float64] = (plane * rays).sum(axis=1)
     return total / sums.cells[:, WEIGHT]
 
 
