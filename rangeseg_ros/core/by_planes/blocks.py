@@ -36,21 +36,22 @@ class Nodes(NamedTuple):
     def of(cls, view: View) -> Nodes:
         """Those of an image, holes bridged: a row of pixels alone determines no plane."""
         blocks, sensor = Blocks.of(view.whole, NODE), view.sensor
-        count = blocks.moments[..., COUNT]
-        kept = count >= _LEAST
-        whole = kept[: view.whole.shape[0] // NODE, : view.whole.shape[1] // NODE]
-        whole &= ~_crossed(view)
+        kept = blocks.moments[..., COUNT] >= _LEAST
+        kept[: view.whole.shape[0] // NODE, : view.whole.shape[1] // NODE] &= ~_crossed(view)
+        count = kept * blocks.moments[..., COUNT]
         level = random_variance(sensor, blocks.squared)
         tilt = tilt_variance(sensor, blocks.across, blocks.down) / level
         weight = kept / (level * (1 + tilt))
-        moments = weight[..., None] * blocks.moments
-        moments[..., COUNT] = kept * count
+        moments = blocks.moments
+        moments *= weight[..., None]
+        moments[..., COUNT] = count
         moments[..., RATIO] = count * weight * systematic_variance(sensor, blocks.squared)
-        moments[..., SLOPE] = moments[..., COUNT] * tilt
+        moments[..., SLOPE] = count * tilt
         # Blocks touch where an edge joins a pixel of one and a pixel of the other.
-        rows, columns = (np.arange(0, length, NODE) for length in view.whole.shape)
-        right = np.logical_or.reduceat(view.grid.right[:, 1::NODE] > 0, rows, axis=0)
-        below = np.logical_or.reduceat(view.grid.below[1::NODE] > 0, columns, axis=1)
+        across, down = view.grid.right[:, 1::NODE] > 0, view.grid.below[1::NODE] > 0
+        right, below = across[::NODE].copy(), down[:, ::NODE].copy()
+        right[: len(across) // NODE] |= across[1::NODE]
+        below[:, : down.shape[1] // NODE] |= down[:, 1::NODE]
         return cls(moments, weight * blocks.residual, right, below)
 
 

@@ -165,14 +165,9 @@ def _settle(
             least = np.float32(np.inf)
             for c in range(names[n, 0]):
                 label, cost = names[n, 1 + c], costs[n, k, c]
-                if u > 0 and inverse[u - 1, v] > 0:
-                    cost += prior * (labels[u - 1, v] != label)
-                if v > 0 and inverse[u, v - 1] > 0:
-                    cost += prior * (labels[u, v - 1] != label)
-                if u + 1 < height and inverse[u + 1, v] > 0:
-                    cost += prior * (labels[u + 1, v] != label)
-                if v + 1 < width and inverse[u, v + 1] > 0:
-                    cost += prior * (labels[u, v + 1] != label)
+                for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
+                    if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
+                        cost += prior * (labels[a, b] != label)
                 if cost < least:
                     best, least = label, cost
             labels[u, v] = best

@@ -57,46 +57,58 @@ def _patches(
     `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.
     """
     shape = after - first, nodes.residual.shape[1]
-    given = nodes.moments[first:after].copy().reshape(-1, SIZE)
-    blocks, residual = given.copy(), nodes.residual[first:after].copy().reshape(-1)
+    blocks = nodes.moments[first:after].copy().reshape(-1, SIZE)
+    residual = nodes.residual[first:after].copy().reshape(-1)
     right, below = nodes.right[first:after], nodes.below[first : max(after - 1, first)]
     smooth = np.zeros(len(blocks), np.bool_)
     for a in range(len(blocks)):
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
-    pairs = _pairs(smooth.reshape(shape), right, below)
     root = find_roots(_quads(blocks, residual, smooth.reshape(shape), right, below, largest))
     # Close together, as those that are left fit into the cache.
     kept = np.flatnonzero(smooth & (root == np.arange(len(root))))
     number = np.zeros(len(root), np.uint32)
     for k in range(len(kept)):
         number[kept[k]] = k
-    grown = _grow(blocks[kept], residual[kept], number[root], pairs, largest, agreement)
+    chains = _chains(number[root], smooth.reshape(shape), right, below, len(kept))
+    grown = _grow(blocks[kept], residual[kept], *chains, largest, agreement)
     for a in range(len(root)):
         if smooth[a]:
             root[a] = kept[grown[number[root[a]]]]
-    return renumbered(root, given, 1.0)
+    return renumbered(root, nodes.moments[first:after].reshape(-1, SIZE), 1.0)
 
 
 @njit(cache=True)
-def _pairs(
-    smooth: NDArray[np.bool_], right: NDArray[np.bool_], below: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """Numbers of smooth blocks that touch, (N, 2)."""
+def _chains(
+    number: NDArray[np.uint32],
+    smooth: NDArray[np.bool_],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    count: int,
+) -> tuple[NDArray[np.uint32], ...]:
+    """Half-edges between parts, `count` in number, of which smooth blocks touch.
+
+    `number` is the part of each block. The first and the last half-edge of each part, and of each
+    half-edge the next one and the part that it leads to.
+    """
     rows, columns = smooth.shape
-    pairs = np.empty((2 * rows * columns, 2), np.intp)
-    count = 0
+    head, tail = np.full(count, _NONE), np.full(count, _NONE)
+    link, target = np.full(4 * smooth.size, _NONE), np.empty(4 * smooth.size, np.uint32)
+    e = np.uint32(0)
     for i in range(rows):
         for j in range(columns):
-            here = i * columns + j
-            if not smooth[i, j]:
-                continue
-            if j + 1 < columns and right[i, j] and smooth[i, j + 1]:
-                pairs[count, 0], pairs[count, 1] = here, here + 1
-                count += 1
-            if i + 1 < rows and below[i, j] and smooth[i + 1, j]:
-                pairs[count, 0], pairs[count, 1] = here, here + columns
-                count += 1
-    return pairs[:count]
+            for u, v in ((i, j + 1), (i + 1, j)):
+                if u == rows or v == columns or not (smooth[i, j] and smooth[u, v]):
+                    continue
+                a, b = number[i * columns + j], number[u * columns + v]
+                if a == b or not (right[i, j] if u == i else below[i, j]):
+                    continue
+                for _ in range(2):
+                    target[e], link[e], head[a] = b, head[a], e
+                    if tail[a] == _NONE:
+                        tail[a] = e
+                    a, b = b, a
+                    e += np.uint32(1)
+    return head, tail, link, target
 
 
 @njit(cache=True, error_model='numpy')
@@ -160,30 +172,20 @@ def _quads(
 def _grow(
     moments: NDArray[np.float64],
     residual: NDArray[np.float64],
-    number: NDArray[np.uint32],
-    pairs: NDArray[np.intp],
+    head: NDArray[np.uint32],
+    tail: NDArray[np.uint32],
+    link: NDArray[np.uint32],
+    target: NDArray[np.uint32],
     largest: float,
     agreement: float,
 ) -> NDArray[np.uint32]:
     """Merge parts to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
 
-    Given are the parts' moments (N, 13) and residuals (N,), and of blocks the part of each and
-    which ones touch. Returns the root of each part's patch.
+    Given are the parts' moments (N, 13) and residuals (N,), and which touch, see `_chains`: the
+    lists of merged patches join in constant time. Returns the root of each part's patch.
     """
     count = len(moments)
-    # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
-    # Unsigned, as indices that may be negative take longer.
-    head, tail = np.full(count, _NONE), np.full(count, _NONE)
-    link, target = np.full(2 * len(pairs), _NONE), np.empty(2 * len(pairs), np.uint32)
-    for e in range(2 * len(pairs)):
-        a, b = number[pairs[e // 2, e % 2]], number[pairs[e // 2, 1 - e % 2]]
-        if a == b:
-            continue
-        target[e], link[e] = b, head[a]
-        head[a] = e
-        if tail[a] == _NONE:
-            tail[a] = e
     parent = np.arange(count).astype(np.uint32)
     # Those as flat wait in one chain, the first of which has waited longest.
     first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)

@@ -1,9 +1,4 @@
-"""What planes cost as labels: the energy of thesis eq. 5.3 with residuals for angles.
-
-The data cost of a plane is the squared residual in variances of the sensor, capped; label 0
-stands for what no plane explains and has a fixed cost; the prior is Potts over the neighbourhood
-weights.
-"""
+"""What planes cost as labels: the energy of thesis eq. 5.3, see docs/method.md."""
 
 from __future__ import annotations
 

@@ -22,9 +22,9 @@ from rangeseg_ros.core.fitting.region_sums import (
     RAY,
     SCATTER,
     WEIGHT,
+    RegionSums,
     fit_sums,
 )
-from rangeseg_ros.core.fitting.uncertainty import level_of
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -51,19 +51,16 @@ def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
     """
     sums, sensor = fits.sums, fits.sensor
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
-    cells = sums.cells, sums.start, sums.box
     # The planes of least squares in inverse range: what those of clouds leave, which are of total
     # least squares, is no bend to a scanner, whose planes are not linear in the pixels.
     theta = fit_sums(fits.total)
-    return _probabilities(*cells, fits.total, theta, sensor, around, alike, prior)
+    return _probabilities(sums, fits.total, theta, sensor, around, alike, prior)
 
 
 # Divisions by zero give inf: cells through which the plane passes edge on.
 @njit(cache=True, nogil=True, error_model='numpy')
 def _probabilities(
-    cells: NDArray[np.float64],
-    start: NDArray[np.intp],
-    box: NDArray[np.intp],
+    sums: RegionSums,
     total: NDArray[np.float64],
     theta: NDArray[np.float64],
     sensor: SensorModel,
@@ -76,8 +73,9 @@ def _probabilities(
         result[k] = prior
         if not theta[k].any():
             continue
-        own = cells[start[k] : start[k + 1]]
-        size, square, linear, bend, scale, ratio = _residuals(own, theta[k], sensor, box[k])
+        cells = sums.cells[sums.start[k] : sums.start[k + 1]]
+        shown = _residuals(cells, theta[k], sensor, sums.box[k])
+        size, square, linear, bend, scale, ratio = shown
         if size == 0:  # all its pixels are too far from the plane
             continue
         # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
@@ -109,13 +107,14 @@ def _residuals(
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
     half = max(box[2] - box[0], box[3] - box[1]) / 2
     for cell in cells:
-        count, level = cell[COUNT], level_of(cell, theta)
+        count, level, mean = cell[COUNT], 0.0, cell[INVERSE]
+        for a in range(3):
+            level += theta[a] * cell[RAY + a]
+            mean -= theta[a] * cell[RAY + a]
+        level /= cell[WEIGHT]
         variance = random_variance(sensor, level**2)
         # Weights of a cloud are not those of its errors.
         unit = count / (variance * cell[WEIGHT])
-        mean = cell[INVERSE]
-        for a in range(3):
-            mean -= theta[a] * cell[RAY + a]
         mean /= cell[WEIGHT] * np.sqrt(variance)
         v = (cell[PLACE] / count - (box[0] + box[2]) / 2) / half
         u = (cell[PLACE + 1] / count - (box[1] + box[3]) / 2) / half

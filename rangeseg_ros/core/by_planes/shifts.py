@@ -78,10 +78,12 @@ def shift_at(local: Shifts, label: int, row: int, column: int) -> float:
 
 def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
     """Surfaces without the blocks beside others, which may hold pixels of these."""
-    numbers, window = surfaces.astype(np.float32), np.ones((3, 3), np.uint8)
-    most = cv2.dilate(numbers, window)
-    least = cv2.erode(np.where(numbers > 0, numbers, np.float32(np.inf)), window)
-    return np.where((least == numbers) & (most == numbers), surfaces, np.int32(0))
+    # Of no surface the highest number, which is never the least of some.
+    window, below = np.ones((3, 3), np.uint8), (surfaces - 1).astype(np.uint16)
+    beside = cv2.dilate(below + np.uint16(1), window) != cv2.erode(below, window) + np.uint16(1)
+    inner = surfaces.copy()
+    inner[beside] = 0
+    return inner
 
 
 @njit(cache=True, nogil=True)
@@ -95,58 +97,41 @@ def _find_shifts(
     around: int,
     agreement: float,
 ) -> None:
-    """Shifts of some planes in their boxes."""
+    """Shifts of some planes in their boxes, from sums over windows of blocks."""
     for k in range(max(first, 1), after):
-        rows, columns = local.box[k, 2], local.box[k, 3]
+        top, left, rows, columns = local.box[k]
         own = local.values[local.start[k] : local.start[k] + rows * columns]
-        own = own.reshape(rows, columns)
-        _shift(k, inner, blocks, theta[k], local.box[k], around, agreement, own)
-
-
-@njit(cache=True)
-def _shift(
-    k: int,
-    inner: NDArray[np.int32],
-    blocks: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    box: NDArray[np.intp],
-    around: int,
-    agreement: float,
-    result: NDArray[np.float32],
-) -> None:
-    """Shifts of one plane in its box, from sums over windows of blocks."""
-    top, left = box[0], box[1]
-    rows, columns = result.shape
-    a, b, c = theta
-    # Sums over all blocks above and to the left: w e theta.r, w (theta.r)^2, ratio of variances.
-    total = np.zeros((rows + 1, columns + 1, 3))
-    for i in range(rows):
-        leaves = weight = ratio = 0.0
-        for j in range(columns):
-            if inner[top + i, left + j] == k:
-                m = blocks[top + i, left + j]
-                square = a * (m[0] * a + 2 * (m[1] * b + m[2] * c))
-                square += b * (m[3] * b + 2 * m[4] * c) + c * m[5] * c
-                leaves += a * m[6] + b * m[7] + c * m[8] - square
-                weight += square
-                ratio += m[RATIO]
-            total[i + 1, j + 1, 0] = total[i, j + 1, 0] + leaves
-            total[i + 1, j + 1, 1] = total[i, j + 1, 1] + weight
-            total[i + 1, j + 1, 2] = total[i, j + 1, 2] + ratio
-    for i in range(rows):
-        first, after = max(i - around, 0), min(i + around + 1, rows)
-        for j in range(columns):
-            start, end = max(j - around, 0), min(j + around + 1, columns)
+        result = own.reshape(rows, columns)
+        a, b, c = theta[k]
+        # Sums over all above and to the left: w e theta.r, w (theta.r)^2, ratio of variances.
+        total = np.zeros((rows + 1, columns + 1, 3))
+        for i in range(rows):
             leaves = weight = ratio = 0.0
-            for sign, u, v in (
-                (1, after, end),
-                (-1, first, end),
-                (-1, after, start),
-                (1, first, start),
-            ):
-                leaves += sign * total[u, v, 0]
-                weight += sign * total[u, v, 1]
-                ratio += sign * total[u, v, 2]
-            # What is left of none is rounding.
-            if weight > 1e-9 * total[rows, columns, 1]:
-                result[i, j] = leaves / weight * ratio / (ratio + agreement)
+            for j in range(columns):
+                if inner[top + i, left + j] == k:
+                    m = blocks[top + i, left + j]
+                    square = a * (m[0] * a + 2 * (m[1] * b + m[2] * c))
+                    square += b * (m[3] * b + 2 * m[4] * c) + c * m[5] * c
+                    leaves += a * m[6] + b * m[7] + c * m[8] - square
+                    weight += square
+                    ratio += m[RATIO]
+                total[i + 1, j + 1, 0] = total[i, j + 1, 0] + leaves
+                total[i + 1, j + 1, 1] = total[i, j + 1, 1] + weight
+                total[i + 1, j + 1, 2] = total[i, j + 1, 2] + ratio
+        for i in range(rows):
+            first, after = max(i - around, 0), min(i + around + 1, rows)
+            for j in range(columns):
+                start, end = max(j - around, 0), min(j + around + 1, columns)
+                leaves = weight = ratio = 0.0
+                for sign, u, v in (
+                    (1, after, end),
+                    (-1, first, end),
+                    (-1, after, start),
+                    (1, first, start),
+                ):
+                    leaves += sign * total[u, v, 0]
+                    weight += sign * total[u, v, 1]
+                    ratio += sign * total[u, v, 2]
+                # What is left of none is rounding.
+                if weight > 1e-9 * total[rows, columns, 1]:
+                    result[i, j] = leaves / weight * ratio / (ratio + agreement)

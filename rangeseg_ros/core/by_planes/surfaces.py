@@ -1,10 +1,4 @@
-"""Surfaces: blocks grow to patches, patches are agglomerated to planar surfaces.
-
-Agglomerative clustering on the adjacency of blocks, as in Feng, Taguchi and Kamat (ICRA 2014),
-with tests that count the sensor's variances. Real sensors bend planes smoothly: the plane that a
-patch of a wall suggests is off by the distortion where the wall ends, yet the patch beside it
-agrees. Hence two steps: blocks merge to patches over which the distortion is nearly constant, and
-patches to surfaces.
+"""Patches of blocks are agglomerated to planar surfaces (Feng, Taguchi and Kamat, ICRA 2014).
 
 Two parts are one surface for either of two reasons. They agree: one plane explains both as well as
 noise, distortion and the bend that planes have themselves let expect, and so it does the patches

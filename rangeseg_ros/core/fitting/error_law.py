@@ -39,13 +39,8 @@ class Law(NamedTuple):
         down: NDArray[np.float64] | float = 0.0,
     ) -> NDArray[np.float64]:
         """Variances at these squared inverse ranges and slopes."""
-        level = self.quartic * squared
-        level *= squared
-        level += FLOOR + self.constant
-        if any(self.tilt):
-            level += self.tilt[0] * across
-            level += self.tilt[1] * down
-        return level
+        level = self.quartic * squared * squared + (FLOOR + self.constant)
+        return level + self.tilt[0] * across + self.tilt[1] * down
 
     def times(self, factor: float) -> Law:
         """So many times the variance."""

@@ -1,14 +1,8 @@
-r"""The sensor model measured in one image, from the residuals of planes in nested blocks.
+"""The sensor model measured in one image, from the residuals of planes in nested blocks.
 
-Blocks of 4, 8, 16, ... pixels are nested, and what a plane through a block leaves is split as in
-an analysis of variance: V(s) is the mean square residual within blocks of s pixels, M(s) what one
-plane through four of them leaves beyond the planes of the four, for each of its nine degrees of
-freedom. White noise of variance v has V = M = v at every scale. Noise correlated over some pixels
-is hidden from blocks smaller than that, and M(s) rises above V. A smooth distortion bends large
-blocks: M(s) grows with their area, the faster the stronger it is.
-
-Where surfaces end, bend or meet, residuals are larger, never smaller: hence low quantiles, and
-only blocks whose four parts are flat themselves are compared, scale by scale.
+V(s) is the mean square residual within blocks of s pixels, M(s) what one plane through four of
+them leaves beyond the planes of the four, for each of its nine degrees of freedom; what noise and
+distortion make of them is in docs/method.md.
 """
 
 from __future__ import annotations
@@ -183,11 +177,10 @@ def _ratio(
 
 def _sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
     """Sums over 2 x 2 of values (rows, columns), of fewer at the border."""
-    rows, columns = values.shape
-    padded = np.zeros((rows + rows % 2, columns + columns % 2))
-    padded[:rows, :columns] = values
-    left = padded[:, ::2] + padded[:, 1::2]
-    return left[::2] + left[1::2]
+    result = values.astype(float)
+    for axis in (1, 0):
+        result = np.add.reduceat(result, np.arange(0, values.shape[axis], 2), axis=axis)
+    return result
 
 
 @cache

@@ -19,7 +19,7 @@ from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
     NO_PIXEL,
-    fit,
+    fit_all,
     plus_pixel,
     ray_of,
     squares_left,
@@ -111,14 +111,9 @@ def sum_regions(
     return RegionSums(layout.box, start, cells[kept], measured, outliers), total
 
 
-@njit(cache=True)
 def fit_sums(total: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least-squares planes theta . ray = inverse range (M + 1, 3); zeros where there is none."""
-    theta = np.zeros((len(total), 3))
-    for k in range(1, len(total)):
-        if total[k, COUNT] >= 3:
-            fit(total[k], theta[k])
-    return theta
+    return np.where(total[:, COUNT, None] >= 3, fit_all(total)[0], 0)
 
 
 def regions_of(start: NDArray[np.intp]) -> NDArray[np.intp]:

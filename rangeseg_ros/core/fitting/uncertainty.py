@@ -182,12 +182,3 @@ def add_common_errors(
             result[p, 0] += ray[i, p] * x
             result[p, 1] += ray[i, p] * y
             result[p, 2] += ray[i, p] * z
-
-
-@njit(cache=True)
-def level_of(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-    """Inverse range of a plane at the middle of a cell."""
-    total = 0.0
-    for a in range(3):
-        total += theta[a] * cell[RAY + a]
-    return total / cell[WEIGHT]

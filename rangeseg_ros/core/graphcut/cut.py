@@ -69,20 +69,17 @@ def minimum_cut(
         np.zeros(count, np.bool_),
         np.zeros(count, np.int32),
         np.zeros(count, np.int32),
-        np.empty(count, np.int32),
+        np.zeros(count, np.int32),
         np.zeros(count, np.bool_),
     )
     orphans = np.empty(count, np.int32)
-    first = last = waiting = 0
+    first = last = 0
     for p in range(count):
         if flow.terminal[p] != 0:
             flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, flow.terminal[p] < 0, 1
-            flow.queue[last] = p
-            flow.queued[p] = True
-            last = _next(last, count)
-            waiting += 1
+            last = _wait(flow, p, last)
     time = 0
-    while waiting > 0:
+    while count > 0 and flow.queued[flow.queue[first]]:
         p = flow.queue[first]
         side = -1
         if flow.parent[p] != _FREE:
@@ -98,11 +95,7 @@ def minimum_cut(
                 if flow.parent[q] == _FREE:
                     flow.parent[q], flow.sink[q] = opposite, flow.sink[p]
                     flow.stamp[q], flow.depth[q] = flow.stamp[p], flow.depth[p] + 1
-                    if not flow.queued[q]:
-                        flow.queue[last] = q
-                        flow.queued[q] = True
-                        last = _next(last, count)
-                        waiting += 1
+                    last = _wait(flow, q, last)
                 elif flow.sink[q] != flow.sink[p]:
                     side = k
                     break
@@ -113,7 +106,6 @@ def minimum_cut(
             # Nothing more to grow here.
             flow.queued[p] = False
             first = _next(first, count)
-            waiting -= 1
             continue
         time += 1
         found = _push(flow, p, side, orphans)
@@ -131,11 +123,8 @@ def minimum_cut(
                     continue
                 opposite = k ^ 2
                 free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
-                if free > 0 and not flow.queued[r]:
-                    flow.queue[last] = r
-                    flow.queued[r] = True
-                    last = _next(last, count)
-                    waiting += 1
+                if free > 0:
+                    last = _wait(flow, r, last)
                 if flow.parent[r] == opposite:
                     flow.parent[r] = _ORPHAN
                     orphans[end] = r
@@ -152,6 +141,15 @@ def minimum_cut(
 def _next(place: int, count: int) -> int:
     """Place after another in a ring."""
     return place + 1 if place + 1 < count else 0
+
+
+@njit(cache=True, nogil=True, inline='always')
+def _wait(flow: _Flow, p: int, last: int) -> int:
+    """Let a node wait in the queue, unless it does; the new end of the queue."""
+    if flow.queued[p]:
+        return last
+    flow.queue[last], flow.queued[p] = p, True
+    return _next(last, len(flow.queue))
 
 
 @njit(cache=True, nogil=True)

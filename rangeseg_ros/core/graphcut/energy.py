@@ -2,11 +2,8 @@
 
     E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q]
 
-f gives every pixel p a label f_p. D_p is the data cost (unary), which each method defines for
-itself: `by_normals.angles`, `by_planes.plane_energy`. The other sum is the Potts prior (pairwise)
-over the edges of the 4-connected grid, with the neighbourhood weights u of eq. 5.1 that `Grid`
-holds: 0 across jump edges and where nothing was measured. The moves of `moves` and `expansion`
-lower E whatever the labels mean.
+D_p is the data cost of each method: `by_normals.angular_cost`, `by_planes.plane_energy`. The other
+sum is the Potts prior over the 4-connected grid, with the neighbourhood weights u of `Grid`.
 """
 
 from __future__ import annotations
