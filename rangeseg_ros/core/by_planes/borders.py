@@ -38,8 +38,8 @@ def with_sharp_borders(
     Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
     (h, w) of these among the planes of `models`. A border between two pixels costs `prior`.
     """
-    labels = np.empty(image.shape, np.uint16)
-    run_rows(_enlarge, len(regions), regions, image.inverse, side, labels)
+    height, width = image.shape
+    labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
     bins, names, planes, start = _bins_at_borders(regions, surfaces)
     costs = np.empty((len(bins), side * side, _LABELS), np.float32)
     pixels = image.inverse, image.rays, sensor
@@ -50,23 +50,6 @@ def with_sharp_borders(
         rows = (len(regions) + 1 - odd) // 2
         run_rows(_settle, rows, odd, start, bins, names, costs, *given)
     return labels
-
-
-@njit(cache=True, nogil=True)
-def _enlarge(
-    first: int,
-    after: int,
-    regions: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    side: int,
-    labels: NDArray[np.uint16],
-) -> None:
-    """Give the pixels of some rows of bins their bin's label."""
-    for i in range(first, after):
-        for u in range(i * side, min((i + 1) * side, len(labels))):
-            for j in range(regions.shape[1]):
-                for v in range(j * side, min((j + 1) * side, labels.shape[1])):
-                    labels[u, v] = regions[i, j] if inverse[u, v] > 0 else np.uint16(0)
 
 
 @njit(cache=True, nogil=True)

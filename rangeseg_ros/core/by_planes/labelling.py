@@ -76,7 +76,11 @@ def _label_block_row(
     for bi in range(first, after):
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
-            count = 0 if own > 0 else _labels_around(bi, bj, surfaces, around)
+            count = 0
+            for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
+                if own == 0 and label > 0 and label not in around[:count]:
+                    around[count] = label
+                    count += 1
             for i in range(bi * NODE, min((bi + 1) * NODE, len(labels) // width)):
                 for p in range(i * width + bj * NODE, i * width + min((bj + 1) * NODE, width)):
                     labels[p] = own if problem.weight[p] > 0 else 0
@@ -87,19 +91,6 @@ def _label_block_row(
                         cost = data_cost(label, p, problem, models)
                         if cost < data[p]:
                             labels[p], data[p] = label, cost
-
-
-@njit(cache=True, nogil=True)
-def _labels_around(
-    bi: int, bj: int, surfaces: NDArray[np.int32], around: NDArray[np.int32]
-) -> int:
-    """How many labels the blocks around a block have; `around` receives them."""
-    count = 0
-    for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
-        if label > 0 and label not in around[:count]:
-            around[count] = label
-            count += 1
-    return count
 
 
 @njit(cache=True, nogil=True)

@@ -44,14 +44,12 @@ def find_contacts(
             a = part[i, j]
             if a == 0:
                 continue
-            for k in range(2):
-                if k == 0 and (j + 1 == columns or not right[i, j]):
+            for u, v in ((i, j + 1), (i + 1, j)):
+                if u == rows or v == columns or part[u, v] in (a, np.int32(0)):
                     continue
-                if k == 1 and (i + 1 == rows or not below[i, j]):
+                if not (right[i, j] if u == i else below[i, j]):
                     continue
-                b = part[i, j + 1] if k == 0 else part[i + 1, j]
-                if b in (a, np.int32(0)):
-                    continue
+                b = part[u, v]
                 h = head[a]
                 while h >= 0 and target[h] != b:
                     h = link[h]

@@ -1,9 +1,8 @@
 """Planes as the sensor bends them: shifted, from place to place, to what is measured there.
 
-A plane fitted to all of a wall is off by the sensor's distortion where the wall meets another, and
-where the two planes intersect is off by several pixels. The distortion is smooth: what a plane
-leaves of the blocks around a place is what it leaves here. So a plane theta is taken as the
-parallel one, (1 + s) theta, through what was measured of its surface near by.
+The distortion is smooth: what a plane leaves of the blocks around a place is what it leaves here.
+So a plane theta is taken as the parallel one, (1 + s) theta, through what was measured of its
+surface near by. Without, a crease of two planes would be off by several pixels.
 """
 
 from __future__ import annotations
@@ -98,6 +97,7 @@ def _find_shifts(
     agreement: float,
 ) -> None:
     """Shifts of some planes in their boxes, from sums over windows of blocks."""
+    window = np.empty(3)
     for k in range(max(first, 1), after):
         top, left, rows, columns = local.box[k]
         own = local.values[local.start[k] : local.start[k] + rows * columns]
@@ -119,19 +119,13 @@ def _find_shifts(
                 total[i + 1, j + 1, 1] = total[i, j + 1, 1] + weight
                 total[i + 1, j + 1, 2] = total[i, j + 1, 2] + ratio
         for i in range(rows):
-            first, after = max(i - around, 0), min(i + around + 1, rows)
+            high, low = max(i - around, 0), min(i + around + 1, rows)
             for j in range(columns):
-                start, end = max(j - around, 0), min(j + around + 1, columns)
-                leaves = weight = ratio = 0.0
-                for sign, u, v in (
-                    (1, after, end),
-                    (-1, first, end),
-                    (-1, after, start),
-                    (1, first, start),
-                ):
-                    leaves += sign * total[u, v, 0]
-                    weight += sign * total[u, v, 1]
-                    ratio += sign * total[u, v, 2]
+                near, far = max(j - around, 0), min(j + around + 1, columns)
+                for n in range(3):
+                    window[n] = total[low, far, n] - total[high, far, n] - total[low, near, n]
+                    window[n] += total[high, near, n]
+                leaves, weight, ratio = window
                 # What is left of none is rounding.
                 if weight > 1e-9 * total[rows, columns, 1]:
                     result[i, j] = leaves / weight * ratio / (ratio + agreement)

@@ -40,10 +40,10 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     """
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
-    field = distortion_field(fits.sensor)
-    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), field)
+    level = levels(fits.sums, fits.theta)
+    cells = Cells.of(fits.sums, level, *distortion_field(fits.sensor))
     start, inverses = fits.sums.start, fits.inverses()
-    return _surfaces(order, start, fits.theta, inverses, covariance, cells, field.width)
+    return _surfaces(order, start, fits.theta, inverses, covariance, cells)
 
 
 @njit(cache=True, nogil=True)
@@ -54,7 +54,6 @@ def _surfaces(
     inverse: NDArray[np.float64],
     covariance: NDArray[np.float64],
     cells: Cells,
-    width: float,
 ) -> NDArray[np.intp]:
     surface = np.zeros(len(theta), np.intp)
     for rank in range(len(order)):
@@ -69,7 +68,7 @@ def _surfaces(
             if value <= _LIMIT:
                 common = np.zeros((3, 3))
                 own, other = (start[k], start[k + 1]), (start[m], start[m + 1])
-                add_common_errors(cells, own, other, width, common)
+                add_common_errors(cells, own, other, common)
                 common = _product(_product(inverse[k], common), inverse[m])
                 value = _chi_squared(theta[k] - theta[m], both - common - common.T)
             if value < least:

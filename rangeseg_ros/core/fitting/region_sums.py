@@ -69,10 +69,6 @@ class RegionSums(NamedTuple):
     pixels: NDArray[np.intp]  # (M + 1,), number of measured pixels
     outliers: NDArray[np.intp]  # (M + 1,), and of those that were left out
 
-    def regions(self) -> NDArray[np.intp]:
-        """Region (N,) of each cell."""
-        return regions_of(self.start)
-
     def without(self, dropped: NDArray[np.bool_]) -> RegionSums:
         """Those of regions that are not `dropped` (M + 1,), numbered anew."""
         kept, length = ~dropped, np.diff(self.start)

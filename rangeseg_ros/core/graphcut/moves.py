@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from itertools import combinations
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +14,8 @@ from rangeseg_ros.core.graphcut.cut import ROUNDING, minimum_cut
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.sensing.grid import Grid
 
-
-class Cost(Protocol):
-    """Data cost (n,) of a label at pixels (n,) given by their index in raster order."""
-
-    def __call__(self, label: int, pixels: NDArray[np.integer], /) -> NDArray[np.floating]: ...
+# Data cost (n,) of a label at pixels (n,) given by their index in raster order.
+Cost = Callable[[int, NDArray[np.integer]], NDArray[np.floating]]
 
 
 class Labelling:
