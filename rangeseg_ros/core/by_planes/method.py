@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,17 +21,16 @@ from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.grid import View
 
 
-class Labelling:
+class Labelling(NamedTuple):
     """Planes, those of `models`, as labels (H, W) of the pixels of an image; 0 is no plane."""
 
-    def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
-        self.labels = labels
-        self._problem = problem
-        self.models = models
+    labels: NDArray[np.int32]
+    problem: Problem
+    models: Models
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
-        return energy(self.labels.ravel(), self._problem, self.models)
+        return energy(self.labels.ravel(), self.problem, self.models)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""

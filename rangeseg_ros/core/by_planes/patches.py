@@ -70,7 +70,7 @@ def _patches(
     for k in range(len(kept)):
         number[kept[k]] = k
     chains = _chains(number[root], smooth.reshape(shape), right, below, len(kept))
-    grown = _grow(blocks[kept], residual[kept], *chains, largest, agreement)
+    grown = _grow(blocks[kept], residual[kept], chains, largest, agreement)
     for a in range(len(root)):
         if smooth[a]:
             root[a] = kept[grown[number[root[a]]]]
@@ -172,10 +172,7 @@ def _quads(
 def _grow(
     moments: NDArray[np.float64],
     residual: NDArray[np.float64],
-    head: NDArray[np.uint32],
-    tail: NDArray[np.uint32],
-    link: NDArray[np.uint32],
-    target: NDArray[np.uint32],
+    chains: tuple[NDArray[np.uint32], ...],
     largest: float,
     agreement: float,
 ) -> NDArray[np.uint32]:
@@ -185,7 +182,7 @@ def _grow(
     Given are the parts' moments (N, 13) and residuals (N,), and which touch, see `_chains`: the
     lists of merged patches join in constant time. Returns the root of each part's patch.
     """
-    count = len(moments)
+    count, (head, tail, link, target) = len(moments), chains
     parent = np.arange(count).astype(np.uint32)
     # Those as flat wait in one chain, the first of which has waited longest.
     first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)

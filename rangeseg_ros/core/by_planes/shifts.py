@@ -54,7 +54,7 @@ def shifts(
     by n / (n + noise / distortion), in variances, with the noise of pixels that agree. Shifts are
     told up to `reach` blocks around a surface.
     """
-    box = find_boxes(0, len(surfaces), surfaces, len(theta))
+    box = find_boxes(surfaces, len(theta))
     corner = np.maximum(box[:, :2] - reach, 0)
     extent = np.minimum(box[:, 2:] + reach, surfaces.shape) - corner
     extent[box[:, 2] == 0] = 0

@@ -48,16 +48,15 @@ class Layout(NamedTuple):
     @classmethod
     def of(cls, labels: NDArray[np.uint16]) -> Layout:
         """Cells of whole blocks for the regions of labels (H, W), as small as may be."""
-        upper, lower = map_halves(find_boxes, len(labels), labels, int(labels.max(initial=0)) + 1)
-        first, after = np.minimum(upper, lower)[:, :2], np.maximum(upper, lower)[:, 2:]
-        first[after[:, 0] == 0] = 0
+        box = find_boxes(labels, int(labels.max(initial=0)) + 1)
+        first, after = box[:, :2], box[:, 2:]
         rows, across = (-(-after // BLOCK) - first // BLOCK).T
         side = np.maximum(np.sqrt(rows * across / MAX_CELLS).astype(np.intp), 1)
         while (many := -(-rows // side) * -(-across // side) > MAX_CELLS).any():
             side += many
         columns = -(-across // side)
         start = np.concatenate([[0], np.cumsum(-(-rows // side) * columns)])
-        return cls(np.hstack([first, after]), side, columns, start)
+        return cls(box, side, columns, start)
 
 
 class RegionSums(NamedTuple):
@@ -118,14 +117,12 @@ def regions_of(start: NDArray[np.intp]) -> NDArray[np.intp]:
 
 
 @njit(cache=True, nogil=True)
-def find_boxes(
-    first: int, after: int, labels: NDArray[np.integer], count: int
-) -> NDArray[np.intp]:
-    """Bounding boxes (count, 4) of the regions in some rows, see `Layout`."""
+def find_boxes(labels: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    """Bounding boxes (count, 4) of regions 1...count - 1, see `Layout`."""
     height, width = labels.shape
     box = np.zeros((count, 4), np.intp)
     box[:, 0], box[:, 1] = height, width
-    for i in range(first, after):
+    for i in range(height):
         begin = 0
         for j in range(1, width + 1):
             if j < width and labels[i, j] == labels[i, begin]:
@@ -134,7 +131,9 @@ def find_boxes(
             box[label, 0], box[label, 1] = min(box[label, 0], i), min(box[label, 1], begin)
             box[label, 2], box[label, 3] = i + 1, max(box[label, 3], j)
             begin = j
-    box[0] = 0
+    for k in range(count):
+        if k == 0 or box[k, 2] == 0:
+            box[k] = 0
     return box
 
 

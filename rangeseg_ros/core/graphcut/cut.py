@@ -12,9 +12,8 @@ is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the 
 cost of staying or of switching.
 
 The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
-tree grows from either terminal over edges that are not saturated; where the two meet,
-flow is pushed along the path, and the nodes that this cuts off look for another parent in their
-tree.
+tree grows from either terminal over edges that are not saturated; where the two meet, flow is
+pushed along the path, and nodes that this cuts off look for another parent in their tree.
 """
 
 from __future__ import annotations
