@@ -33,11 +33,10 @@ def refine(
     moments: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.int32], Models]:
-    """Label the pixels with the planes of surfaces (rows, columns), which are those of blocks.
+    """Label the pixels (n,) with the planes of the surfaces (rows, columns) of blocks, or 0.
 
     Given are the moments of the blocks (rows, columns, 13) and of the surfaces (K + 1, 13), and
-    the errors of the image. Returns the labels (n,), 0 for no plane, and the planes they were
-    found for.
+    the errors of the image.
     """
     models = Models.of(moments, sensor.distortion_pixels)
     # Windows as wide as the distortion tell the shifts: where it changes, larger ones tell
@@ -77,10 +76,11 @@ def _label_block_row(
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
             count = 0
-            for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
-                if own == 0 and label > 0 and label not in around[:count]:
-                    around[count] = label
-                    count += 1
+            if own == 0:
+                for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
+                    if label > 0 and label not in around[:count]:
+                        around[count] = label
+                        count += 1
             for i in range(bi * NODE, min((bi + 1) * NODE, len(labels) // width)):
                 for p in range(i * width + bj * NODE, i * width + min((bj + 1) * NODE, width)):
                     labels[p] = own if problem.weight[p] > 0 else 0
@@ -95,10 +95,7 @@ def _label_block_row(
 
 @njit(cache=True, nogil=True)
 def _expand_near(
-    rows: tuple[int, int],
-    labelling: GridLabelling,
-    problem: Problem,
-    models: Models,
+    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models
 ) -> None:
     """Expand every label once in some rows, near its boundaries; in place.
 

@@ -160,8 +160,7 @@ def _quads(
                 if total[COUNT] <= largest and together - apart < _CLEAR:
                     merged[i, j] = found = True
                     residual[a] = together
-                    for entry in range(SIZE):
-                        moments[a, entry] = total[entry]
+                    moments[a] = total
                     # What has been merged before follows its own parent.
                     parent[b] = parent[c] = parent[d] = a
         whole, side = merged, 2 * side

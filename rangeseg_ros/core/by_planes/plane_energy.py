@@ -15,11 +15,7 @@ from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import (
-    SensorModel,
-    random_variance,
-    systematic_variance,
-)
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
 
 NO_PLANE = chi2_quantile(1) / 2
@@ -44,13 +40,7 @@ class Problem(NamedTuple):
     width: int  # columns of the image
 
     @classmethod
-    def of(
-        cls,
-        image: RangeImage,
-        sensor: SensorModel,
-        grid: Grid,
-        smoothness: float,
-    ) -> Problem:
+    def of(cls, image: RangeImage, sensor: SensorModel, grid: Grid, smoothness: float) -> Problem:
         """Weigh the pixels of an image by the noise of its sensor.
 
         The prior is `smoothness` for each pixel that counts as one measurement with its

@@ -137,23 +137,19 @@ def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> tuple
     """Sums of squares that the linear terms of a fit explain, and that its quadratic ones add.
 
     With the normal equations A = L L^T (Cholesky), b^T A^-1 b is |L^-1 b|^2, and the first terms
-    have the first rows to themselves.
+    have the first rows to themselves. Below L, as a row more, stands L^-1 b.
     """
     ridge = 1e-9 * max(normal[0, 0], 1.0)
-    root, half = np.zeros((6, 6)), np.zeros(6)
-    for a in range(6):
-        half[a] = right[a]
-        for b in range(a + 1):
-            entry = normal[a, b]
+    root = np.vstack((normal, right.reshape(1, -1)))
+    for a in range(7):
+        for b in range(min(a + 1, 6)):
             for c in range(b):
-                entry -= root[a, c] * root[b, c]
+                root[a, b] -= root[a, c] * root[b, c]
             if a == b:
-                root[a, a] = np.sqrt(max(entry, 0.0) + ridge)
+                root[a, a] = np.sqrt(max(root[a, a], 0.0) + ridge)
             else:
-                root[a, b] = entry / root[b, b]
-                half[a] -= root[a, b] * half[b]
-        half[a] /= root[a, a]
-    return (half[:3] ** 2).sum(), (half[3:] ** 2).sum()
+                root[a, b] /= root[b, b]
+    return (root[6, :3] ** 2).sum(), (root[6, 3:] ** 2).sum()
 
 
 @njit(cache=True)

@@ -58,15 +58,9 @@ class Expected(NamedTuple):
     @classmethod
     def of(cls, view: View, unit: int, smoothness: float) -> Expected:
         """Of parts of an image, their borders counted in units of so many pixels."""
-        sensor = view.sensor
-        return cls(
-            sensor.distortion_pixels,
-            sensor.agreement,
-            sensor.patch,
-            float(unit),
-            float(smoothness * sensor.patch * unit),
-            PLANE_BEND**2 * view.area,
-        )
+        smooth, patch = view.sensor.distortion_pixels, view.sensor.patch
+        border, bend = float(smoothness * patch * unit), PLANE_BEND**2 * view.area
+        return cls(smooth, view.sensor.agreement, patch, float(unit), border, bend)
 
 
 def join_surfaces(
@@ -183,12 +177,7 @@ def _apart(
 
 @njit(cache=True)
 def _misfit(
-    extra: float,
-    moments: NDArray[np.float64],
-    k: int,
-    m: int,
-    bend: float,
-    expected: Expected,
+    extra: float, moments: NDArray[np.float64], k: int, m: int, bend: float, expected: Expected
 ) -> float:
     """What two parts leave of a common plane beyond their own, in what that may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]

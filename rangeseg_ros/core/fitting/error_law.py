@@ -32,15 +32,14 @@ class Law(NamedTuple):
     quartic: float
     tilt: tuple[float, float] = (0.0, 0.0)
 
-    def variances(
-        self,
-        squared: NDArray[np.float64],
-        across: NDArray[np.float64] | float = 0.0,
-        down: NDArray[np.float64] | float = 0.0,
-    ) -> NDArray[np.float64]:
-        """Variances at these squared inverse ranges and slopes."""
-        level = self.quartic * squared * squared + (FLOOR + self.constant)
-        return level + self.tilt[0] * across + self.tilt[1] * down
+    def facing(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variances at these squared inverse ranges, on surfaces that face the sensor."""
+        return self.quartic * squared * squared + (FLOOR + self.constant)
+
+    def variances(self, blocks: Blocks) -> NDArray[np.float64]:
+        """Variances (rows, columns) of the pixels of blocks."""
+        level = self.facing(blocks.squared)
+        return level + self.tilt[0] * blocks.across + self.tilt[1] * blocks.down
 
     def times(self, factor: float) -> Law:
         """So many times the variance."""
@@ -103,7 +102,7 @@ def fit_law(
     if in_range and len(facing) > 1:
         factor, other = _scale_term(quartic, ahead, before)
         law = Law(0.0, factor) if other < deviance else law
-    known = known + law.variances(strata.squared)
+    known = known + law.facing(strata.squared)
     tilt, deviance = _scale_term(strata.slope, shown, known)
     if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:
         return law
@@ -116,7 +115,7 @@ def fit_turning(strata: Strata, blocks: Blocks, shown: NDArray[np.float64], law:
     As those of scanners that turn do. `strata` are those of how much more the `blocks` slope down
     the column than along the row.
     """
-    known = law._replace(tilt=(0.0, 0.0)).variances(strata.squared)
+    known = law.facing(strata.squared)
     across, down = strata.medians(blocks.across), strata.medians(blocks.down)
     _, both = _scale_term(across + down, shown, known)
     rows, along = _scale_term(across, shown, known)

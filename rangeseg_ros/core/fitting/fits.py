@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import (
-    POINT,
-    SCATTER,
-    RegionSums,
-    fit_sums,
-    sum_regions,
-)
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import theta_covariances
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
@@ -45,11 +39,11 @@ class Fits(NamedTuple):
     ) -> Fits:
         """Fit a plane to every region.
 
-        Weighted least squares in inverse range, where a plane is linear and the error of a
-        camera lies. An organised cloud tells neither its sensor's centre nor the direction of
-        its errors; there the plane is that of total least squares of the points. Either leaves
-        out what is beyond four standard deviations of the sensor's errors, see `sum_regions`.
-        Regions are labels (H, W) 0...M, 0 for no plane; blocks, where known, of 4 x 4 pixels.
+        Regions are labels (H, W) 0...M, 0 for no plane. Weighted least squares in inverse range,
+        where a plane is linear and the error of a camera lies. An organised cloud tells neither
+        its sensor's centre nor the direction of its errors; there the plane is that of total least
+        squares of the points. Either leaves out what is beyond four standard deviations of the
+        sensor's errors, see `sum_regions`.
         """
         sums, total = sum_regions(labels, image, blocks or Blocks.of(image), sensor)
         theta = fit_sums(total)

@@ -66,7 +66,7 @@ def measured_sensor(
 
     def shown(strata: Strata) -> NDArray[np.float64]:
         most = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
-        return np.maximum(most, least.variances(strata.squared))
+        return np.maximum(most, least.facing(strata.squared))
 
     strata = Strata.of(coarse, used, coarse.across + coarse.down)
     noise = fit_law(strata, shown(strata), np.zeros(len(strata.blocks)), True)
@@ -105,7 +105,7 @@ def _over_scales(
     noise. V(4), V(8), ... relative to `noise`; M(8) relative to it; the measured share of most
     blocks; the largest distortion that any scale shows. None where too few blocks are flat.
     """
-    variance = _variances(noise, coarse)
+    variance = noise.variances(coarse)
     level = variance.repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
     count = blocks.moments[..., COUNT]
@@ -135,23 +135,18 @@ def _over_scales(
         if side == 2 * BLOCK:
             between = float(strata.medians(excess / level).mean())
             filled = pixels / BLOCK**2
-        expected = _variances(shown, larger)
+        expected = shown.variances(larger)
         bent, known = strata.medians(excess), strata.medians(expected)
         # Lasers err in range alone.
         bend = fit_law(strata, np.maximum(bent, FLOOR), known, noise.quartic > 0)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
-        typical = 8 / pixels * float(np.median(bend.variances(strata.squared)))
+        typical = 8 / pixels * float(np.median(bend.facing(strata.squared)))
         if typical > most:
             most, distortion = typical, bend.times(8 / pixels)
-        flat = whole & (excess < _BENT * (expected + _variances(bend, larger)))
+        flat = whole & (excess < _BENT * (expected + bend.variances(larger)))
         side *= 2
         blocks, larger = larger, larger.merged(rays, side)
     return (within, between, filled, distortion) if len(within) > 1 else None
-
-
-def _variances(law: Law, blocks: Blocks) -> NDArray[np.float64]:
-    """Variances (rows, columns) of the pixels of blocks."""
-    return law.variances(blocks.squared, blocks.across, blocks.down)
 
 
 def _some(used: NDArray[np.intp], most: int) -> NDArray[np.intp]:

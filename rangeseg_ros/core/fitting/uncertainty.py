@@ -138,10 +138,7 @@ def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> N
 
 @njit(cache=True)
 def add_common_errors(
-    cells: Cells,
-    one: tuple[int, int],
-    other: tuple[int, int],
-    result: NDArray[np.float64],
+    cells: Cells, one: tuple[int, int], other: tuple[int, int], result: NDArray[np.float64]
 ) -> None:
     """Add the sum over pairs of pixels to `result` (3, 3): of the means of cells.
 

@@ -11,8 +11,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+# Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1].
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
-"""Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
 
 class GridLabelling(NamedTuple):
