@@ -1,8 +1,7 @@
 """Borders of regions that were found in bins, decided pixel by pixel.
 
 Each pixel of a bin beside another region takes the label of the lowest cost given those of its
-neighbours, several times (iterated conditional modes; Besag, On the statistical analysis of dirty
-pictures, 1986). Bins have minimised the same energy by cuts, so that borders are near.
+neighbours, several times (iterated conditional modes; Besag 1986).
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
-the sum of their variances. Planes of buildings and furniture are not exactly flat, curved objects
-are in pieces that bend by a little or by much: how far either bends, as share of its width, is
+the sum of their variances. How far planes and curved objects bend, as share of their width, is
 log-normal, and so is the distortion's variance around the one that is measured. The posterior
 compares both hypotheses, the likelihood of each integrated over these (Gauss-Hermite quadrature).
 """

@@ -137,14 +137,6 @@ def renumbered(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
-    count = np.zeros(len(root))
-    for a in range(len(root)):
-        count[root[a]] += moments[a, COUNT]
-    number = np.zeros(len(root), np.int32)
-    clusters = 0
-    for a in range(len(root)):
-        if count[a] >= least:
-            clusters += 1
-            number[a] = clusters
-    labels = number[root]
-    return labels, sum_by_label(labels, moments, clusters + 1)
+    kept = np.bincount(root, moments[:, COUNT], len(root)) >= least
+    labels = (np.cumsum(kept.astype(np.int32)) * kept)[root].astype(np.int32)
+    return labels, sum_by_label(labels, moments, kept.sum() + 1)

@@ -1,6 +1,4 @@
-"""The energy that both methods minimise (thesis eq. 5.3).
-
-    E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q]
+"""The energy that both methods minimise: E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q].
 
 D_p is the data cost of each method: `by_normals.angular_cost`, `by_planes.plane_energy`. The other
 sum is the Potts prior over the 4-connected grid, with the neighbourhood weights u of `Grid`.
