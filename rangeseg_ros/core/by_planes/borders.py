@@ -39,7 +39,13 @@ def with_sharp_borders(
     """
     height, width = image.shape
     labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
-    given = regions, surfaces, models, side, image.inverse, image.rays, sensor
+    across, down = regions[:, 1:] != regions[:, :-1], regions[1:] != regions[:-1]
+    beside = np.zeros(regions.shape, np.bool_)
+    beside[:, 1:] |= across
+    beside[:, :-1] |= across
+    beside[1:] |= down
+    beside[:-1] |= down
+    given = beside, regions, surfaces, models, side, image.inverse, image.rays, sensor
     # Rows of bins in turn: those that change at the same time do not touch.
     for odd in (0, 1) * _ROUNDS:
         rows = (len(regions) + 1 - odd) // 2
@@ -52,6 +58,7 @@ def _settle(
     first: int,
     after: int,
     odd: int,
+    beside: NDArray[np.bool_],
     regions: NDArray[np.uint16],
     surfaces: NDArray[np.int32],
     models: Models,
@@ -62,61 +69,47 @@ def _settle(
     prior: np.float32,
     labels: NDArray[np.uint16],
 ) -> None:
-    """Give the pixels of bins in every second row the label of the lowest cost, in place."""
+    """Give pixels of bins `beside` others the label of the lowest cost, in every second row."""
     (rows, columns), (height, width) = regions.shape, labels.shape
-    names, costs = np.empty(_LABELS, np.uint16), np.empty((_LABELS, side * side), np.float32)
+    names, planes = np.empty(_LABELS, np.uint16), np.empty(_LABELS, np.intp)
+    costs = np.empty((side * side, _LABELS), np.float32)
     for i in range(2 * first + odd, 2 * after + odd - 1, 2):
         for j in range(columns):
-            known, own = 0, regions[i, j]
-            for u, v in ((i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
-                inside = 0 <= u < rows and 0 <= v < columns
-                if not inside or regions[u, v] == own or known == _LABELS:
+            if not beside[i, j]:
+                continue
+            known = 0
+            for u, v in ((i, j), (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
+                if not (0 <= u < rows and 0 <= v < columns) or known == _LABELS:
                     continue
-                if known == 0:
-                    names[0], known = own, 1
-                    label = surfaces[i, j] if own > 0 else 0
-                    _fill_costs(0, label, i, j, models, side, inverse, rays, sensor, costs)
-                if regions[u, v] not in names[:known]:
-                    names[known] = regions[u, v]
-                    label = surfaces[u, v] if names[known] > 0 else 0
-                    _fill_costs(known, label, i, j, models, side, inverse, rays, sensor, costs)
-                    known += 1
-            for k in range(side * side if known > 0 else 0):
+                c = 0
+                while c < known and names[c] != regions[u, v]:
+                    c += 1
+                if c == known:
+                    names[c], known = regions[u, v], known + 1
+                    planes[c] = surfaces[u, v] if regions[u, v] > 0 else 0
+            for c in range(known):
+                label = planes[c]
+                scale = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
+                theta, half_precision = models.theta[label], models.half_precision[label]
+                for k in range(side * side):
+                    u, v = i * side + k // side, j * side + k % side
+                    if u >= height or v >= width or inverse[u, v] == 0:
+                        continue
+                    y, level = np.float64(inverse[u, v]), 0.0
+                    for a in range(3):
+                        level += theta[a] * rays[u, v, a]
+                    square = (y - scale * level) ** 2 / random_variance(sensor, y * y)
+                    costs[k, c] = min(half_precision * square, CAP) if label > 0 else NO_PLANE
+            for k in range(side * side):
                 u, v = i * side + k // side, j * side + k % side
                 if u >= height or v >= width or inverse[u, v] == 0:
                     continue
                 least = np.float32(np.inf)
                 for c in range(known):
-                    cost = costs[c, k]
+                    cost = costs[k, c]
                     for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
                         if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
                             cost += prior * (labels[a, b] != names[c])
                     if cost < least:
-                        labels[u, v], least = names[c], cost
-
-
-@njit(cache=True, nogil=True)
-def _fill_costs(
-    c: int,
-    label: int,
-    i: int,
-    j: int,
-    models: Models,
-    side: int,
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    sensor: SensorModel,
-    costs: NDArray[np.float32],
-) -> None:
-    """What a label costs the measured pixels of a bin, as `costs` (4, side * side) of row c."""
-    scale = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
-    theta, half_precision = models.theta, models.half_precision[label]
-    for k in range(side * side):
-        u, v = i * side + k // side, j * side + k % side
-        if u >= inverse.shape[0] or v >= inverse.shape[1] or inverse[u, v] == 0:
-            continue
-        y, level = np.float64(inverse[u, v]), 0.0
-        for a in range(3):
-            level += theta[label, a] * rays[u, v, a]
-        square = (y - scale * level) ** 2 / random_variance(sensor, y * y)
-        costs[c, k] = min(half_precision * square, CAP) if label > 0 else NO_PLANE
+                        best, least = names[c], cost
+                labels[u, v] = best

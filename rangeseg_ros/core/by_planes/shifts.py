@@ -33,9 +33,8 @@ class Shifts(NamedTuple):
     @classmethod
     def none(cls, count: int) -> Shifts:
         """No shifts of so many labels, 0 included."""
-        return cls(
-            np.zeros((count, 4), np.intp), np.zeros(count, np.intp), np.zeros(0, np.float32)
-        )
+        numbers = np.zeros((count, 5), np.intp)
+        return cls(numbers[:, :4].copy(), numbers[:, 4].copy(), np.zeros(0, np.float32))
 
 
 def shifts(
@@ -79,9 +78,8 @@ def _inner(surfaces: NDArray[np.int32]) -> NDArray[np.int32]:
     """Surfaces without the blocks beside others, which may hold pixels of these."""
     # Of no surface the highest number, which is never the least of some.
     window, below = np.ones((3, 3), np.uint8), (surfaces - 1).astype(np.uint16)
-    beside = cv2.dilate(below + np.uint16(1), window) != cv2.erode(below, window) + np.uint16(1)
-    inner = surfaces.copy()
-    inner[beside] = 0
+    most, least = cv2.dilate(below + np.uint16(1), window), cv2.erode(below, window)
+    inner: NDArray[np.int32] = surfaces * (most == least + np.uint16(1))
     return inner
 
 
