@@ -67,8 +67,7 @@ def _label_block_row(
     """Label the pixels of some rows of blocks (rows, columns) with the surfaces of these.
 
     The pixels of a block without a surface, most of which a border crosses, get the label of the
-    lowest cost among those of the blocks around it. Expansions that begin with these have less to
-    change than those that begin with no plane, and end with a lower energy.
+    lowest cost among those of the blocks around it: expansions then have less to change.
     """
     width = problem.width
     around = np.empty(9, np.int32)

@@ -2,9 +2,8 @@
 
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
-the sum of their variances. How far planes and curved objects bend, as share of their width, is
-log-normal, and so is the distortion's variance around the one that is measured. The posterior
-compares both hypotheses, the likelihood of each integrated over these (Gauss-Hermite quadrature).
+the sum of their variances. The last two are log-normal; the posterior compares planes with curved
+surfaces, the likelihood of each integrated over these (Gauss-Hermite quadrature).
 """
 
 from __future__ import annotations

@@ -139,4 +139,4 @@ def renumbered(
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
     kept = np.bincount(root, moments[:, COUNT], len(root)) >= least
     labels = (np.cumsum(kept.astype(np.int32)) * kept)[root].astype(np.int32)
-    return labels, sum_by_label(labels, moments, kept.sum() + 1)
+    return labels, sum_by_label(labels, moments, int(kept.sum()) + 1)

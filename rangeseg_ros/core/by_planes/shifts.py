@@ -33,8 +33,8 @@ class Shifts(NamedTuple):
     @classmethod
     def none(cls, count: int) -> Shifts:
         """No shifts of so many labels, 0 included."""
-        numbers = np.zeros((count, 5), np.intp)
-        return cls(numbers[:, :4].copy(), numbers[:, 4].copy(), np.zeros(0, np.float32))
+        box, start = np.zeros((count, 4), np.intp), np.zeros(count, np.intp)
+        return cls(box, start, np.zeros(0, np.float32))
 
 
 def shifts(
@@ -49,9 +49,8 @@ def shifts(
 
     With w the weights of pixels and e what theta leaves of them, s is the least-squares solution
     sum(w e theta.r) / sum(w (theta.r)^2) over the blocks `around` on each side, of weighted
-    moments (rows, columns, 13), drawn towards 0 as far as the noise of so many pixels explains it:
-    by n / (n + noise / distortion), in variances, with the noise of pixels that agree. Shifts are
-    told up to `reach` blocks around a surface.
+    moments (rows, columns, 13), drawn towards 0 by n / (n + noise / distortion), in variances.
+    Shifts are told up to `reach` blocks around a surface.
     """
     box = find_boxes(surfaces, len(theta))
     corner = np.maximum(box[:, :2] - reach, 0)

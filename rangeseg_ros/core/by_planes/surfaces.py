@@ -42,10 +42,10 @@ _PLANE = chi2_quantile(3) / 2
 class Expected(NamedTuple):
     """What is expected of parts of one surface.
 
-    `smooth`, `agreement` and `patch` are `distortion_pixels` and the like of the sensor model;
-    `unit` are the pixels of a unit of the length of borders, and `border` is what one costs in the
-    energy. `bend` is the mean square by which planes bend, in squares of their inverse range, for
-    each pixel that they are large.
+    Of the sensor `smooth`, its `distortion_pixels`, `agreement` and `patch`; the pixels of a
+    `unit` of the length of borders, and what one costs in the energy (`border`); the mean square
+    by which planes bend for each pixel that they are large, in squares of their inverse range
+    (`bend`).
     """
 
     smooth: float

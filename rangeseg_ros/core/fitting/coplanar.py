@@ -31,12 +31,10 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     """Group regions whose planes differ by no more than their errors.
 
     From the largest region to the smallest, each joins the group whose largest member it agrees
-    with best, or begins a new one: a small region of uncertain direction joins one group and
-    ties no two together. Two planes of such covariances (M + 1, 3, 3) agree when the chi-squared
-    of their difference, which is what a joint fit adds to that of two separate ones, is what parts
-    of a face have. The systematic errors of neighbouring regions are alike and cancel in the
-    difference. Returns the label (M + 1,) of the largest region of each one's group, 0 where there
-    is no plane.
+    with best: a small region of uncertain direction ties no two together. Planes agree when the
+    chi-squared of their difference is what parts of a face have; the systematic errors of
+    neighbours are alike and cancel in it. Returns the label (M + 1,) of the largest region of each
+    one's group, 0 where there is no plane.
     """
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]

@@ -154,8 +154,8 @@ def _deviance(explained: NDArray[np.float64], shown: NDArray[np.float64]) -> flo
 def _advantage(likely: float, unlikely: float, shown: NDArray[np.float64]) -> float:
     """F of a term by which variances (S,) have one deviance and not the other.
 
-    Edges among the blocks of a stratum leave more than chance would: what is left of a perfect fit
-    tells by how much (quasi-likelihood; Wedderburn 1974). 0 where too few tell.
+    Edges leave more than chance: what is left of a perfect fit tells by how much (quasi-
+    likelihood; Wedderburn 1974). 0 where too few tell.
     """
     left = likely - _deviance(shown, shown)
     return (unlikely - likely) * max(len(shown) - 2, 0) / max(left, 1e-12)

@@ -188,9 +188,8 @@ def _random(within: list[float], between: float, filled: float) -> tuple[float, 
     """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(8).
 
     By least squares relative to these, for each of some widths. Of a block only a share is
-    `filled`. Planes through these pixels miss the block's own by what sampling leaves of the
-    residuals around it, as of a finite population; that and theirs count as many times less as
-    there are fewer pixels.
+    `filled`: planes through these pixels miss the block's own by what sampling leaves of the
+    residuals around it, as of a finite population, and count as many times less.
     """
     shown = np.maximum([*within[:3], between], 1e-9)
     hidden = np.array([correlated_residuals(width) for width in _WIDTHS])

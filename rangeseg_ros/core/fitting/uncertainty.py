@@ -1,9 +1,8 @@
 """How far fitted planes may be off: sandwich covariances from the sensor's errors.
 
-The errors are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)), sigma the
-width of the kernel they look smoothed with. Their sum over pairs of pixels is taken over pairs of
-cells: pixels of a cell spread around its middle like a Gaussian of their variance, over which the
-mean of the correlation has a closed form.
+They are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)), sigma the width of
+the kernel they look smoothed with. Their sum over pairs of pixels is taken over pairs of cells,
+whose pixels spread like a Gaussian of their variance: then its mean has a closed form.
 """
 
 from __future__ import annotations
