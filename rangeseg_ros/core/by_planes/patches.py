@@ -85,10 +85,9 @@ def _chains(
     below: NDArray[np.bool_],
     count: int,
 ) -> tuple[NDArray[np.uint32], ...]:
-    """Half-edges between parts, `count` in number, of which smooth blocks touch.
+    """Half-edges between parts, `count` in number, whose smooth blocks touch; `number` is of blocks.
 
-    `number` is the part of each block. The first and the last half-edge of each part, and of each
-    half-edge the next one and the part that it leads to.
+    The first and the last half-edge of each part; of each the next one, and the part it leads to.
     """
     rows, columns = smooth.shape
     head, tail = np.full(count, _NONE), np.full(count, _NONE)
@@ -178,8 +177,8 @@ def _grow(
     """Merge parts to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
 
-    Given are the parts' moments (N, 13) and residuals (N,), and which touch, see `_chains`: the
-    lists of merged patches join in constant time. Returns the root of each part's patch.
+    Of moments (N, 13) and residuals (N,); returns the root of each part's patch. The `chains` of
+    merged patches join in constant time.
     """
     count, (head, tail, link, target) = len(moments), chains
     parent = np.arange(count).astype(np.uint32)

@@ -29,10 +29,7 @@ class Contacts(NamedTuple):
 def find_contacts(
     part: NDArray[np.int32], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
 ) -> Contacts:
-    """Contacts between the parts 1...count - 1 of a grid of blocks (rows, columns), 0 for none.
-
-    `right` and `below` tell whether a block touches its neighbour, see `Nodes`.
-    """
+    """Contacts between parts 1...count - 1 of blocks (rows, columns), 0 for none, see `Nodes`."""
     rows, columns = part.shape
     head = np.full(count, -1, np.int32)
     link = np.empty(4 * rows * columns, np.int32)

@@ -101,9 +101,9 @@ def _over_scales(
 ) -> tuple[list[float], float, float, Law] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    Given are the rays (H, W, 3), blocks of 4 and 8 pixels, what the latter show, and the least
-    noise. V(4), V(8), ... relative to `noise`; M(8) relative to it; the measured share of most
-    blocks; the largest distortion that any scale shows. None where too few blocks are flat.
+    With the rays (H, W, 3) and the least noise. V(4), V(8), ... relative to `noise`, what 8 pixels
+    show; M(8) relative to it; the measured share of most blocks; the largest distortion that any
+    scale shows. None where too few blocks are flat.
     """
     variance = noise.variances(coarse)
     level = variance.repeat(2, axis=0).repeat(2, axis=1)

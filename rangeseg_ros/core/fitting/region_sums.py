@@ -82,9 +82,9 @@ def sum_regions(
     """Sums over the pixels of regions (H, W), but for outliers from their least-squares planes.
 
     Outliers are beyond four standard deviations of the sensor's errors from the plane of the
-    blocks that the region fills: the moments of blocks of 4 x 4 pixels stand for these. A region
-    keeps them where they are more than half of it: it is then the sensor model that does not fit,
-    or no plane. Also returns the sums (M + 1, 29) over the cells of each region.
+    blocks (of 4 x 4 pixels) that the region fills. It keeps them where they are more than half of
+    it: then the sensor model does not fit, or there is no plane. Also returns the sums (M + 1, 29)
+    over the cells of each region.
     """
     layout = Layout.of(labels)
     inside = _labels_of_blocks(labels)

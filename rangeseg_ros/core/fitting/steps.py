@@ -28,10 +28,9 @@ class Steps(NamedTuple):
 def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:
     """Smallest step of the inverse range that is a jump, and the slope of the surface.
 
-    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times
-    the variance of `agreement` for white and correlated noise alike (0.67 to 0.76), and five
-    standard deviations are no noise. Rounding alone makes steps of one quantum, and of two
-    where noise adds to it.
+    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times the
+    variance of `agreement` (0.67 to 0.76), and five standard deviations are no noise. Rounding
+    alone makes steps of one quantum, and of two where noise adds to it.
     """
     across, down, squared = blocks.across, blocks.down, blocks.squared
     variance, tilt = random_variance(sensor, squared), tilt_variance(sensor, across, down)

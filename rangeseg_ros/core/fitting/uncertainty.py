@@ -24,6 +24,10 @@ _FAR = 5.0
 _ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
+# Width of a field, see `Cells`, and the constant and quartic term of its variance.
+Field = tuple[float, float, float]
+
+
 class Cells(NamedTuple):
     """Cells of regions as a Gaussian field sees them; see `RegionSums` for which are whose."""
 
@@ -34,15 +38,9 @@ class Cells(NamedTuple):
     width: float  # of the kernel that it looks smoothed with, pixels
 
     @classmethod
-    def of(
-        cls,
-        sums: RegionSums,
-        level: NDArray[np.float64],
-        width: float,
-        constant: float,
-        quartic: float,
-    ) -> Cells:
+    def of(cls, sums: RegionSums, level: NDArray[np.float64], field: Field) -> Cells:
         """Cells whose planes are at inverse ranges y (N,); of variance constant + quartic y^4."""
+        width, constant, quartic = field
         cells = sums.cells
         count = cells[:, COUNT]
         mean = cells[:, PLACE : PLACE + 4] / count[:, None]
@@ -53,8 +51,8 @@ class Cells(NamedTuple):
         return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation, float(width))
 
 
-def distortion_field(sensor: SensorModel) -> tuple[float, float, float]:
-    """Width and variances, see `Cells.of`, of the smooth systematic errors of a sensor."""
+def distortion_field(sensor: SensorModel) -> Field:
+    """The smooth systematic errors of a sensor."""
     return sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2
 
 
@@ -77,7 +75,7 @@ def theta_covariances(
     middle = np.zeros((len(theta), 3, 3))
     for field in ((sensor.correlation, *variances), distortion_field(sensor)):
         if field[1] + field[2] > 0:
-            cells = Cells.of(sums, level, *field)
+            cells = Cells.of(sums, level, field)
             own += (_within(cells) * mean)[:, None] * centred
             upper, lower = map_halves(_between, len(theta), sums.start, cells)
             middle += upper + lower

@@ -25,9 +25,9 @@ def energy(
 def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
     """Lambda u of every edge of a grid (H, W), in the order of the sites; lambda = `smoothness`.
 
-    (2, H * W): of each pixel's edges to the right and down; 0 at the border. The edge between p
-    and its neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
-    the first pixel, where this counts from the end, there is a border as well.
+    (2, H * W): of each pixel's edges to the right and down, 0 at the border. The edge between p
+    and its neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)]; before the
+    first pixel, where this counts from the end, is a border as well.
     """
     height, width = len(grid.right), grid.below.shape[1]
     result = np.empty((2, height, width), np.float32)
