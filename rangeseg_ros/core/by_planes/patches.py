@@ -85,7 +85,7 @@ def _chains(
     below: NDArray[np.bool_],
     count: int,
 ) -> tuple[NDArray[np.uint32], ...]:
-    """Half-edges between parts, `count` in number, whose smooth blocks touch; `number` is of blocks.
+    """Half-edges between `count` parts, whose `number` blocks have, where smooth blocks touch.
 
     The first and the last half-edge of each part; of each the next one, and the part it leads to.
     """

@@ -38,8 +38,7 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     """
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
-    level = levels(fits.sums, fits.theta)
-    cells = Cells.of(fits.sums, level, distortion_field(fits.sensor))
+    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), distortion_field(fits.sensor))
     start, inverses = fits.sums.start, fits.inverses()
     return _surfaces(order, start, fits.theta, inverses, covariance, cells)
 

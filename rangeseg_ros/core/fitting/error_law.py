@@ -57,10 +57,7 @@ class Strata(NamedTuple):
 
     @classmethod
     def of(cls, blocks: Blocks, used: NDArray[np.intp], slope: NDArray[np.float64]) -> Strata:
-        """Strata of equal sizes of the blocks of these flat indices (N,), by a `slope` of all.
-
-        Fewer than a block for each stratum are left out.
-        """
+        """Strata of equal sizes of blocks (N,), but for a few left out, by a `slope` of all."""
         squared, slope = blocks.squared.ravel()[used], slope.ravel()[used]
         slopes = _SLOPES if len(used) >= _SLOPES * _PER_STRATUM else 1
         ranges = min(_RANGES, max(len(used) // (slopes * _PER_STRATUM), 1))

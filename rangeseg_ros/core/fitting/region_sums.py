@@ -39,8 +39,7 @@ p (3), p p^T (6), and v, u, v^2, u^2 (4) of the row v and the column u; their nu
 class Layout(NamedTuple):
     """Cells of regions 0...M; region 0 has none."""
 
-    # (M + 1, 4), first row and column, and the ones after the last; zeros without pixels
-    box: NDArray[np.intp]
+    box: NDArray[np.intp]  # (M + 1, 4), first row and column, those after the last; or zeros
     side: NDArray[np.intp]  # (M + 1,), blocks along the side of a cell
     columns: NDArray[np.intp]  # (M + 1,), cells side by side
     start: NDArray[np.intp]  # (M + 2,), where each region's cells begin

@@ -137,10 +137,9 @@ def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> N
 def add_common_errors(
     cells: Cells, one: tuple[int, int], other: tuple[int, int], result: NDArray[np.float64]
 ) -> None:
-    """Add the sum over pairs of pixels to `result` (3, 3): of the means of cells.
+    """Add the sum over pairs of pixels, of the means of cells, to `result` (3, 3).
 
-    The first pixel is in cells from the first of `one` to before its second, the second one in
-    those of `other`.
+    `one` and `other` are the first cell of either pixel and the one after the last.
     """
     variance = 2 * cells.width**2
     place, count, ray = cells.place, cells.pixels, cells.ray

@@ -38,8 +38,7 @@ class _Flow(NamedTuple):
 
     neighbour: NDArray[np.int32]  # (n, 4), node on each side, -1 for none
     residual: NDArray[np.float64]  # (n, 4), what the edge to that side can still take
-    # (n,), what the edge from the source, or to the sink where negative, can still take
-    terminal: NDArray[np.float64]
+    terminal: NDArray[np.float64]  # (n,), that of the source, of the sink where negative
     parent: NDArray[np.int8]  # (n,), side of the parent in its tree
     sink: NDArray[np.bool_]  # (n,), whether the tree is that of the sink
     stamp: NDArray[np.int32]  # (n,), when the distance to the terminal was last known

@@ -38,10 +38,7 @@ class GridLabelling(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def fronts(labelling: GridLabelling, count: int, rows: tuple[int, int]) -> Sites:
-    """Sites that are across an edge from each of `count` labels' own.
-
-    They lie from the first of the `rows` to before the second.
-    """
+    """Sites in some rows that are across an edge from each of `count` labels' own."""
     labels, links, width, found = labelling.labels, labelling.links, labelling.width, 0
     first, after = rows[0] * width, rows[1] * width
     owners, sites = np.empty((2, 4 * (after - first)), np.int32)
