@@ -131,9 +131,9 @@ MECHANISMS = (
     # Regions.
     Mechanism('patches as wide as the distortion',
               'by_planes/patches.py',
-              {'by_planes.method.Patches.of': _without_distortion_length}),
+              {'by_planes.method.find_patches': _without_distortion_length}),
     Mechanism('parts merge by the energy', 'by_planes/surfaces.py:_apart',
-              {'by_planes.method.join_surfaces': _given(3, _NO_BORDER),
+              {'by_planes.method.join_surfaces': _given(4, _NO_BORDER),
                'by_planes.method.unite_regions': _given(2, _NO_BORDER)}),
     Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
               {'by_planes.method.unite_regions': _unchanged}),

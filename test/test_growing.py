@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.patches import Patches
+from rangeseg_ros.core.by_planes.patches import find_patches
 from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts, least_contact
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
@@ -39,7 +39,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     area = pixel_area(image.rays)
     view = View(image, image, Blocks.of(image), edges, model, least, area, True)
     nodes = Nodes.of(view)
-    return join_surfaces(Patches.of(nodes, model), nodes, view, SMOOTHNESS)
+    return join_surfaces(*find_patches(nodes, model), nodes, view, SMOOTHNESS)
 
 
 def covered(labels, label):

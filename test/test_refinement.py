@@ -8,7 +8,7 @@ import pytest
 from rangeseg_ros.core.by_planes import labelling as refinement
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.patches import Patches
+from rangeseg_ros.core.by_planes.patches import find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
@@ -111,9 +111,9 @@ def expand(alpha, labels, cost, problem, models, reach=12):
     """Expand a label from everywhere; in place."""
     labels, cost = labels.ravel(), cost.ravel()
     rows = 0, len(labels) // problem.width
-    start, sites = fronts(labels, problem.links, problem.width, len(models.theta), rows)
-    front = sites[start[alpha] : start[alpha + 1]]
     labelling = GridLabelling.of(labels, cost, problem.links, problem.width)
+    start, sites = fronts(labelling, len(models.theta), rows)
+    front = sites[start[alpha] : start[alpha + 1]]
     helped = refinement._expand(alpha, front, rows, reach, labelling, problem, models)
     assert (labelling.position == -1).all()
     return helped
@@ -211,7 +211,7 @@ def small_room(seed=900):
     edges = weights(image)
     view = View(image, image, Blocks.of(image), edges, sensor, 1, pixel_area(image.rays), True)
     nodes = Nodes.of(view)
-    found = join_surfaces(Patches.of(nodes, sensor), nodes, view, LAMBDA)
+    found = join_surfaces(*find_patches(nodes, sensor), nodes, view, LAMBDA)
     problem = Problem.of(image, sensor, edges, LAMBDA)
     return problem, (found[0], nodes.moments, found[1]), sensor
 
@@ -234,11 +234,8 @@ def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
 
 def test_moments_of_regions_are_sums_over_their_pixels():
     problem, _, labels = random_case(3, 17, 13)
-    arrays = (
-        array.reshape(17, 13, *array.shape[1:])
-        for array in (problem.inverse, problem.rays, problem.weight)
-    )
-    moments = region_moments(labels, 4, *arrays, SENSOR)
+    image = RangeImage(problem.rays.reshape(17, 13, 3), problem.inverse.reshape(17, 13))
+    moments = region_moments(labels, 4, image, SENSOR)
     assert not moments[0].any()
     for label in range(1, 4):
         mask = labels.ravel() == label

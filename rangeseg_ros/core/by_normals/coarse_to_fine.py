@@ -149,7 +149,7 @@ def _expand_rows(
 ) -> None:
     """Expand every label in some rows from its borders and seeds, as far as it gains; in place."""
     count = len(directions)
-    start, sites = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
+    start, sites = fronts(labelling, count, rows)
     first = rows[0] * labelling.width
     found = first + np.flatnonzero(seeds[first : rows[1] * labelling.width] >= 0)
     begin, grown = group_sites(seeds[found], found.astype(np.int32), count)

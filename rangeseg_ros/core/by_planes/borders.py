@@ -1,8 +1,7 @@
 """Borders of regions that were found in bins, decided pixel by pixel.
 
 Each pixel of a bin beside another region takes the label of the lowest cost given those of its
-neighbours, several times (iterated conditional modes; Besag, On the statistical analysis of dirty
-pictures, 1986). Bins have minimised the same energy by cuts, so that borders are near.
+neighbours, several times (iterated conditional modes; Besag 1986).
 """
 
 from __future__ import annotations
@@ -33,124 +32,77 @@ def with_sharp_borders(
     sensor: SensorModel,
     prior: float,
 ) -> NDArray[np.uint16]:
-    """Labels (H, W) of the pixels of an image; 0 where nothing was measured.
+    """Labels (H, W) of the pixels of an image of errors `sensor`; 0 where nothing was measured.
 
-    Parameters
-    ----------
-    regions : (h, w) uint16
-        Labels of bins.
-    surfaces : (h, w) int32
-        Labels of the bins among those of `models`.
-    models : Models
-        Planes of the surfaces.
-    image : RangeImage
-        (H, W).
-    side : int
-        Pixels along the side of a bin.
-    sensor : SensorModel
-        Errors of the pixels.
-    prior : float
-        What a border between two pixels costs.
+    Given are the regions (h, w) of bins, which have `side` pixels along their side, and the labels
+    (h, w) of these among the planes of `models`. A border between two pixels costs `prior`.
     """
-    labels = np.empty(image.shape, np.uint16)
-    run_rows(_enlarge, len(regions), regions, image.inverse, side, labels)
-    bins, names, planes, start = _bins_at_borders(regions, surfaces)
-    costs = np.empty((len(bins), side * side, _LABELS), np.float32)
-    pixels = image.inverse, image.rays, sensor
-    run_rows(_fill_costs, len(bins), bins, planes, side, *pixels, models, costs)
-    given = np.float32(prior), side, image.inverse, labels
+    height, width = image.shape
+    labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
+    names = np.empty((*regions.shape, _LABELS), np.uint16)
+    costs = np.empty((*regions.shape, side * side, _LABELS), np.float32)
+    known = np.zeros(regions.shape, np.uint8)
+    seen = regions, surfaces, models, image.inverse, image.rays, sensor
+    run_rows(_fill_costs, len(regions), *seen, side, known, names, costs)
+    given = known, names, costs, np.float32(prior), side, image.inverse, labels
     # Rows of bins in turn: those that change at the same time do not touch.
     for odd in (0, 1) * _ROUNDS:
-        rows = (len(regions) + 1 - odd) // 2
-        run_rows(_settle, rows, odd, start, bins, names, costs, *given)
+        run_rows(_settle, (len(regions) + 1 - odd) // 2, odd, *given)
     return labels
-
-
-@njit(cache=True, nogil=True)
-def _enlarge(
-    first: int,
-    after: int,
-    regions: NDArray[np.uint16],
-    inverse: NDArray[np.float32],
-    side: int,
-    labels: NDArray[np.uint16],
-) -> None:
-    """Give the pixels of some rows of bins their bin's label."""
-    for i in range(first, after):
-        for u in range(i * side, min((i + 1) * side, len(labels))):
-            for j in range(regions.shape[1]):
-                for v in range(j * side, min((j + 1) * side, labels.shape[1])):
-                    labels[u, v] = regions[i, j] if inverse[u, v] > 0 else np.uint16(0)
-
-
-@njit(cache=True, nogil=True)
-def _bins_at_borders(
-    regions: NDArray[np.uint16], surfaces: NDArray[np.int32]
-) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.intp]]:
-    """Rows and columns (N, 2) of bins beside other regions, and labels (N, 5) there.
-
-    Of the labels first their number, then the own one. The same of their surfaces; and where each
-    row begins, (h + 1,).
-    """
-    rows, columns = regions.shape
-    bins = np.empty((regions.size, 2), np.int32)
-    names, planes = np.empty((2, regions.size, 1 + _LABELS), np.int32)
-    start = np.zeros(rows + 1, np.intp)
-    count = 0
-    for i in range(rows):
-        for j in range(columns):
-            own, known = regions[i, j], 1
-            names[count, 1] = own
-            planes[count, 1] = surfaces[i, j] if own > 0 else 0
-            for u, v in ((i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
-                if not (0 <= u < rows and 0 <= v < columns):
-                    continue
-                label = regions[u, v]
-                if label != own and known < _LABELS and label not in names[count, 1 : 1 + known]:
-                    known += 1
-                    names[count, known] = label
-                    planes[count, known] = surfaces[u, v] if label > 0 else 0
-            names[count, 0] = planes[count, 0] = known
-            if known > 1:
-                bins[count] = i, j
-                count += 1
-        start[i + 1] = count
-    return bins[:count].copy(), names[:count].copy(), planes[:count].copy(), start
 
 
 @njit(cache=True, nogil=True)
 def _fill_costs(
     first: int,
     after: int,
-    bins: NDArray[np.int32],
-    planes: NDArray[np.int32],
-    side: int,
+    regions: NDArray[np.uint16],
+    surfaces: NDArray[np.int32],
+    models: Models,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     sensor: SensorModel,
-    models: Models,
+    side: int,
+    known: NDArray[np.uint8],
+    names: NDArray[np.uint16],
     costs: NDArray[np.float32],
 ) -> None:
-    """What the labels of some bins cost their pixels, (N, side * side, 4)."""
-    height, width = inverse.shape
-    for n in range(first, after):
-        i, j = bins[n]
-        for c in range(planes[n, 0]):
-            label = planes[n, 1 + c]
-            scale = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
-            theta, half_precision = models.theta[label], models.half_precision[label]
-            for k in range(side * side):
-                u, v = i * side + k // side, j * side + k % side
-                if u >= height or v >= width or inverse[u, v] == 0:
+    """What labels cost pixels (h, w, side * side, 4) of bins in some rows that are beside others.
+
+    With the names (h, w, 4) of these labels, and how many are `known` (h, w), 0 elsewhere.
+    """
+    (rows, columns), (height, width) = regions.shape, inverse.shape
+    planes = np.empty(_LABELS, np.intp)
+    for i in range(first, after):
+        for j in range(columns):
+            count, own = 0, regions[i, j]
+            if 0 < i < rows - 1 and 0 < j < columns - 1:
+                alike = own == regions[i, j - 1] == regions[i, j + 1]
+                if alike and own == regions[i - 1, j] == regions[i + 1, j]:
                     continue
-                costs[n, k, c] = NO_PLANE
-                if label == 0:
+            for u, v in ((i, j), (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
+                if not (0 <= u < rows and 0 <= v < columns) or count == _LABELS:
                     continue
-                y, level = np.float64(inverse[u, v]), 0.0
-                for a in range(3):
-                    level += theta[a] * rays[u, v, a]
-                square = (y - scale * level) ** 2 / random_variance(sensor, y * y)
-                costs[n, k, c] = min(half_precision * square, CAP)
+                c = 0
+                while c < count and names[i, j, c] != regions[u, v]:
+                    c += 1
+                if c == count:
+                    names[i, j, c], count = regions[u, v], count + 1
+                    planes[c] = surfaces[u, v] if regions[u, v] > 0 else 0
+            known[i, j] = count if count > 1 else 0
+            for c in range(known[i, j]):
+                label = planes[c]
+                scale = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
+                theta, half_precision = models.theta[label], models.half_precision[label]
+                for k in range(side * side):
+                    u, v = i * side + k // side, j * side + k % side
+                    if u >= height or v >= width or inverse[u, v] == 0:
+                        continue
+                    y, level = np.float64(inverse[u, v]), 0.0
+                    for a in range(3):
+                        level += theta[a] * rays[u, v, a]
+                    square = (y - scale * level) ** 2 / random_variance(sensor, y * y)
+                    cost = min(half_precision * square, CAP) if label > 0 else NO_PLANE
+                    costs[i, j, k, c] = cost
 
 
 @njit(cache=True, nogil=True)
@@ -158,35 +110,28 @@ def _settle(
     first: int,
     after: int,
     odd: int,
-    start: NDArray[np.intp],
-    bins: NDArray[np.int32],
-    names: NDArray[np.int32],
+    known: NDArray[np.uint8],
+    names: NDArray[np.uint16],
     costs: NDArray[np.float32],
     prior: np.float32,
     side: int,
     inverse: NDArray[np.float32],
     labels: NDArray[np.uint16],
 ) -> None:
-    """Give the pixels of bins in every second row the label of the lowest cost, in place."""
+    """Give pixels of bins in every second row the label of the lowest cost, in place."""
     height, width = labels.shape
-    for n in range(start[2 * first + odd], start[2 * after + odd - 1]):
-        if bins[n, 0] % 2 != odd:
-            continue
-        for k in range(side * side):
-            u, v = bins[n, 0] * side + k // side, bins[n, 1] * side + k % side
-            if u >= height or v >= width or inverse[u, v] == 0:
-                continue
-            least = np.float32(np.inf)
-            for c in range(names[n, 0]):
-                label, cost = names[n, 1 + c], costs[n, k, c]
-                if u > 0 and inverse[u - 1, v] > 0:
-                    cost += prior * (labels[u - 1, v] != label)
-                if v > 0 and inverse[u, v - 1] > 0:
-                    cost += prior * (labels[u, v - 1] != label)
-                if u + 1 < height and inverse[u + 1, v] > 0:
-                    cost += prior * (labels[u + 1, v] != label)
-                if v + 1 < width and inverse[u, v + 1] > 0:
-                    cost += prior * (labels[u, v + 1] != label)
-                if cost < least:
-                    best, least = label, cost
-            labels[u, v] = best
+    for i in range(2 * first + odd, 2 * after + odd - 1, 2):
+        for j in range(known.shape[1]):
+            for k in range(side * side if known[i, j] > 0 else 0):
+                u, v = i * side + k // side, j * side + k % side
+                if u >= height or v >= width or inverse[u, v] == 0:
+                    continue
+                least = np.float32(np.inf)
+                for c in range(known[i, j]):
+                    label, cost = names[i, j, c], costs[i, j, k, c]
+                    for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
+                        if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
+                            cost += prior * (labels[a, b] != label)
+                    if cost < least:
+                        best, least = label, cost
+                labels[u, v] = best

@@ -33,26 +33,10 @@ def refine(
     moments: NDArray[np.float64],
     sensor: SensorModel,
 ) -> tuple[NDArray[np.int32], Models]:
-    """Label the pixels with the planes of surfaces.
+    """Label the pixels (n,) with the planes of the surfaces (rows, columns) of blocks, or 0.
 
-    Parameters
-    ----------
-    problem : Problem
-    surfaces : (rows, columns) int32
-        Surface of each block, 0...K, 0 for none.
-    blocks : (rows, columns, 13) float64
-        Moments of the blocks, weighted.
-    moments : (K + 1, 13) float64
-        Of the surfaces.
-    sensor : SensorModel
-        Errors of the image that the blocks are of.
-
-    Returns
-    -------
-    labels : (n,) int32
-        0 = no plane.
-    models : Models
-        The planes the labelling was found for.
+    Given are the moments of the blocks (rows, columns, 13) and of the surfaces (K + 1, 13), and
+    the errors of the image.
     """
     models = Models.of(moments, sensor.distortion_pixels)
     # Windows as wide as the distortion tell the shifts: where it changes, larger ones tell
@@ -83,17 +67,21 @@ def _label_block_row(
     """Label the pixels of some rows of blocks (rows, columns) with the surfaces of these.
 
     The pixels of a block without a surface, most of which a border crosses, get the label of the
-    lowest cost among those of the blocks around it. Expansions that begin with these have less to
-    change than those that begin with no plane, and end with a lower energy.
+    lowest cost among those of the blocks around it: expansions then have less to change.
     """
-    size, width = NODE, problem.width
+    width = problem.width
     around = np.empty(9, np.int32)
     for bi in range(first, after):
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
-            count = 0 if own > 0 else _labels_around(bi, bj, surfaces, around)
-            for i in range(bi * size, min((bi + 1) * size, len(labels) // width)):
-                for p in range(i * width + bj * size, i * width + min((bj + 1) * size, width)):
+            count = 0
+            if own == 0:
+                for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
+                    if label > 0 and label not in around[:count]:
+                        around[count] = label
+                        count += 1
+            for i in range(bi * NODE, min((bi + 1) * NODE, len(labels) // width)):
+                for p in range(i * width + bj * NODE, i * width + min((bj + 1) * NODE, width)):
                     labels[p] = own if problem.weight[p] > 0 else 0
                     if count == 0 or problem.weight[p] == 0:
                         continue
@@ -105,31 +93,15 @@ def _label_block_row(
 
 
 @njit(cache=True, nogil=True)
-def _labels_around(
-    bi: int, bj: int, surfaces: NDArray[np.int32], around: NDArray[np.int32]
-) -> int:
-    """How many labels the blocks around a block have; `around` receives them."""
-    count = 0
-    for label in surfaces[max(bi - 1, 0) : bi + 2, max(bj - 1, 0) : bj + 2].flat:
-        if label > 0 and label not in around[:count]:
-            around[count] = label
-            count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
 def _expand_near(
-    rows: tuple[int, int],
-    labelling: GridLabelling,
-    problem: Problem,
-    models: Models,
+    rows: tuple[int, int], labelling: GridLabelling, problem: Problem, models: Models
 ) -> None:
     """Expand every label once in some rows, near its boundaries; in place.
 
     Label 0 is not expanded: what no plane explains costs it little more, and it gains nothing.
     """
     count = len(models.theta)
-    start, sites = fronts(labelling.labels, labelling.links, labelling.width, count, rows)
+    start, sites = fronts(labelling, count, rows)
     for alpha in range(1, count):
         front = sites[start[alpha] : start[alpha + 1]]
         _expand(alpha, front, rows, _BAND, labelling, problem, models)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.patches import Patches
+from rangeseg_ros.core.by_planes.patches import find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces, unite_regions
@@ -20,48 +21,30 @@ from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.grid import View
 
 
-class Labelling:
-    """Planes as labels of the pixels of an image.
+class Labelling(NamedTuple):
+    """Planes, those of `models`, as labels (H, W) of the pixels of an image; 0 is no plane."""
 
-    Attributes
-    ----------
-    labels : (H, W) int32
-        0 = no plane.
-    models : Models
-        Of the other labels.
-    """
-
-    def __init__(self, labels: NDArray[np.int32], problem: Problem, models: Models) -> None:
-        self.labels = labels
-        self._problem = problem
-        self.models = models
+    labels: NDArray[np.int32]
+    problem: Problem
+    models: Models
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
-        return energy(self.labels.ravel(), self._problem, self.models)
+        return energy(self.labels.ravel(), self.problem, self.models)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""
 
 
 def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling:
-    """Label pixels with planes.
-
-    Parameters
-    ----------
-    view : View
-    config : Config
-        `plane_smoothness` is read.
-    lap : callable
-        Told the name of every stage that ends.
-    """
+    """Label pixels with planes; `lap` is told the name of every stage that ends."""
     whole, sensor = view.whole, view.sensor
     nodes = Nodes.of(view)
     lap('blocks')
     smoothness = config.plane_smoothness
     pending = submit(Problem.of, whole, sensor, view.grid, smoothness)
-    patches = Patches.of(nodes, sensor)
-    surface, moments = join_surfaces(patches, nodes, view, smoothness)
+    patches = find_patches(nodes, sensor)
+    surface, moments = join_surfaces(*patches, nodes, view, smoothness)
     problem = pending.result()
     lap('surfaces')
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)

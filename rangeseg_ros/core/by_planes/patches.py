@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
-from rangeseg_ros.core.by_planes.region_graph import renumbered
+from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, common_residual, fit
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -20,8 +18,8 @@ _CHI2_LIMIT = chi2_quantile(3)
 # Extra chi-squared of one plane for four blocks, with nine degrees of freedom, below which they
 # are merged at once: quantile 0.996.
 _CLEAR = 24.0
-WITHIN_PATCH = 2.0
-"""Systematic variances granted between blocks of a patch: that of a difference is twice one."""
+# Systematic variances granted between blocks of a patch: that of a difference is twice one.
+_GRANTED = 2.0
 # Residuals of a block, in variances, beyond which it is no part of a plane.
 _ROUGH = OUTLIER**2
 # Steps of a variance by which patches are told to be flatter: the mean residual of the largest
@@ -33,57 +31,30 @@ _LEVELS = 16 * _PER_VARIANCE
 _NONE = np.uint32(0xFFFFFFFF)
 
 
-class Patches(NamedTuple):
+def find_patches(
+    nodes: Nodes, sensor: SensorModel
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Connected blocks on one plane, over which the distortion is nearly constant.
 
-    Attributes
-    ----------
-    labels : (rows, columns) int32
-        Patch of each block: 0 for none, otherwise 1...P.
-    moments : (P + 1, 13) float64
-        Of the patches; zeros for 0.
+    The patch (rows, columns) of each block, 0 for none, otherwise 1...P, and moments (P + 1, 13).
     """
-
-    labels: NDArray[np.int32]
-    moments: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, nodes: Nodes, sensor: SensorModel) -> Patches:
-        """Patches of blocks (rows, columns)."""
-        shape = nodes.residual.shape
-        # No patch reaches over the middle, but neither does any reach across a large surface.
-        # Not even in a small image is one smaller than four blocks.
-        largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
-        halves = map_halves(_patches, shape[0], nodes, largest, sensor.agreement)
-        labels, moments = _put_together(*halves[0], *halves[1])
-        return cls(labels.reshape(shape), moments)
+    # No patch reaches over the middle, but neither does any reach across a large surface.
+    # Not even in a small image is one smaller than four blocks.
+    largest = max(sensor.distortion_pixels, 4.0 * NODE**2)
+    halves = map_halves(_patches, len(nodes.residual), nodes, largest, sensor.agreement)
+    (upper, first), (lower, second) = halves
+    lower[lower > 0] += len(first) - 1
+    labels, moments = np.concatenate([upper, lower]), np.concatenate([first, second[1:]])
+    return labels.reshape(nodes.residual.shape), moments
 
 
 @njit(cache=True, nogil=True)
-def grow_patches(
-    first: int,
-    after: int,
-    nodes: Nodes,
-    largest: float,
-    agreement: float,
-) -> NDArray[np.intp]:
-    """Group some rows of blocks into patches.
+def _patches(
+    first: int, after: int, nodes: Nodes, largest: float, agreement: float
+) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+    """Patches of at most `largest` pixels in some rows of blocks, 1...P, and their moments.
 
-    Parameters
-    ----------
-    first, after : int
-        The rows.
-    nodes : Nodes
-        The blocks.
-    largest : float
-        Pixels of the largest patch.
-    agreement : float
-        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
-
-    Returns
-    -------
-    ((after - first) * columns,) int
-        Number of the block that stands for each block's patch, its own for a block in none.
+    `agreement`: by how much the noise of neighbours exceeds white noise, see `SensorModel`.
     """
     shape = after - first, nodes.residual.shape[1]
     blocks = nodes.moments[first:after].copy().reshape(-1, SIZE)
@@ -92,70 +63,60 @@ def grow_patches(
     smooth = np.zeros(len(blocks), np.bool_)
     for a in range(len(blocks)):
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
-    pairs = _pairs(smooth.reshape(shape), right, below)
     root = find_roots(_quads(blocks, residual, smooth.reshape(shape), right, below, largest))
     # Close together, as those that are left fit into the cache.
     kept = np.flatnonzero(smooth & (root == np.arange(len(root))))
     number = np.zeros(len(root), np.uint32)
     for k in range(len(kept)):
         number[kept[k]] = k
-    grown = _grow(blocks[kept], residual[kept], number[root], pairs, largest, agreement)
+    chains = _chains(number[root], smooth.reshape(shape), right, below, len(kept))
+    grown = _grow(blocks[kept], residual[kept], chains, largest, agreement)
     for a in range(len(root)):
         if smooth[a]:
             root[a] = kept[grown[number[root[a]]]]
-    return root + first * shape[1]
+    return renumbered(root, nodes.moments[first:after].reshape(-1, SIZE), 1.0)
 
 
 @njit(cache=True)
-def _pairs(
-    smooth: NDArray[np.bool_], right: NDArray[np.bool_], below: NDArray[np.bool_]
-) -> NDArray[np.intp]:
-    """Numbers of smooth blocks that touch, (N, 2)."""
+def _chains(
+    number: NDArray[np.uint32],
+    smooth: NDArray[np.bool_],
+    right: NDArray[np.bool_],
+    below: NDArray[np.bool_],
+    count: int,
+) -> tuple[NDArray[np.uint32], ...]:
+    """Half-edges between `count` parts, whose `number` blocks have, where smooth blocks touch.
+
+    The first and the last half-edge of each part; of each the next one, and the part it leads to.
+    """
     rows, columns = smooth.shape
-    pairs = np.empty((2 * rows * columns, 2), np.intp)
-    count = 0
+    head, tail = np.full(count, _NONE), np.full(count, _NONE)
+    link, target = np.full(4 * smooth.size, _NONE), np.empty(4 * smooth.size, np.uint32)
+    e = np.uint32(0)
     for i in range(rows):
         for j in range(columns):
-            here = i * columns + j
-            if not smooth[i, j]:
-                continue
-            if j + 1 < columns and right[i, j] and smooth[i, j + 1]:
-                pairs[count, 0], pairs[count, 1] = here, here + 1
-                count += 1
-            if i + 1 < rows and below[i, j] and smooth[i + 1, j]:
-                pairs[count, 0], pairs[count, 1] = here, here + columns
-                count += 1
-    return pairs[:count]
+            for u, v in ((i, j + 1), (i + 1, j)):
+                if u == rows or v == columns or not (smooth[i, j] and smooth[u, v]):
+                    continue
+                a, b = number[i * columns + j], number[u * columns + v]
+                if a == b or not (right[i, j] if u == i else below[i, j]):
+                    continue
+                for _ in range(2):
+                    target[e], link[e], head[a] = b, head[a], e
+                    if tail[a] == _NONE:
+                        tail[a] = e
+                    a, b = b, a
+                    e += np.uint32(1)
+    return head, tail, link, target
 
 
 @njit(cache=True, error_model='numpy')
-def misfit(
-    extra: float, moments: NDArray[np.float64], k: int, m: int, granted: float, agreement: float
-) -> float:
-    """How far two parts leave a common plane, in what noise and distortion are granted.
-
-    Parameters
-    ----------
-    extra : float
-        Chi-squared of the common plane less those of the parts' own.
-    moments : (N, 13) float64
-        Of all parts.
-    k, m : int
-        The two.
-    granted : float
-        Systematic variances.
-    agreement : float
-        By how much the noise of neighbours exceeds that of white noise, see `SensorModel`.
-
-    Returns
-    -------
-    float
-        1 is too far.
-    """
+def _misfit(extra: float, moments: NDArray[np.float64], k: int, m: int, agreement: float) -> float:
+    """Extra chi-squared of one plane for two of the parts (N, 13), in what it may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]
     pixels = first + second
     ratio = (moments[k, RATIO] + moments[m, RATIO]) / pixels
-    return extra / (agreement * _CHI2_LIMIT + granted * ratio * first * second / pixels)
+    return extra / (agreement * _CHI2_LIMIT + _GRANTED * ratio * first * second / pixels)
 
 
 @njit(cache=True)
@@ -198,8 +159,7 @@ def _quads(
                 if total[COUNT] <= largest and together - apart < _CLEAR:
                     merged[i, j] = found = True
                     residual[a] = together
-                    for entry in range(SIZE):
-                        moments[a, entry] = total[entry]
+                    moments[a] = total
                     # What has been merged before follows its own parent.
                     parent[b] = parent[c] = parent[d] = a
         whole, side = merged, 2 * side
@@ -210,30 +170,17 @@ def _quads(
 def _grow(
     moments: NDArray[np.float64],
     residual: NDArray[np.float64],
-    number: NDArray[np.uint32],
-    pairs: NDArray[np.intp],
+    chains: tuple[NDArray[np.uint32], ...],
     largest: float,
     agreement: float,
 ) -> NDArray[np.uint32]:
     """Merge parts to patches of at most `largest` pixels, the flattest first, each with the
     neighbour it fits best; in place.
 
-    Given are the parts' moments (N, 13) and residuals (N,), and of blocks the part of each and
-    which ones touch. Returns the root of each part's patch.
+    Of moments (N, 13) and residuals (N,); returns the root of each part's patch. The `chains` of
+    merged patches join in constant time.
     """
-    count = len(moments)
-    # Adjacency lists as chained half-edges: the lists of merged patches join in constant time.
-    # Unsigned, as indices that may be negative take longer.
-    head, tail = np.full(count, _NONE), np.full(count, _NONE)
-    link, target = np.full(2 * len(pairs), _NONE), np.empty(2 * len(pairs), np.uint32)
-    for e in range(2 * len(pairs)):
-        a, b = number[pairs[e // 2, e % 2]], number[pairs[e // 2, 1 - e % 2]]
-        if a == b:
-            continue
-        target[e], link[e] = b, head[a]
-        head[a] = e
-        if tail[a] == _NONE:
-            tail[a] = e
+    count, (head, tail, link, target) = len(moments), chains
     parent = np.arange(count).astype(np.uint32)
     # Those as flat wait in one chain, the first of which has waited longest.
     first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)
@@ -275,7 +222,7 @@ def _grow(
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
                     common = common_residual(moments, a, b)
                     extra = common - residual[a] - residual[b]
-                    apart = misfit(extra, moments, a, b, WITHIN_PATCH, agreement)
+                    apart = _misfit(extra, moments, a, b, agreement)
                     if apart < best:
                         best, partner, together = apart, b, common
             e = following
@@ -307,39 +254,3 @@ def _wait(
         after[last[level]] = a
     last[level], after[a] = a, _NONE
     return level
-
-
-@njit(cache=True)
-def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
-    """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
-    root = np.empty_like(parent)
-    for a in range(len(parent)):
-        b = a
-        while parent[b] != b:
-            b = parent[b]
-        root[a] = b
-    return root
-
-
-@njit(cache=True, nogil=True)
-def _patches(
-    first: int, after: int, nodes: Nodes, largest: float, agreement: float
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Patches in some rows of blocks, 1...P, and their moments."""
-    begin, end = first * nodes.residual.shape[1], after * nodes.residual.shape[1]
-    roots = grow_patches(first, after, nodes, largest, agreement) - begin
-    return renumbered(roots, nodes.moments.reshape(-1, SIZE)[begin:end], 1.0)
-
-
-@njit(cache=True, nogil=True)
-def _put_together(
-    upper: NDArray[np.int32],
-    first: NDArray[np.float64],
-    lower: NDArray[np.int32],
-    second: NDArray[np.float64],
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Labels and moments of two halves as those of the whole."""
-    labels = np.concatenate((upper, lower))
-    for a in range(len(upper), len(labels)):
-        labels[a] += (labels[a] > 0) * (len(first) - 1)
-    return labels, np.concatenate((first, second[1:]))

@@ -2,10 +2,8 @@
 
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
-the sum of their variances. Planes of buildings and furniture are not exactly flat, curved objects
-are in pieces that bend by a little or by much: how far either bends, as share of its width, is
-log-normal, and so is the distortion's variance around the one that is measured. The posterior
-compares both hypotheses, the likelihood of each integrated over these (Gauss-Hermite quadrature).
+the sum of their variances. The last two are log-normal; the posterior compares planes with curved
+surfaces, the likelihood of each integrated over these (Gauss-Hermite quadrature).
 """
 
 from __future__ import annotations
@@ -22,9 +20,9 @@ from rangeseg_ros.core.fitting.region_sums import (
     RAY,
     SCATTER,
     WEIGHT,
+    RegionSums,
     fit_sums,
 )
-from rangeseg_ros.core.fitting.uncertainty import level_of
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors, squares_left
 from rangeseg_ros.core.sensing.sensor import (
     SensorModel,
@@ -45,35 +43,22 @@ _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
 def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
-    """Posterior probability of each region to be a plane and no curved surface.
+    """Posterior probability (M + 1,) of each region to be a plane and no curved surface.
 
-    Parameters
-    ----------
-    fits : Fits
-        Of M + 1 regions.
-    prior : float
-        Share of planes among regions.
-
-    Returns
-    -------
-    (M + 1,) float64
-        The prior where nothing tells; 0 for region 0.
+    `prior` is the share of planes among regions: the result where nothing tells. 0 for region 0.
     """
     sums, sensor = fits.sums, fits.sensor
     around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
-    cells = sums.cells, sums.start, sums.box
     # The planes of least squares in inverse range: what those of clouds leave, which are of total
     # least squares, is no bend to a scanner, whose planes are not linear in the pixels.
     theta = fit_sums(fits.total)
-    return _probabilities(*cells, fits.total, theta, sensor, around, alike, prior)
+    return _probabilities(sums, fits.total, theta, sensor, around, alike, prior)
 
 
 # Divisions by zero give inf: cells through which the plane passes edge on.
 @njit(cache=True, nogil=True, error_model='numpy')
 def _probabilities(
-    cells: NDArray[np.float64],
-    start: NDArray[np.intp],
-    box: NDArray[np.intp],
+    sums: RegionSums,
     total: NDArray[np.float64],
     theta: NDArray[np.float64],
     sensor: SensorModel,
@@ -86,8 +71,9 @@ def _probabilities(
         result[k] = prior
         if not theta[k].any():
             continue
-        own = cells[start[k] : start[k + 1]]
-        size, square, linear, bend, scale, ratio = _residuals(own, theta[k], sensor, box[k])
+        cells = sums.cells[sums.start[k] : sums.start[k + 1]]
+        shown = _residuals(cells, theta[k], sensor, sums.box[k])
+        size, square, linear, bend, scale, ratio = shown
         if size == 0:  # all its pixels are too far from the plane
             continue
         # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
@@ -119,13 +105,14 @@ def _residuals(
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
     half = max(box[2] - box[0], box[3] - box[1]) / 2
     for cell in cells:
-        count, level = cell[COUNT], level_of(cell, theta)
+        count, level, mean = cell[COUNT], 0.0, cell[INVERSE]
+        for a in range(3):
+            level += theta[a] * cell[RAY + a]
+            mean -= theta[a] * cell[RAY + a]
+        level /= cell[WEIGHT]
         variance = random_variance(sensor, level**2)
         # Weights of a cloud are not those of its errors.
         unit = count / (variance * cell[WEIGHT])
-        mean = cell[INVERSE]
-        for a in range(3):
-            mean -= theta[a] * cell[RAY + a]
         mean /= cell[WEIGHT] * np.sqrt(variance)
         v = (cell[PLACE] / count - (box[0] + box[2]) / 2) / half
         u = (cell[PLACE + 1] / count - (box[1] + box[3]) / 2) / half
@@ -148,23 +135,19 @@ def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> tuple
     """Sums of squares that the linear terms of a fit explain, and that its quadratic ones add.
 
     With the normal equations A = L L^T (Cholesky), b^T A^-1 b is |L^-1 b|^2, and the first terms
-    have the first rows to themselves.
+    have the first rows to themselves. Below L, as a row more, stands L^-1 b.
     """
     ridge = 1e-9 * max(normal[0, 0], 1.0)
-    root, half = np.zeros((6, 6)), np.zeros(6)
-    for a in range(6):
-        half[a] = right[a]
-        for b in range(a + 1):
-            entry = normal[a, b]
+    root = np.vstack((normal, right.reshape(1, -1)))
+    for a in range(7):
+        for b in range(min(a + 1, 6)):
             for c in range(b):
-                entry -= root[a, c] * root[b, c]
+                root[a, b] -= root[a, c] * root[b, c]
             if a == b:
-                root[a, a] = np.sqrt(max(entry, 0.0) + ridge)
+                root[a, a] = np.sqrt(max(root[a, a], 0.0) + ridge)
             else:
-                root[a, b] = entry / root[b, b]
-                half[a] -= root[a, b] * half[b]
-        half[a] /= root[a, a]
-    return (half[:3] ** 2).sum(), (half[3:] ** 2).sum()
+                root[a, b] /= root[b, b]
+    return (root[6, :3] ** 2).sum(), (root[6, 3:] ** 2).sum()
 
 
 @njit(cache=True)

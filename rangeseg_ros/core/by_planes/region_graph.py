@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.moments import COUNT, SIZE
+from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 
 
 class Contacts(NamedTuple):
@@ -16,43 +16,20 @@ class Contacts(NamedTuple):
 
     Half-edge 2e of contact e leads from one part to the other, and 2e + 1 back. Parts touch few
     others: chains are shorter than the rows of a matrix, and the shorter to clear.
-
-    Attributes
-    ----------
-    head : (N,) int32
-        First half-edge of each part, -1 for none.
-    link : (2E,) int32
-        The next one of the same part, -1 for none.
-    target : (2E,) int32
-        Part that a half-edge leads to.
-    length : (E,) float64
-        Length of the common border, in blocks; 0 where parts have been joined.
-    place : (N,) int32
-        Room for `absorb`, all -1.
     """
 
-    head: NDArray[np.int32]
-    link: NDArray[np.int32]
-    target: NDArray[np.int32]
-    length: NDArray[np.float64]
-    place: NDArray[np.int32]
+    head: NDArray[np.int32]  # (N,), first half-edge of each part, -1 for none
+    link: NDArray[np.int32]  # (2E,), the next one of the same part, -1 for none
+    target: NDArray[np.int32]  # (2E,), part that a half-edge leads to
+    length: NDArray[np.float64]  # (E,), of the common border, blocks; 0 where parts were joined
+    place: NDArray[np.int32]  # (N,), room for `absorb`, all -1
 
 
 @njit(cache=True, nogil=True)
 def find_contacts(
     part: NDArray[np.int32], right: NDArray[np.bool_], below: NDArray[np.bool_], count: int
 ) -> Contacts:
-    """Contacts between the parts of a grid of blocks.
-
-    Parameters
-    ----------
-    part : (rows, columns) int32
-        0 for none, otherwise 1...N - 1.
-    right, below : (rows, columns - 1), (rows - 1, columns) bool
-        Whether a block touches its neighbour.
-    count : int
-        N.
-    """
+    """Contacts between parts 1...count - 1 of blocks (rows, columns), 0 for none, see `Nodes`."""
     rows, columns = part.shape
     head = np.full(count, -1, np.int32)
     link = np.empty(4 * rows * columns, np.int32)
@@ -64,14 +41,12 @@ def find_contacts(
             a = part[i, j]
             if a == 0:
                 continue
-            for k in range(2):
-                if k == 0 and (j + 1 == columns or not right[i, j]):
+            for u, v in ((i, j + 1), (i + 1, j)):
+                if u == rows or v == columns or part[u, v] in (a, np.int32(0)):
                     continue
-                if k == 1 and (i + 1 == rows or not below[i, j]):
+                if not (right[i, j] if u == i else below[i, j]):
                     continue
-                b = part[i, j + 1] if k == 0 else part[i + 1, j]
-                if b in (a, np.int32(0)):
-                    continue
+                b = part[u, v]
                 h = head[a]
                 while h >= 0 and target[h] != b:
                     h = link[h]
@@ -142,25 +117,23 @@ def least_contact(
     return best, least
 
 
+@njit(cache=True)
+def find_roots(parent: NDArray[Any]) -> NDArray[Any]:
+    """Root (N,) of every node of a forest given by parents (N,); that of a root is itself."""
+    root = np.empty_like(parent)
+    for a in range(len(parent)):
+        b = a
+        while parent[b] != b:
+            b = parent[b]
+        root[a] = b
+    return root
+
+
 @njit(cache=True, nogil=True)
 def renumbered(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
-    count = np.zeros(len(root))
-    for a in range(len(root)):
-        count[root[a]] += moments[a, COUNT]
-    number = np.zeros(len(root), np.int32)
-    clusters = 0
-    for a in range(len(root)):
-        if count[a] >= least:
-            clusters += 1
-            number[a] = clusters
-    labels = np.zeros(len(root), np.int32)
-    total = np.zeros((clusters + 1, SIZE))
-    for a in range(len(root)):
-        labels[a] = number[root[a]]
-        if labels[a] > 0:
-            for entry in range(SIZE):
-                total[labels[a], entry] += moments[a, entry]
-    return labels, total
+    kept = np.bincount(root, moments[:, COUNT], len(root)) >= least
+    labels = (np.cumsum(kept.astype(np.int32)) * kept)[root].astype(np.int32)
+    return labels, sum_by_label(labels, moments, int(kept.sum()) + 1)

@@ -1,10 +1,4 @@
-"""Surfaces: blocks grow to patches, patches are agglomerated to planar surfaces.
-
-Agglomerative clustering on the adjacency of blocks, as in Feng, Taguchi and Kamat (ICRA 2014),
-with tests that count the sensor's variances. Real sensors bend planes smoothly: the plane that a
-patch of a wall suggests is off by the distortion where the wall ends, yet the patch beside it
-agrees. Hence two steps: blocks merge to patches over which the distortion is nearly constant, and
-patches to surfaces.
+"""Patches of blocks are agglomerated to planar surfaces (Feng, Taguchi and Kamat, ICRA 2014).
 
 Two parts are one surface for either of two reasons. They agree: one plane explains both as well as
 noise, distortion and the bend that planes have themselves let expect, and so it does the patches
@@ -21,13 +15,12 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
-from rangeseg_ros.core.by_planes.patches import Patches, find_roots
-from rangeseg_ros.core.by_planes.plane_energy import pixel_weights, region_moments
+from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import (
-    Contacts,
     absorb,
     find_contacts,
+    find_roots,
     least_contact,
     renumbered,
 )
@@ -49,17 +42,10 @@ _PLANE = chi2_quantile(3) / 2
 class Expected(NamedTuple):
     """What is expected of parts of one surface.
 
-    Attributes
-    ----------
-    smooth, agreement, patch : float
-        `distortion_pixels`, `agreement` and `patch` of the sensor model.
-    unit : float
-        Pixels of a unit of the length of borders.
-    border : float
-        What a unit of a border costs in the energy.
-    bend : float
-        Mean square by which planes bend, in squares of their inverse range, for each pixel that
-        they are large.
+    Of the sensor `smooth`, its `distortion_pixels`, `agreement` and `patch`; the pixels of a
+    `unit` of the length of borders, and what one costs in the energy (`border`); the mean square
+    by which planes bend for each pixel that they are large, in squares of their inverse range
+    (`bend`).
     """
 
     smooth: float
@@ -72,126 +58,57 @@ class Expected(NamedTuple):
     @classmethod
     def of(cls, view: View, unit: int, smoothness: float) -> Expected:
         """Of parts of an image, their borders counted in units of so many pixels."""
-        sensor = view.sensor
-        return cls(
-            sensor.distortion_pixels,
-            sensor.agreement,
-            sensor.patch,
-            float(unit),
-            float(smoothness * sensor.patch * unit),
-            PLANE_BEND**2 * view.area,
-        )
+        smooth, patch = view.sensor.distortion_pixels, view.sensor.patch
+        border, bend = float(smoothness * patch * unit), PLANE_BEND**2 * view.area
+        return cls(smooth, view.sensor.agreement, patch, float(unit), border, bend)
 
 
 def join_surfaces(
-    patches: Patches,
+    patches: NDArray[np.int32],
+    moments: NDArray[np.float64],
     nodes: Nodes,
     view: View,
     smoothness: float,
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """Group blocks into planar surfaces.
+    """Group the patches (rows, columns) of blocks, of moments (P + 1, 13), into planar surfaces.
 
-    Parameters
-    ----------
-    patches : Patches
-        Of the blocks.
-    nodes : Nodes
-        (rows, columns).
-    view : View
-        Of the blocks. Surfaces are as large as its `least` plane: smaller ones are clutter.
-    smoothness : float
-        Of the energy's prior, see `Problem.of`.
-
-    Returns
-    -------
-    labels : (rows, columns) int32
-        0 where no surface is, otherwise 1...K.
-    moments : (K + 1, 13) float64
-        Of the surfaces; zeros for 0.
+    The surface of each block, 0 for none, otherwise 1...K, and moments (K + 1, 13). Surfaces are
+    as large as the `least` plane of the view: smaller ones are clutter.
     """
     expected = Expected.of(view, NODE, smoothness)
-    return _surfaces(patches, nodes.right, nodes.below, expected, float(view.least))
+    roots = _agglomerate(patches, nodes.right, nodes.below, moments, expected)
+    surface, moments = renumbered(roots, moments, float(view.least))
+    return surface[patches], moments
 
 
 def unite_regions(
     regions: NDArray[np.uint16], view: View, smoothness: float
 ) -> NDArray[np.uint16]:
-    """Unite regions whose pixels touch, for the reasons for which patches are.
+    """Unite regions (H, W) whose pixels touch, for the reasons for which patches are.
 
     Where holes or jumps leave no blocks beside each other, their pixels may still touch.
-
-    Parameters
-    ----------
-    regions : (H, W) uint16
-        0...M.
-    view : View
-        (H, W).
-    smoothness : float
-        Of the energy's prior, see `Problem.of`.
-
-    Returns
-    -------
-    (H, W) uint16
-        0...N.
     """
-    count = int(regions.max(initial=0)) + 1
-    image, grid, sensor = view.whole, view.grid, view.sensor
-    weight = pixel_weights(image.inverse, sensor)
-    moments = region_moments(regions, count, image.inverse, image.rays, weight, sensor)
-    touching = grid.right > 0, grid.below > 0
+    moments = region_moments(regions, int(regions.max(initial=0)) + 1, view.whole, view.sensor)
+    touching = view.grid.right > 0, view.grid.below > 0
     expected = Expected.of(view, 1, smoothness)
-    roots = _roots(regions.astype(np.int32), *touching, moments, expected)
-    pixels = np.bincount(roots, moments[:, COUNT], count).astype(np.intp)
+    roots = _agglomerate(regions.astype(np.int32), *touching, moments, expected)
+    pixels = np.bincount(roots, moments[:, COUNT], len(moments)).astype(np.intp)
     return relabel(regions, by_falling_size(pixels)[roots])
 
 
 @njit(cache=True, nogil=True)
-def _surfaces(
-    patches: Patches,
-    right: NDArray[np.bool_],
-    below: NDArray[np.bool_],
-    expected: Expected,
-    least: float,
-) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """What `join_surfaces` returns."""
-    labels, moments = patches.labels.copy(), patches.moments
-    roots = _roots(labels, right, below, moments, expected)
-    surface, moments = renumbered(roots, moments, least)
-    _rename(labels, surface)
-    return labels, moments
-
-
-@njit(cache=True, nogil=True)
-def _roots(
+def _agglomerate(
     labels: NDArray[np.int32],
     right: NDArray[np.bool_],
     below: NDArray[np.bool_],
     moments: NDArray[np.float64],
     expected: Expected,
 ) -> NDArray[np.intp]:
-    """Roots of the parts 1...P of an image of labels, see `_agglomerate`."""
-    contacts = find_contacts(labels, right, below, len(moments))
-    return _agglomerate(moments, contacts, expected)
+    """Merge the parts 1...P of an image of labels, those that are likeliest one surface first.
 
-
-@njit(cache=True, nogil=True)
-def _rename(labels: NDArray[np.int32], table: NDArray[np.int32]) -> None:
-    """Labels by another name, in place."""
-    for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
-            labels[i, j] = table[labels[i, j]]
-
-
-@njit(cache=True, nogil=True)
-def _agglomerate(
-    moments: NDArray[np.float64],
-    contacts: Contacts,
-    expected: Expected,
-) -> NDArray[np.intp]:
-    """Merge parts 1...P, those that are likeliest one surface first; returns the roots.
-
-    The contacts are used up.
+    Returns the root (P + 1,) of each.
     """
+    contacts = find_contacts(labels, right, below, len(moments))
     moments, parent = moments.copy(), np.arange(len(moments))
     residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
@@ -260,12 +177,7 @@ def _apart(
 
 @njit(cache=True)
 def _misfit(
-    extra: float,
-    moments: NDArray[np.float64],
-    k: int,
-    m: int,
-    bend: float,
-    expected: Expected,
+    extra: float, moments: NDArray[np.float64], k: int, m: int, bend: float, expected: Expected
 ) -> float:
     """What two parts leave of a common plane beyond their own, in what that may be at most."""
     first, second = moments[k, COUNT], moments[m, COUNT]

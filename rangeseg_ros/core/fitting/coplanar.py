@@ -31,29 +31,16 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     """Group regions whose planes differ by no more than their errors.
 
     From the largest region to the smallest, each joins the group whose largest member it agrees
-    with best, or begins a new one: a small region of uncertain direction joins one group and
-    ties no two together. Two planes agree when the chi-squared of their difference, which
-    is what a joint fit adds to that of two separate ones, is what parts of a face have. The
-    systematic errors of neighbouring regions are alike and cancel in the difference.
-
-    Parameters
-    ----------
-    fits : Fits
-        Of M + 1 regions.
-    covariance : (M + 1, 3, 3) float64
-        Of their planes.
-
-    Returns
-    -------
-    (M + 1,) int
-        Label of the largest region of the group; 0 where there is no plane.
+    with best: a small region of uncertain direction ties no two together. Planes agree when the
+    chi-squared of their difference is what parts of a face have; the systematic errors of
+    neighbours are alike and cancel in it. Returns the label (M + 1,) of the largest region of each
+    one's group, 0 where there is no plane.
     """
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
-    field = distortion_field(fits.sensor)
-    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), field)
+    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), distortion_field(fits.sensor))
     start, inverses = fits.sums.start, fits.inverses()
-    return _surfaces(order, start, fits.theta, inverses, covariance, cells, field.width)
+    return _surfaces(order, start, fits.theta, inverses, covariance, cells)
 
 
 @njit(cache=True, nogil=True)
@@ -64,7 +51,6 @@ def _surfaces(
     inverse: NDArray[np.float64],
     covariance: NDArray[np.float64],
     cells: Cells,
-    width: float,
 ) -> NDArray[np.intp]:
     surface = np.zeros(len(theta), np.intp)
     for rank in range(len(order)):
@@ -79,7 +65,7 @@ def _surfaces(
             if value <= _LIMIT:
                 common = np.zeros((3, 3))
                 own, other = (start[k], start[k + 1]), (start[m], start[m + 1])
-                add_common_errors(cells, own, other, width, common)
+                add_common_errors(cells, own, other, common)
                 common = _product(_product(inverse[k], common), inverse[m])
                 value = _chi_squared(theta[k] - theta[m], both - common - common.T)
             if value < least:

@@ -32,20 +32,14 @@ class Law(NamedTuple):
     quartic: float
     tilt: tuple[float, float] = (0.0, 0.0)
 
-    def variances(
-        self,
-        squared: NDArray[np.float64],
-        across: NDArray[np.float64] | float = 0.0,
-        down: NDArray[np.float64] | float = 0.0,
-    ) -> NDArray[np.float64]:
-        """Variances at these squared inverse ranges and slopes."""
-        level = self.quartic * squared
-        level *= squared
-        level += FLOOR + self.constant
-        if any(self.tilt):
-            level += self.tilt[0] * across
-            level += self.tilt[1] * down
-        return level
+    def facing(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Variances at these squared inverse ranges, on surfaces that face the sensor."""
+        return self.quartic * squared * squared + (FLOOR + self.constant)
+
+    def variances(self, blocks: Blocks) -> NDArray[np.float64]:
+        """Variances (rows, columns) of the pixels of blocks."""
+        level = self.facing(blocks.squared)
+        return level + self.tilt[0] * blocks.across + self.tilt[1] * blocks.down
 
     def times(self, factor: float) -> Law:
         """So many times the variance."""
@@ -54,29 +48,16 @@ class Law(NamedTuple):
 
 
 class Strata(NamedTuple):
-    """Blocks alike in range and slope: of each range first those of the smallest slope.
+    """Blocks alike in range and slope: of each range first those of the smallest slope."""
 
-    Attributes
-    ----------
-    blocks : (S, N) int
-        Flat indices of the blocks of each stratum.
-    squared, slope : (S,) float64
-        Medians of the squared inverse range, and of what is taken for the slope.
-    slopes : int
-        Strata of a range.
-    """
-
-    blocks: NDArray[np.intp]
-    squared: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    slopes: int
+    blocks: NDArray[np.intp]  # (S, N), flat indices of the blocks of each stratum
+    squared: NDArray[np.float64]  # (S,), medians of the squared inverse range
+    slope: NDArray[np.float64]  # (S,), of what is taken for the slope
+    slopes: int  # strata of a range
 
     @classmethod
     def of(cls, blocks: Blocks, used: NDArray[np.intp], slope: NDArray[np.float64]) -> Strata:
-        """Strata of equal sizes of the blocks of these flat indices (N,), by a `slope` of all.
-
-        Fewer than a block for each stratum are left out.
-        """
+        """Strata of equal sizes of blocks (N,), but for a few left out, by a `slope` of all."""
         squared, slope = blocks.squared.ravel()[used], slope.ravel()[used]
         slopes = _SLOPES if len(used) >= _SLOPES * _PER_STRATUM else 1
         ranges = min(_RANGES, max(len(used) // (slopes * _PER_STRATUM), 1))
@@ -118,7 +99,7 @@ def fit_law(
     if in_range and len(facing) > 1:
         factor, other = _scale_term(quartic, ahead, before)
         law = Law(0.0, factor) if other < deviance else law
-    known = known + law.variances(strata.squared)
+    known = known + law.facing(strata.squared)
     tilt, deviance = _scale_term(strata.slope, shown, known)
     if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:
         return law
@@ -131,7 +112,7 @@ def fit_turning(strata: Strata, blocks: Blocks, shown: NDArray[np.float64], law:
     As those of scanners that turn do. `strata` are those of how much more the `blocks` slope down
     the column than along the row.
     """
-    known = law._replace(tilt=(0.0, 0.0)).variances(strata.squared)
+    known = law.facing(strata.squared)
     across, down = strata.medians(blocks.across), strata.medians(blocks.down)
     _, both = _scale_term(across + down, shown, known)
     rows, along = _scale_term(across, shown, known)
@@ -170,8 +151,8 @@ def _deviance(explained: NDArray[np.float64], shown: NDArray[np.float64]) -> flo
 def _advantage(likely: float, unlikely: float, shown: NDArray[np.float64]) -> float:
     """F of a term by which variances (S,) have one deviance and not the other.
 
-    Edges among the blocks of a stratum leave more than chance would: what is left of a perfect fit
-    tells by how much (quasi-likelihood; Wedderburn 1974). 0 where too few tell.
+    Edges leave more than chance: what is left of a perfect fit tells by how much (quasi-
+    likelihood; Wedderburn 1974). 0 where too few tell.
     """
     left = likely - _deviance(shown, shown)
     return (unlikely - likely) * max(len(shown) - 2, 0) / max(left, 1e-12)

@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import (
-    POINT,
-    SCATTER,
-    RegionSums,
-    fit_sums,
-    sum_regions,
-)
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import theta_covariances
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
@@ -25,23 +19,13 @@ _GRAZING = 1e-3
 
 
 class Fits(NamedTuple):
-    """Planes theta . ray = inverse range of regions 0...M; zeros where there is none.
+    """Planes theta . ray = inverse range (M + 1, 3) of regions; zeros where there is none.
 
-    Attributes
-    ----------
-    sums : RegionSums
-        Over the pixels that were fitted.
-    total : (M + 1, 29) float64
-        The same of whole regions.
-    pixels : (M + 1,) int
-        Number of measured pixels.
-    theta : (M + 1, 3) float64
-    sensor : SensorModel
+    `sums` are over the pixels that were fitted, `total` (M + 1, 29) the same of whole regions.
     """
 
     sums: RegionSums
     total: NDArray[np.float64]
-    pixels: NDArray[np.intp]
     theta: NDArray[np.float64]
     sensor: SensorModel
 
@@ -55,37 +39,28 @@ class Fits(NamedTuple):
     ) -> Fits:
         """Fit a plane to every region.
 
-        Weighted least squares in inverse range, where a plane is linear and the error of a
-        camera lies. An organised cloud tells neither its sensor's centre nor the direction of
-        its errors; there the plane is that of total least squares of the points. Either leaves
-        out what is beyond four standard deviations of the sensor's errors, see `sum_regions`.
-
-        Parameters
-        ----------
-        labels : (H, W) uint16
-            0...M, 0 for no plane.
-        image : RangeImage
-            (H, W).
-        sensor : SensorModel
-            Errors of the image.
-        blocks : Blocks, optional
-            Of 4 x 4 pixels of the image, where they are known.
+        Regions are labels (H, W) 0...M, 0 for no plane. Weighted least squares in inverse range,
+        where a plane is linear and the error of a camera lies. An organised cloud tells neither
+        its sensor's centre nor the direction of its errors; there the plane is that of total least
+        squares of the points. Either leaves out what is beyond four standard deviations of the
+        sensor's errors, see `sum_regions`.
         """
         sums, total = sum_regions(labels, image, blocks or Blocks.of(image), sensor)
         theta = fit_sums(total)
         if image.camera is None:
             theta = _total_least_squares(total, theta)
-        return cls(sums, total, sums.pixels, theta, sensor)
+        return cls(sums, total, theta, sensor)
 
     def without(self, dropped: NDArray[np.bool_]) -> Fits:
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         kept = ~dropped
-        return self._replace(
-            sums=self.sums.without(dropped),
-            total=self.total[kept],
-            pixels=self.pixels[kept],
-            theta=self.theta[kept],
-        )
+        sums = self.sums.without(dropped)
+        return Fits(sums, self.total[kept], self.theta[kept], self.sensor)
+
+    @property
+    def pixels(self) -> NDArray[np.intp]:
+        """Number of measured pixels of each region, (M + 1,)."""
+        return self.sums.pixels
 
     def boxes(self) -> NDArray[np.intp]:
         """First row and column of each region, and the ones after its last, (M + 1, 4)."""

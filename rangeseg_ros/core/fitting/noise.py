@@ -1,14 +1,8 @@
-r"""The sensor model measured in one image, from the residuals of planes in nested blocks.
+"""The sensor model measured in one image, from the residuals of planes in nested blocks.
 
-Blocks of 4, 8, 16, ... pixels are nested, and what a plane through a block leaves is split as in
-an analysis of variance: V(s) is the mean square residual within blocks of s pixels, M(s) what one
-plane through four of them leaves beyond the planes of the four, for each of its nine degrees of
-freedom. White noise of variance v has V = M = v at every scale. Noise correlated over some pixels
-is hidden from blocks smaller than that, and M(s) rises above V. A smooth distortion bends large
-blocks: M(s) grows with their area, the faster the stronger it is.
-
-Where surfaces end, bend or meet, residuals are larger, never smaller: hence low quantiles, and
-only blocks whose four parts are flat themselves are compared, scale by scale.
+V(s) is the mean square residual within blocks of s pixels, M(s) what one plane through four of
+them leaves beyond the planes of the four, for each of its nine degrees of freedom; what noise and
+distortion make of them is in docs/method.md.
 """
 
 from __future__ import annotations
@@ -50,17 +44,9 @@ _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 def measured_sensor(
     image: RangeImage, blocks: Blocks, prior: SensorModel, quanta: tuple[float, float]
 ) -> SensorModel:
-    """The errors that an image shows.
+    """The errors that an image shows in its blocks; the `prior` as far as it says too little.
 
-    Parameters
-    ----------
-    image : RangeImage
-    blocks : Blocks
-        Of the image.
-    prior : SensorModel
-        Taken as far as the image says too little.
-    quanta : tuple of 2 float
-        Steps that it is rounded to, see `quantisation`.
+    `quanta` are the steps that it is rounded to, see `quantisation`.
     """
     # Smaller blocks would not do: rounding hides in those that it rounds alike, and noise makes
     # slopes of its own.
@@ -80,7 +66,7 @@ def measured_sensor(
 
     def shown(strata: Strata) -> NDArray[np.float64]:
         most = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
-        return np.maximum(most, least.variances(strata.squared))
+        return np.maximum(most, least.facing(strata.squared))
 
     strata = Strata.of(coarse, used, coarse.across + coarse.down)
     noise = fit_law(strata, shown(strata), np.zeros(len(strata.blocks)), True)
@@ -115,24 +101,11 @@ def _over_scales(
 ) -> tuple[list[float], float, float, Law] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    Parameters
-    ----------
-    rays : (H, W, 3) float32
-        Of the image.
-    blocks, coarse : Blocks
-        Of 4 and 8 pixels.
-    noise : Law
-        What blocks of 8 pixels show.
-    least : Law
-        Of the noise.
-
-    Returns
-    -------
-    tuple or None
-        V(4), V(8), ... relative to `noise`; M(8) relative to it; the measured share of most
-        blocks; the largest distortion that any scale shows. None where too few blocks are flat.
+    With the rays (H, W, 3) and the least noise. V(4), V(8), ... relative to `noise`, what 8 pixels
+    show; M(8) relative to it; the measured share of most blocks; the largest distortion that any
+    scale shows. None where too few blocks are flat.
     """
-    variance = _variances(noise, coarse)
+    variance = noise.variances(coarse)
     level = variance.repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
     count = blocks.moments[..., COUNT]
@@ -162,23 +135,18 @@ def _over_scales(
         if side == 2 * BLOCK:
             between = float(strata.medians(excess / level).mean())
             filled = pixels / BLOCK**2
-        expected = _variances(shown, larger)
+        expected = shown.variances(larger)
         bent, known = strata.medians(excess), strata.medians(expected)
         # Lasers err in range alone.
         bend = fit_law(strata, np.maximum(bent, FLOOR), known, noise.quartic > 0)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
-        typical = 8 / pixels * float(np.median(bend.variances(strata.squared)))
+        typical = 8 / pixels * float(np.median(bend.facing(strata.squared)))
         if typical > most:
             most, distortion = typical, bend.times(8 / pixels)
-        flat = whole & (excess < _BENT * (expected + _variances(bend, larger)))
+        flat = whole & (excess < _BENT * (expected + bend.variances(larger)))
         side *= 2
         blocks, larger = larger, larger.merged(rays, side)
     return (within, between, filled, distortion) if len(within) > 1 else None
-
-
-def _variances(law: Law, blocks: Blocks) -> NDArray[np.float64]:
-    """Variances (rows, columns) of the pixels of blocks."""
-    return law.variances(blocks.squared, blocks.across, blocks.down)
 
 
 def _some(used: NDArray[np.intp], most: int) -> NDArray[np.intp]:
@@ -204,11 +172,10 @@ def _ratio(
 
 def _sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
     """Sums over 2 x 2 of values (rows, columns), of fewer at the border."""
-    rows, columns = values.shape
-    padded = np.zeros((rows + rows % 2, columns + columns % 2))
-    padded[:rows, :columns] = values
-    left = padded[:, ::2] + padded[:, 1::2]
-    return left[::2] + left[1::2]
+    result = values.astype(float)
+    for axis in (1, 0):
+        result = np.add.reduceat(result, np.arange(0, values.shape[axis], 2), axis=axis)
+    return result
 
 
 @cache
@@ -221,9 +188,8 @@ def _random(within: list[float], between: float, filled: float) -> tuple[float, 
     """Total variance, white share and correlation length that explain V(4), V(8), V(16), M(8).
 
     By least squares relative to these, for each of some widths. Of a block only a share is
-    `filled`. Planes through these pixels miss the block's own by what sampling leaves of the
-    residuals around it, as of a finite population; that and theirs count as many times less as
-    there are fewer pixels.
+    `filled`: planes through these pixels miss the block's own by what sampling leaves of the
+    residuals around it, as of a finite population, and count as many times less.
     """
     shown = np.maximum([*within[:3], between], 1e-9)
     hidden = np.array([correlated_residuals(width) for width in _WIDTHS])

@@ -21,15 +21,7 @@ _SAME = 0.05
 def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
     """Steps of the inverse range, 1/m, and of the range, metres, that an image is rounded to.
 
-    Parameters
-    ----------
-    inverse : (H, W) float32
-        Inverse range, 0 where nothing was measured.
-
-    Returns
-    -------
-    tuple of 2 float
-        One of them at most is not 0.
+    Of inverse ranges (H, W), 0 where nothing was measured. One of the steps at most is not 0.
     """
     rows = inverse[:: max(len(inverse) // _ROWS, 1)]
     both = (rows[:, 1:] > 0) & (rows[:, :-1] > 0)

@@ -19,11 +19,11 @@ from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
     NO_PIXEL,
-    SIZE,
-    fit,
+    fit_all,
     plus_pixel,
     ray_of,
     squares_left,
+    sum_by_label,
 )
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -37,58 +37,35 @@ p (3), p p^T (6), and v, u, v^2, u^2 (4) of the row v and the column u; their nu
 
 
 class Layout(NamedTuple):
-    """Cells of regions 0...M; region 0 has none.
+    """Cells of regions 0...M; region 0 has none."""
 
-    Attributes
-    ----------
-    box : (M + 1, 4) int
-        First row and column of each region, and the ones after its last; zeros without pixels.
-    side, columns : (M + 1,) int
-        Blocks along the side of a cell, and cells side by side.
-    start : (M + 2,) int
-        Where each region's cells begin.
-    """
-
-    box: NDArray[np.intp]
-    side: NDArray[np.intp]
-    columns: NDArray[np.intp]
-    start: NDArray[np.intp]
+    box: NDArray[np.intp]  # (M + 1, 4), first row and column, those after the last; or zeros
+    side: NDArray[np.intp]  # (M + 1,), blocks along the side of a cell
+    columns: NDArray[np.intp]  # (M + 1,), cells side by side
+    start: NDArray[np.intp]  # (M + 2,), where each region's cells begin
 
     @classmethod
     def of(cls, labels: NDArray[np.uint16]) -> Layout:
         """Cells of whole blocks for the regions of labels (H, W), as small as may be."""
-        upper, lower = map_halves(_find_boxes, len(labels), labels, int(labels.max(initial=0)) + 1)
-        first, after = np.minimum(upper, lower)[:, :2], np.maximum(upper, lower)[:, 2:]
-        first[after[:, 0] == 0] = 0
+        box = find_boxes(labels, int(labels.max(initial=0)) + 1)
+        first, after = box[:, :2], box[:, 2:]
         rows, across = (-(-after // BLOCK) - first // BLOCK).T
         side = np.maximum(np.sqrt(rows * across / MAX_CELLS).astype(np.intp), 1)
         while (many := -(-rows // side) * -(-across // side) > MAX_CELLS).any():
             side += many
         columns = -(-across // side)
         start = np.concatenate([[0], np.cumsum(-(-rows // side) * columns)])
-        return cls(np.hstack([first, after]), side, columns, start)
+        return cls(box, side, columns, start)
 
 
 class RegionSums(NamedTuple):
-    """Sums over regions 0...M, without outliers.
+    """Sums over regions 0...M, without outliers."""
 
-    Attributes
-    ----------
-    box : (M + 1, 4) int
-        See `Layout`.
-    start : (M + 2,) int
-        Where each region's cells begin in `cells`.
-    cells : (N, 29) float64
-        Those with pixels, see `RECORD`.
-    pixels, outliers : (M + 1,) int
-        Number of measured pixels, and of those that were left out.
-    """
-
-    box: NDArray[np.intp]
-    start: NDArray[np.intp]
-    cells: NDArray[np.float64]
-    pixels: NDArray[np.intp]
-    outliers: NDArray[np.intp]
+    box: NDArray[np.intp]  # (M + 1, 4), see `Layout`
+    start: NDArray[np.intp]  # (M + 2,), where each region's cells begin in `cells`
+    cells: NDArray[np.float64]  # (N, 29), those with pixels, see `RECORD`
+    pixels: NDArray[np.intp]  # (M + 1,), number of measured pixels
+    outliers: NDArray[np.intp]  # (M + 1,), and of those that were left out
 
     def without(self, dropped: NDArray[np.bool_]) -> RegionSums:
         """Those of regions that are not `dropped` (M + 1,), numbered anew."""
@@ -101,27 +78,12 @@ class RegionSums(NamedTuple):
 def sum_regions(
     labels: NDArray[np.uint16], image: RangeImage, blocks: Blocks, sensor: SensorModel
 ) -> tuple[RegionSums, NDArray[np.float64]]:
-    """Sum up the measured pixels of regions, but for outliers from their least-squares planes.
+    """Sums over the pixels of regions (H, W), but for outliers from their least-squares planes.
 
     Outliers are beyond four standard deviations of the sensor's errors from the plane of the
-    blocks that the region fills. It keeps them where they are more than half of it: it is then
-    the sensor model that does not fit, or no plane.
-
-    Parameters
-    ----------
-    labels : (H, W) uint16
-        0...M, 0 for no region.
-    image : RangeImage
-        (H, W).
-    blocks : Blocks
-        Of 4 x 4 pixels of the image. Where a region fills one, its moments stand for the pixels.
-    sensor : SensorModel
-
-    Returns
-    -------
-    RegionSums
-    total : (M + 1, 29) float64
-        Sums over the cells of each region.
+    blocks (of 4 x 4 pixels) that the region fills. It keeps them where they are more than half of
+    it: then the sensor model does not fit, or there is no plane. Also returns the sums (M + 1, 29)
+    over the cells of each region.
     """
     layout = Layout.of(labels)
     inside = _labels_of_blocks(labels)
@@ -131,46 +93,35 @@ def sum_regions(
     given = *pixels, axis, blocks, sensor, layout, planes
     upper, lower = map_halves(_accumulate, len(inside), *given)
     cells, outside = upper + lower
-    total, left_out = sum_cells(layout.start, cells), sum_cells(layout.start, outside)
+    owners, count = regions_of(layout.start), len(layout.box)
+    total, left_out = (sum_by_label(owners, part, count) for part in (cells, outside))
     outliers = left_out[:, COUNT].astype(np.intp)
     measured = total[:, COUNT].astype(np.intp) + outliers
     many = 2 * outliers > measured
-    cells += outside * np.repeat(many, np.diff(layout.start))[:, None]
+    cells += outside * many[owners, None]
     total += left_out * many[:, None]
     kept = cells[:, COUNT] > 0
     start = np.searchsorted(np.flatnonzero(kept), layout.start)
     return RegionSums(layout.box, start, cells[kept], measured, outliers), total
 
 
-@njit(cache=True)
 def fit_sums(total: NDArray[np.float64]) -> NDArray[np.float64]:
     """Least-squares planes theta . ray = inverse range (M + 1, 3); zeros where there is none."""
-    theta = np.zeros((len(total), 3))
-    for k in range(1, len(total)):
-        if total[k, COUNT] >= 3:
-            fit(total[k], theta[k])
-    return theta
+    return np.where(total[:, COUNT, None] >= 3, fit_all(total)[0], 0)
 
 
-@njit(cache=True)
-def sum_cells(start: NDArray[np.intp], cells: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sums (M + 1, K) over the cells (N, K) of each region."""
-    total = np.zeros((len(start) - 1, cells.shape[1]))
-    for k in range(len(total)):
-        for c in range(start[k], start[k + 1]):
-            total[k] += cells[c]
-    return total
+def regions_of(start: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Region (N,) of each cell, where those of regions 0...M begin at `start` (M + 2,)."""
+    return np.repeat(np.arange(len(start) - 1), np.diff(start))
 
 
 @njit(cache=True, nogil=True)
-def _find_boxes(
-    first: int, after: int, labels: NDArray[np.uint16], count: int
-) -> NDArray[np.intp]:
-    """Bounding boxes (count, 4) of the regions in some rows, see `Layout`."""
+def find_boxes(labels: NDArray[np.integer], count: int) -> NDArray[np.intp]:
+    """Bounding boxes (count, 4) of regions 1...count - 1, see `Layout`."""
     height, width = labels.shape
     box = np.zeros((count, 4), np.intp)
     box[:, 0], box[:, 1] = height, width
-    for i in range(first, after):
+    for i in range(height):
         begin = 0
         for j in range(1, width + 1):
             if j < width and labels[i, j] == labels[i, begin]:
@@ -179,7 +130,9 @@ def _find_boxes(
             box[label, 0], box[label, 1] = min(box[label, 0], i), min(box[label, 1], begin)
             box[label, 2], box[label, 3] = i + 1, max(box[label, 3], j)
             begin = j
-    box[0] = 0
+    for k in range(count):
+        if k == 0 or box[k, 2] == 0:
+            box[k] = 0
     return box
 
 
@@ -199,17 +152,12 @@ def _labels_of_blocks(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
     return result
 
 
-@njit(cache=True, nogil=True)
 def _inner_planes(
     inside: NDArray[np.int32], moments: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
     """Planes (count, 3) of the blocks that regions fill; zeros where these do not tell one."""
-    sums = np.zeros((count, SIZE))
-    for bi in range(inside.shape[0]):
-        for bj in range(inside.shape[1]):
-            if inside[bi, bj] > 0:
-                sums[inside[bi, bj]] += moments[bi, bj]
-    return fit_sums(sums)
+    flat = moments.reshape(-1, moments.shape[2])
+    return fit_sums(sum_by_label(inside.ravel(), flat, count))
 
 
 @njit(cache=True, inline='always')

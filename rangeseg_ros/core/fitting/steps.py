@@ -18,35 +18,19 @@ class Steps(NamedTuple):
     """Which steps of the inverse range are jumps, of blocks (rows, columns), 1/m.
 
     Of a block that is not flat, by what is known of the flat ones beside it.
-
-    Attributes
-    ----------
-    windows : (rows, columns) float32
-        Smallest jump between means of windows: that of the flattest surface.
-    pixels : (rows, columns) float32
-        The same between pixels, which may be any surface's: that of the noisiest.
-    slopes : (rows, columns) float32
-        Change of the inverse range from pixel to pixel on the flattest surface.
     """
 
-    windows: NDArray[np.float32]
-    pixels: NDArray[np.float32]
-    slopes: NDArray[np.float32]
+    windows: NDArray[np.float32]  # between means of windows: that of the flattest surface
+    pixels: NDArray[np.float32]  # between pixels, which may be any surface's: of the noisiest
+    slopes: NDArray[np.float32]  # change from pixel to pixel on the flattest surface
 
 
 def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:
     """Smallest step of the inverse range that is a jump, and the slope of the surface.
 
-    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times
-    the variance of `agreement` for white and correlated noise alike (0.67 to 0.76), and five
-    standard deviations are no noise. Rounding alone makes steps of one quantum, and of two
-    where noise adds to it.
-
-    Parameters
-    ----------
-    blocks : Blocks
-        (rows, columns).
-    sensor : SensorModel
+    Second differences of means of 3 x 3 pixels, that jump edges are found by, have 0.72 times the
+    variance of `agreement` (0.67 to 0.76), and five standard deviations are no noise. Rounding
+    alone makes steps of one quantum, and of two where noise adds to it.
     """
     across, down, squared = blocks.across, blocks.down, blocks.squared
     variance, tilt = random_variance(sensor, squared), tilt_variance(sensor, across, down)

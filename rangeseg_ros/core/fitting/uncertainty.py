@@ -1,14 +1,8 @@
-r"""How far fitted planes may be off: covariances from the sensor's errors.
+"""How far fitted planes may be off: sandwich covariances from the sensor's errors.
 
-A weighted fit of theta . r = y turns errors e of the inverse range into
-A^-1 sum_i w_i r_i e_i, with A = sum_i w_i r_i r_i^T, whence the sandwich
-
-    cov(theta) = A^-1 (sum_ij w_i w_j r_i r_j^T cov(e_i, e_j)) A^-1.
-
-The sensor's errors are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)),
-sigma the width of the kernel they look smoothed with. Their sum over pairs of pixels is taken over
-pairs of cells: pixels of a cell spread around its middle like a Gaussian of their variance, over
-which the mean of the correlation has a closed form.
+They are white, or Gaussian fields of correlation exp(-|i - j|^2 / (4 sigma^2)), sigma the width of
+the kernel they look smoothed with. Their sum over pairs of pixels is taken over pairs of cells,
+whose pixels spread like a Gaussian of their variance: then its mean has a closed form.
 """
 
 from __future__ import annotations
@@ -19,9 +13,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, sum_cells
+from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, regions_of
 from rangeseg_ros.core.runtime.threads import map_halves
-from rangeseg_ros.core.sensing.moments import COUNT
+from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
 # Standard deviations of a correlation beyond which it is zero.
@@ -30,80 +24,47 @@ _FAR = 5.0
 _ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
-class Field(NamedTuple):
-    """Gaussian random field of variance constant + quartic y^4 at the inverse range y.
-
-    `width` is that of the kernel it looks smoothed with, pixels.
-    """
-
-    width: float
-    constant: float
-    quartic: float
+# Width of a field, see `Cells`, and the constant and quartic term of its variance.
+Field = tuple[float, float, float]
 
 
 class Cells(NamedTuple):
-    """Cells of regions as a field sees them; see `RegionSums` for which are whose.
+    """Cells of regions as a Gaussian field sees them; see `RegionSums` for which are whose."""
 
-    Attributes
-    ----------
-    place : (N, 4) float64
-        Mean row and column of the pixels, and their variances.
-    pixels : (N,) float64
-        Number of them.
-    ray : (N, 3) float64
-        Sum of the weighted rays, times the standard deviation of the field.
-    deviation : (N,) float64
-        That deviation.
-    """
-
-    place: NDArray[np.float64]
-    pixels: NDArray[np.float64]
-    ray: NDArray[np.float64]
-    deviation: NDArray[np.float64]
+    place: NDArray[np.float64]  # (N, 4), mean row and column of the pixels, and their variances
+    pixels: NDArray[np.float64]  # (N,), number of them
+    ray: NDArray[np.float64]  # (N, 3), sum of the weighted rays, times the deviation
+    deviation: NDArray[np.float64]  # (N,), standard deviation of the field
+    width: float  # of the kernel that it looks smoothed with, pixels
 
     @classmethod
     def of(cls, sums: RegionSums, level: NDArray[np.float64], field: Field) -> Cells:
-        """Cells whose planes are at such inverse ranges (N,)."""
+        """Cells whose planes are at inverse ranges y (N,); of variance constant + quartic y^4."""
+        width, constant, quartic = field
         cells = sums.cells
         count = cells[:, COUNT]
         mean = cells[:, PLACE : PLACE + 4] / count[:, None]
         spread = np.maximum(mean[:, 2:] - mean[:, :2] ** 2, 0)
-        deviation = np.sqrt(field.constant + field.quartic * level**4)
+        deviation = np.sqrt(constant + quartic * level**4)
         ray = deviation[:, None] * cells[:, RAY : RAY + 3]
-        return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation)
+        # A model whose numbers are given as integers is one of numbers all the same.
+        return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation, float(width))
 
 
 def distortion_field(sensor: SensorModel) -> Field:
     """The smooth systematic errors of a sensor."""
-    # A model whose numbers are given as integers is one of numbers all the same.
-    return Field(
-        *map(float, (sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2))
-    )
+    return sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2
 
 
 def theta_covariances(
     sums: RegionSums, theta: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
-    """Covariance of each plane in the form theta . ray = inverse range.
+    """Covariances (M + 1, 3, 3) of planes theta . ray = inverse range (M + 1, 3) of regions.
 
-    Parameters
-    ----------
-    sums : RegionSums
-        Of M + 1 regions.
-    theta : (M + 1, 3) float64
-        Their planes; zeros where there is none.
-    inverse : (M + 1, 3, 3) float64
-        A^-1.
-    sensor : SensorModel
-
-    Returns
-    -------
-    (M + 1, 3, 3) float64
-        Zeros where there is no plane.
+    `inverse` (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
     """
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
-    random = Field(*map(float, (sensor.correlation, *variances)))
     level = levels(sums, theta)
     weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
     mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
@@ -112,20 +73,21 @@ def theta_covariances(
     white = (1 - smooth) * random_variance(sensor, level**2) * mean
     own = white[:, None] * scatter
     middle = np.zeros((len(theta), 3, 3))
-    for field in (random, distortion_field(sensor)):
-        if field.constant + field.quartic > 0:
+    for field in ((sensor.correlation, *variances), distortion_field(sensor)):
+        if field[1] + field[2] > 0:
             cells = Cells.of(sums, level, field)
-            own += (_within(cells, field.width) * mean)[:, None] * centred
-            upper, lower = map_halves(_between, len(theta), sums.start, cells, field.width)
+            own += (_within(cells) * mean)[:, None] * centred
+            upper, lower = map_halves(_between, len(theta), sums.start, cells)
             middle += upper + lower
-    middle += sum_cells(sums.start, own)[:, _FULL].reshape(-1, 3, 3)
+    total = sum_by_label(regions_of(sums.start), own, len(theta))
+    middle += total[:, _FULL].reshape(-1, 3, 3)
     return sandwiches(inverse, middle)
 
 
 def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
-    plane = np.repeat(theta, np.diff(sums.start), axis=0)
-    total: NDArray[np.float64] = (plane * sums.cells[:, RAY : RAY + 3]).sum(axis=1)
+    plane, rays = theta[regions_of(sums.start)], sums.cells[:, RAY : RAY + 3]
+    total: NDArray[np.float64] = (plane * rays).sum(axis=1)
     return total / sums.cells[:, WEIGHT]
 
 
@@ -150,9 +112,9 @@ def plane_jacobians(
     return np.concatenate([-distance[:, None, None] * tangent, along], axis=1)
 
 
-def _within(cells: Cells, width: float) -> NDArray[np.float64]:
+def _within(cells: Cells) -> NDArray[np.float64]:
     """Variance (N,) by which a field varies in cells, as far as it is narrower than they are."""
-    variance, spread = 2 * width**2, cells.place[:, 2:]
+    variance, spread = 2 * cells.width**2, cells.place[:, 2:]
     total = np.maximum((variance + 2 * spread).prod(axis=1), 1e-300)
     alike = np.maximum(cells.pixels * variance / np.sqrt(total), 1)
     mean = spread.mean(axis=1)
@@ -162,31 +124,24 @@ def _within(cells: Cells, width: float) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _between(
-    first: int, after: int, start: NDArray[np.intp], cells: Cells, width: float
-) -> NDArray[np.float64]:
+def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
     """Sums over pairs of cells (M + 1, 3, 3), of regions from the first to before the second."""
     result = np.zeros((len(start) - 1, 3, 3))
     for k in range(first, after):
         own = start[k], start[k + 1]
-        add_common_errors(cells, own, own, width, result[k])
+        add_common_errors(cells, own, own, result[k])
     return result
 
 
 @njit(cache=True)
 def add_common_errors(
-    cells: Cells,
-    one: tuple[int, int],
-    other: tuple[int, int],
-    width: float,
-    result: NDArray[np.float64],
+    cells: Cells, one: tuple[int, int], other: tuple[int, int], result: NDArray[np.float64]
 ) -> None:
-    """Add the sum over pairs of pixels to `result` (3, 3): of the means of cells.
+    """Add the sum over pairs of pixels, of the means of cells, to `result` (3, 3).
 
-    The first pixel is in cells from the first of `one` to before its second, the second one in
-    those of `other`.
+    `one` and `other` are the first cell of either pixel and the one after the last.
     """
-    variance = 2 * width**2
+    variance = 2 * cells.width**2
     place, count, ray = cells.place, cells.pixels, cells.ray
     for i in range(*one):
         x = y = z = 0.0
@@ -206,12 +161,3 @@ def add_common_errors(
             result[p, 0] += ray[i, p] * x
             result[p, 1] += ray[i, p] * y
             result[p, 2] += ray[i, p] * z
-
-
-@njit(cache=True)
-def level_of(cell: NDArray[np.float64], theta: NDArray[np.float64]) -> float:
-    """Inverse range of a plane at the middle of a cell."""
-    total = 0.0
-    for a in range(3):
-        total += theta[a] * cell[RAY + a]
-    return total / cell[WEIGHT]

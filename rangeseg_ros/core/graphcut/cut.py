@@ -12,9 +12,8 @@ is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the 
 cost of staying or of switching.
 
 The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
-tree grows from either terminal over edges that are not saturated; where the two meet,
-flow is pushed along the path, and the nodes that this cuts off look for another parent in their
-tree.
+tree grows from either terminal over edges that are not saturated; where the two meet, flow is
+pushed along the path, and nodes that this cuts off look for another parent in their tree.
 """
 
 from __future__ import annotations
@@ -35,36 +34,17 @@ class _Flow(NamedTuple):
     """State of a maximum flow: n nodes with up to four neighbours.
 
     The source stands for staying, the sink for switching.
-
-    Attributes
-    ----------
-    neighbour : (n, 4) int32
-        Node on each side, -1 for none.
-    residual : (n, 4) float64
-        What the edge to that side can still take.
-    terminal : (n,) float64
-        What the edge from the source, or to the sink where negative, can still take.
-    parent : (n,) int8
-        Side of the parent in its tree.
-    sink : (n,) bool
-        Whether the tree is that of the sink.
-    stamp, depth : (n,) int32
-        When the distance to the terminal was last known, and that distance.
-    queue : (n,) int32
-        Ring of the nodes from which the trees grow.
-    queued : (n,) bool
-        Whether a node is in it.
     """
 
-    neighbour: NDArray[np.int32]
-    residual: NDArray[np.float64]
-    terminal: NDArray[np.float64]
-    parent: NDArray[np.int8]
-    sink: NDArray[np.bool_]
-    stamp: NDArray[np.int32]
-    depth: NDArray[np.int32]
-    queue: NDArray[np.int32]
-    queued: NDArray[np.bool_]
+    neighbour: NDArray[np.int32]  # (n, 4), node on each side, -1 for none
+    residual: NDArray[np.float64]  # (n, 4), what the edge to that side can still take
+    terminal: NDArray[np.float64]  # (n,), that of the source, of the sink where negative
+    parent: NDArray[np.int8]  # (n,), side of the parent in its tree
+    sink: NDArray[np.bool_]  # (n,), whether the tree is that of the sink
+    stamp: NDArray[np.int32]  # (n,), when the distance to the terminal was last known
+    depth: NDArray[np.int32]  # (n,), that distance
+    queue: NDArray[np.int32]  # (n,), ring of the nodes from which the trees grow
+    queued: NDArray[np.bool_]  # (n,), whether a node is in it
 
 
 @njit(cache=True, nogil=True)
@@ -73,18 +53,10 @@ def minimum_cut(
 ) -> NDArray[np.bool_]:
     """Choice x (n,) bool that minimises sum excess x + sum link |x - x of the neighbour|.
 
-    Of several, the one that chooses fewest nodes.
-
-    Parameters
-    ----------
-    excess : (n,) float64
-        Cost of choosing a node, of either sign.
-    neighbour : (n, 4) int32
-        Node on each side of a grid, -1 for none: that node has this one on the opposite side,
-        k ^ 2 for side k.
-    link : (n, 4) float64
-        Cost of the edge to that side if its ends are not chosen alike, not negative; the same
-        seen from either end.
+    Of several, the one that chooses fewest nodes. `excess` (n,) is the cost of choosing a node, of
+    either sign. `neighbour` (n, 4) are the nodes on each side of a grid, -1 for none: that node
+    has this one on the opposite side, k ^ 2 for side k. `link` (n, 4) is the cost, not negative,
+    of the edge to that side if its ends are not chosen alike; the same seen from either end.
     """
     count = len(excess)
     flow = _Flow(
@@ -95,20 +67,17 @@ def minimum_cut(
         np.zeros(count, np.bool_),
         np.zeros(count, np.int32),
         np.zeros(count, np.int32),
-        np.empty(count, np.int32),
+        np.zeros(count, np.int32),
         np.zeros(count, np.bool_),
     )
     orphans = np.empty(count, np.int32)
-    first = last = waiting = 0
+    first = last = 0
     for p in range(count):
         if flow.terminal[p] != 0:
             flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, flow.terminal[p] < 0, 1
-            flow.queue[last] = p
-            flow.queued[p] = True
-            last = _next(last, count)
-            waiting += 1
+            last = _wait(flow, p, last)
     time = 0
-    while waiting > 0:
+    while count > 0 and flow.queued[flow.queue[first]]:
         p = flow.queue[first]
         side = -1
         if flow.parent[p] != _FREE:
@@ -124,11 +93,7 @@ def minimum_cut(
                 if flow.parent[q] == _FREE:
                     flow.parent[q], flow.sink[q] = opposite, flow.sink[p]
                     flow.stamp[q], flow.depth[q] = flow.stamp[p], flow.depth[p] + 1
-                    if not flow.queued[q]:
-                        flow.queue[last] = q
-                        flow.queued[q] = True
-                        last = _next(last, count)
-                        waiting += 1
+                    last = _wait(flow, q, last)
                 elif flow.sink[q] != flow.sink[p]:
                     side = k
                     break
@@ -139,7 +104,6 @@ def minimum_cut(
             # Nothing more to grow here.
             flow.queued[p] = False
             first = _next(first, count)
-            waiting -= 1
             continue
         time += 1
         found = _push(flow, p, side, orphans)
@@ -157,11 +121,8 @@ def minimum_cut(
                     continue
                 opposite = k ^ 2
                 free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
-                if free > 0 and not flow.queued[r]:
-                    flow.queue[last] = r
-                    flow.queued[r] = True
-                    last = _next(last, count)
-                    waiting += 1
+                if free > 0:
+                    last = _wait(flow, r, last)
                 if flow.parent[r] == opposite:
                     flow.parent[r] = _ORPHAN
                     orphans[end] = r
@@ -180,6 +141,15 @@ def _next(place: int, count: int) -> int:
     return place + 1 if place + 1 < count else 0
 
 
+@njit(cache=True, nogil=True, inline='always')
+def _wait(flow: _Flow, p: int, last: int) -> int:
+    """Let a node wait in the queue, unless it does; the new end of the queue."""
+    if flow.queued[p]:
+        return last
+    flow.queue[last], flow.queued[p] = p, True
+    return _next(last, len(flow.queue))
+
+
 @njit(cache=True, nogil=True)
 def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
     """Push what the path over the edge from `p` can take; how many `orphans` that makes."""
@@ -189,55 +159,35 @@ def _push(flow: _Flow, p: int, side: int, orphans: NDArray[np.int32]) -> int:
         p, side = neighbour[p, side], side ^ 2
     pushed = residual[p, side]
     # From p up to the source, against the flow, and from its neighbour on to the sink.
-    a = p
-    while parent[a] != _TERMINAL:
-        k = parent[a]
-        above = neighbour[a, k]
-        pushed = min(pushed, residual[above, k ^ 2])
-        a = above
-    pushed = min(pushed, terminal[a])
-    b = neighbour[p, side]
-    while parent[b] != _TERMINAL:
-        k = parent[b]
-        pushed = min(pushed, residual[b, k])
-        b = neighbour[b, k]
-    pushed = min(pushed, -terminal[b])
-
+    for sink in range(2):
+        a = neighbour[p, side] if sink else p
+        while parent[a] != _TERMINAL:
+            k = parent[a]
+            above = neighbour[a, k]
+            pushed = min(pushed, residual[a, k] if sink else residual[above, k ^ 2])
+            a = above
+        pushed = min(pushed, abs(terminal[a]))
     found = 0
     residual[p, side] -= pushed
-    b = neighbour[p, side]
-    residual[b, side ^ 2] += pushed
-    a = p
-    while parent[a] != _TERMINAL:
-        k = parent[a]
-        above = neighbour[a, k]
-        residual[a, k] += pushed
-        residual[above, k ^ 2] -= pushed
-        if residual[above, k ^ 2] <= 0:
+    residual[neighbour[p, side], side ^ 2] += pushed
+    for sink in range(2):
+        a = neighbour[p, side] if sink else p
+        way = pushed if sink else -pushed
+        while parent[a] != _TERMINAL:
+            k = parent[a]
+            above = neighbour[a, k]
+            residual[a, k] -= way
+            residual[above, k ^ 2] += way
+            if (residual[a, k] if sink else residual[above, k ^ 2]) <= 0:
+                parent[a] = _ORPHAN
+                orphans[found] = a
+                found += 1
+            a = above
+        terminal[a] += way
+        if terminal[a] == 0:
             parent[a] = _ORPHAN
             orphans[found] = a
             found += 1
-        a = above
-    terminal[a] -= pushed
-    if terminal[a] <= 0:
-        parent[a] = _ORPHAN
-        orphans[found] = a
-        found += 1
-    while parent[b] != _TERMINAL:
-        k = parent[b]
-        above = neighbour[b, k]
-        residual[above, k ^ 2] += pushed
-        residual[b, k] -= pushed
-        if residual[b, k] <= 0:
-            parent[b] = _ORPHAN
-            orphans[found] = b
-            found += 1
-        b = above
-    terminal[b] += pushed
-    if terminal[b] >= 0:
-        parent[b] = _ORPHAN
-        orphans[found] = b
-        found += 1
     return found
 
 

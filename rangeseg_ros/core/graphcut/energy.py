@@ -1,12 +1,7 @@
-"""The energy that both methods minimise (thesis eq. 5.3).
+"""The energy that both methods minimise: E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q].
 
-    E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q]
-
-f gives every pixel p a label f_p. D_p is the data cost (unary), which each method defines for
-itself: `by_normals.angles`, `by_planes.plane_energy`. The other sum is the Potts prior (pairwise)
-over the edges of the 4-connected grid, with the neighbourhood weights u of eq. 5.1 that `Grid`
-holds: 0 across jump edges and where nothing was measured. The moves of `moves` and `expansion`
-lower E whatever the labels mean.
+D_p is the data cost of each method: `by_normals.angular_cost`, `by_planes.plane_energy`. The other
+sum is the Potts prior over the 4-connected grid, with the neighbourhood weights u of `Grid`.
 """
 
 from __future__ import annotations
@@ -20,17 +15,7 @@ from rangeseg_ros.core.sensing.grid import Grid
 def energy(
     data: NDArray[np.floating], labels: NDArray[np.integer], grid: Grid, smoothness: float
 ) -> float:
-    """Value of E for a labelling.
-
-    Parameters
-    ----------
-    data : (H, W) float
-        Data cost of each pixel's label.
-    labels : (H, W) int
-    grid : Grid
-    smoothness : float
-        Lambda.
-    """
+    """Value of E for labels (H, W) of data costs (H, W), lambda = `smoothness`."""
     across = grid.right[labels[:, 1:] != labels[:, :-1]]
     down = grid.below[labels[1:] != labels[:-1]]
     boundary = across.sum(dtype=float) + down.sum(dtype=float)
@@ -38,21 +23,11 @@ def energy(
 
 
 def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
-    """Lambda u of every edge, in the order of the sites.
+    """Lambda u of every edge of a grid (H, W), in the order of the sites; lambda = `smoothness`.
 
-    Parameters
-    ----------
-    grid : Grid
-        (H, W).
-    smoothness : float
-        Lambda.
-
-    Returns
-    -------
-    (2, H * W) float32
-        Of each pixel's edges to the right and down; 0 at the border. The edge between p and its
-        neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)], and before
-        the first pixel, where this counts from the end, there is a border as well.
+    (2, H * W): of each pixel's edges to the right and down, 0 at the border. The edge between p
+    and its neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)]; before the
+    first pixel, where this counts from the end, is a border as well.
     """
     height, width = len(grid.right), grid.below.shape[1]
     result = np.empty((2, height, width), np.float32)

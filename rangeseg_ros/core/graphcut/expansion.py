@@ -18,37 +18,16 @@ def expand(
     labelling: GridLabelling,
     least: float,
 ) -> bool:
-    """Give label `alpha` to the best set of sites; in place.
+    """Give label `alpha` to the best set of sites (s,), none of which has it; in place.
 
-    Parameters
-    ----------
-    alpha : int
-    sites : (s,) int32
-        Those that may switch, none of which has the label. `labelling.position` has their places.
-    new : (s,) float32
-        Data cost of the label there.
-    labelling : GridLabelling
-    least : float
-        An improvement of no more than this is rounding.
-
-    Returns
-    -------
-    bool
-        Whether that lowered the energy.
+    `labelling.position` has their places, `new` (s,) is the data cost of the label there. Returns
+    whether that lowered the energy by more than `least`, which is rounding.
     """
-    excess, neighbour, link = _problem(alpha, sites, new, labelling)
+    excess, neighbour, link = switching(alpha, sites, new, labelling)
     switch = minimum_cut(excess, neighbour, link)
-    count, value = len(sites), 0.0
-    for s in range(count):
-        if not switch[s]:
-            continue
-        value += excess[s]
-        for k in range(4):
-            if neighbour[s, k] >= 0 and not switch[neighbour[s, k]]:
-                value += link[s, k]
-    if value >= -least:
+    if change(switch, excess, neighbour, link) >= -least:
         return False
-    for s in range(count):
+    for s in range(len(sites)):
         if switch[s]:
             labelling.labels[sites[s]] = alpha
             labelling.data[sites[s]] = new[s]
@@ -56,7 +35,26 @@ def expand(
 
 
 @njit(cache=True, nogil=True)
-def _problem(
+def change(
+    switch: NDArray[np.bool_],
+    excess: NDArray[np.float64],
+    neighbour: NDArray[np.int32],
+    link: NDArray[np.float64],
+) -> float:
+    """What the energy changes by where sites (s,) `switch`; the others as of `minimum_cut`."""
+    value = 0.0
+    for s in range(len(switch)):
+        if not switch[s]:
+            continue
+        value += excess[s]
+        for k in range(4):
+            if neighbour[s, k] >= 0 and not switch[neighbour[s, k]]:
+                value += link[s, k]
+    return value
+
+
+@njit(cache=True, nogil=True)
+def switching(
     alpha: int, sites: NDArray[np.int32], new: NDArray[np.float32], labelling: GridLabelling
 ) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.float64]]:
     """What switching costs each site more than staying, and its edges to other sites.

@@ -11,31 +11,18 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+# Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1].
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
-"""Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1]."""
 
 
 class GridLabelling(NamedTuple):
-    """A labelling of n pixels, in raster order, while expansions change it.
+    """A labelling of n pixels, in raster order, while expansions change it."""
 
-    Attributes
-    ----------
-    labels : (n,) int32
-    data : (n,) float32
-        Data cost of each pixel's label.
-    links : (2, n) float32
-        See `energy.link_costs`.
-    width : int
-        Pixels in a row.
-    position : (n,) int32
-        Scratch of the expansions: -1 between them.
-    """
-
-    labels: NDArray[np.int32]
-    data: NDArray[np.float32]
-    links: NDArray[np.float32]
-    width: int
-    position: NDArray[np.int32]
+    labels: NDArray[np.int32]  # (n,)
+    data: NDArray[np.float32]  # (n,), data cost of each pixel's label
+    links: NDArray[np.float32]  # (2, n), see `energy.link_costs`
+    width: int  # pixels in a row
+    position: NDArray[np.int32]  # (n,), scratch of the expansions: -1 between them
 
     @classmethod
     def of(
@@ -50,29 +37,11 @@ class GridLabelling(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def fronts(
-    labels: NDArray[np.int32],
-    links: NDArray[np.float32],
-    width: int,
-    count: int,
-    rows: tuple[int, int],
-) -> Sites:
-    """Sites in some rows that are across an edge from each label's own.
-
-    Parameters
-    ----------
-    labels : (n,) int32
-    links : (2, n) float32
-    width : int
-        Sites in a row.
-    count : int
-        Number of labels.
-    rows : tuple of 2 int
-        The first of the rows, and the one after the last.
-    """
+def fronts(labelling: GridLabelling, count: int, rows: tuple[int, int]) -> Sites:
+    """Sites in some rows that are across an edge from each of `count` labels' own."""
+    labels, links, width, found = labelling.labels, labelling.links, labelling.width, 0
     first, after = rows[0] * width, rows[1] * width
     owners, sites = np.empty((2, 4 * (after - first)), np.int32)
-    found = 0
     for p in range(max(first - width, 0), after):
         # The last pixel of a row has no link to the right.
         for k, q in enumerate((p + 1, p + width)):
@@ -110,20 +79,8 @@ def band(
 ) -> NDArray[np.int32]:
     """Sites of other labels, in some rows, within `reach` edges of a label.
 
-    Parameters
-    ----------
-    alpha : int
-    front : (m,) int32
-        Sites next to those of the label, one or more times. Those of the label are left out.
-    reach : int
-    labelling : GridLabelling
-        `position` receives the place of each site in the result.
-    rows : tuple of 2 int
-        The first of the rows, and the one after the last.
-
-    Returns
-    -------
-    (s,) int32
+    `front` (m,) are sites next to those of the label, one or more times; those of the label are
+    left out. `labelling.position` receives the place of each site in the result (s,).
     """
     labels, links, position = labelling.labels, labelling.links, labelling.position
     offsets = np.array([1, labelling.width, -1, -labelling.width])

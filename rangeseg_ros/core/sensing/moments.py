@@ -163,3 +163,16 @@ def fit_all(moments: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[
     for i in range(len(moments)):
         residual[i] = fit(moments[i], theta[i])
     return theta, residual
+
+
+@njit(cache=True, nogil=True)
+def sum_by_label(
+    labels: NDArray[np.integer], values: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
+    """Sums (count, K) of the values (N, K) of each of the labels (N,) above 0."""
+    total = np.zeros((count, values.shape[1]))
+    for n in range(len(labels)):
+        if labels[n] > 0:
+            for k in range(values.shape[1]):
+                total[labels[n], k] += values[n, k]
+    return total
