@@ -185,11 +185,11 @@ def test_a_band_has_the_sites_so_near_to_a_label(reach):
         )
         links[0, :, -1] = links[1, -1] = 0
         pixels = labels.ravel(), links.reshape(2, -1)
-        start, sites = fronts(*pixels, width, count, rows)
+        costs = np.zeros(labels.size, np.float32)
+        start, sites = fronts(GridLabelling.of(pixels[0], costs, pixels[1], width), count, rows)
         inside = np.zeros(labels.shape, bool)
         inside[slice(*rows)] = True
         for alpha in range(count):
-            costs = np.zeros(labels.size, np.float32)
             labelling = GridLabelling.of(pixels[0], costs, pixels[1], width)
             front = sites[start[alpha] : start[alpha + 1]]
             assert inside.flat[front].all() and (pixels[0][front] != alpha).all()
