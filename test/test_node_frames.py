@@ -243,7 +243,7 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         )
         assert (0, 0) in {(ground, free) for ground, _, free in found}
         assert published(bench, PITCH + np.radians(25), robot, ahead=60) == (0, 0, 0)
-        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'stated up is off by' in s.message)
+        bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'up is off by' in s.message)
 
 
 @pytest.fixture(scope='module')
