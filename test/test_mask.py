@@ -6,7 +6,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, RangeImageError, Segmenter, corrected
 from rangeseg_ros.core.ground.points import unseen
-from rangeseg_ros.io.images import read_labels
+from rangeseg_ros.io.images import read_labels, read_mask
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 TILT = np.radians(40)
@@ -65,3 +65,12 @@ def test_wrong_files_end_the_command_in_one_line(tmp_path, kind, segment_image):
     # Of the size nothing is known before there is an image.
     assert (f'{tmp_path / "params.yaml"}: parameter mask: ' in error) == (kind != 'size')
     assert not (tmp_path / 'out').exists()
+
+
+def test_of_four_channels_the_last_is_opacity(tmp_path):
+    image = np.zeros((2, 3, 4), np.uint8)
+    image[..., 3] = [[255, 0, 255], [255, 255, 0]]
+    image[:, :2, 1] = 9
+    cv2.imwrite(str(tmp_path / 'mask.png'), image)
+    expected = [[True, False, False], [True, True, False]]
+    assert read_mask(tmp_path / 'mask.png').tolist() == expected

@@ -158,6 +158,12 @@ def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     assert of_white.max() > 0
 
 
+def test_what_was_not_measured_weighs_nothing():
+    problem, _, _ = random_case(2, 13, 9)
+    assert (problem.inverse == 0).any()
+    np.testing.assert_array_equal(problem.weight > 0, problem.inverse > 0)
+
+
 @pytest.mark.parametrize('seed', range(5))
 def test_energy_is_what_it_is_defined_to_be(seed):
     problem, models, labels = random_case(seed, 13, 9)
