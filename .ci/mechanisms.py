@@ -118,7 +118,7 @@ MECHANISMS = (
     Mechanism('jump edges', 'sensing/jump_edges.py fitting/steps.py',
               {'jump_edges': 'none'}),
     Mechanism('jumps by the plane, not Sobel',
-              'sensing/jump_edges.py:plane_deviation,_crossings,_exceeds fitting/steps.py',
+              'sensing/jump_edges.py:plane_deviation,_find_deviations fitting/steps.py',
               {'jump_edges': 'sobel'}),
     Mechanism('steps follow the noise', 'fitting/steps.py', {'edge_step': 0.0065}),
     Mechanism('holes bridged', 'sensing/bridges.py',

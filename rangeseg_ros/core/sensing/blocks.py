@@ -56,11 +56,7 @@ class Blocks(NamedTuple):
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
-        parts = np.pad(self.moments, ((0, rows % 2), (0, columns % 2), (0, 0)))
-        upper, lower = parts[::2], parts[1::2]
-        blocks.moments[:] = upper[:, ::2] + upper[:, 1::2] + lower[:, ::2] + lower[:, 1::2]
-        blocks.moments[..., COUNT + 1 :] = 0
-        _fit_planes(0, len(blocks.moments), rays, size, blocks)
+        _sum_blocks(self.moments, rays, size, blocks)
         return blocks
 
     @classmethod
@@ -73,6 +69,20 @@ def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
     """Values of the blocks, or one for all, for the pixels (H, W) of each."""
     blocks = np.broadcast_to(values, [-(-length // BLOCK) for length in shape])
     return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=0)[: shape[0], : shape[1]]
+
+
+@njit(cache=True, nogil=True)
+def _sum_blocks(
+    parts: NDArray[np.float64], rays: NDArray[np.float32], size: int, blocks: Blocks
+) -> None:
+    """Fill in blocks of 2 x 2 that have these moments."""
+    moments = blocks.moments
+    moments[:] = 0
+    for i in range(parts.shape[0]):
+        for j in range(parts.shape[1]):
+            for k in range(COUNT + 1):
+                moments[i // 2, j // 2, k] += parts[i, j, k]
+    _fit_planes(0, len(moments), rays, size, blocks)
 
 
 @njit(cache=True, nogil=True)

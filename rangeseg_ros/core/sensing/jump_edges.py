@@ -6,18 +6,19 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.blocks import for_pixels
+from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import OUTLIER
 
 # Rows and columns of the windows of both methods, and of the median before the Sobel operators.
 _WINDOW = 3
+_FRAME = 2 * _WINDOW - 1  # the farthest window that a boundary looks at
 _SOBEL_GAIN = 4  # response of the operator of 3 x 3 to a step of one: 1 + 2 + 1
-# Rows are looked at as they are, columns as rows of the transposed image.
-_TURNS = (np.asarray, np.transpose)
 
 
 def jump_edges(image: RangeImage, method: str, *steps: ArrayLike) -> GridEdges | None:
@@ -43,24 +44,32 @@ def plane_deviation(
     In 1/m, of the image or of every block of 4 x 4 pixels: the deviation of windows that makes a
     `step`, that `between` two pixels, if larger, and the `slope` of surfaces from pixel to pixel.
     """
+    height, width = image.shape
     step, slope, between = (np.asarray(a, np.float32) for a in (step, slope, between))
     # No noise, and twice as steep as the flat surface around.
     clear = np.float32(OUTLIER) * step + 2 * slope
     step, lone, clear = (
-        for_pixels(a, image.shape) for a in (step, np.maximum(step, between), clear)
+        _along_rows(a, image.shape) for a in (step, np.maximum(step, between), clear)
     )
     total, count = _window_sums(image, _WINDOW)
-    means = total / np.maximum(count, 1)
+    means = _framed(total / np.maximum(count, 1))
+    jumps = np.empty((height, width - 1), np.bool_), np.empty((height - 1, width), np.bool_)
+    for down, result in enumerate(jumps):
+        run_rows(_find_deviations, len(result), means, step, down, result)
     total, count = _window_sums(image, 2 * _WINDOW + 1)
     nearer = image.inverse * count > total
-    across, down = (turn(_exceeds(turn(means), _WINDOW, turn(step))[0]) for turn in _TURNS)
     # 1 for candidates below the mean, 2 for those above.
-    sides = pixels_beside((across, down)).view(np.uint8) << nearer
-    across, down = (
-        turn(_crossings(turn(image.inverse), turn(sides), turn(lone), turn(clear)))
-        for turn in _TURNS
-    )
-    return across, down
+    sides = pixels_beside(jumps).view(np.uint8) << nearer
+    pixels = _framed(image.inverse)
+    for down, result in enumerate(jumps):
+        run_rows(_find_crossings, len(result), pixels, sides, lone, clear, down, result)
+    return jumps
+
+
+def _along_rows(limit: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """Values (rows of blocks, W) from one value or those of all blocks."""
+    blocks = np.broadcast_to(limit, (-(-shape[0] // BLOCK), -(-shape[1] // BLOCK)))
+    return np.ascontiguousarray(blocks.repeat(BLOCK, axis=1)[:, : shape[1]])
 
 
 def _window_sums(image: RangeImage, size: int) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -72,38 +81,77 @@ def _window_sums(image: RangeImage, size: int) -> tuple[NDArray[Any], NDArray[An
     return total, count
 
 
-def _crossings(
-    inverse: NDArray[np.float32],
+def _framed(values: NDArray[Any]) -> NDArray[Any]:
+    """Values in a frame of zeros."""
+    return cv2.copyMakeBorder(values, _FRAME, _FRAME, _FRAME, _FRAME, cv2.BORDER_CONSTANT)
+
+
+@njit(cache=True, nogil=True)
+def _find_deviations(
+    first: int,
+    after: int,
+    means: NDArray[np.float32],
+    limits: NDArray[np.float32],
+    down: bool,
+    result: NDArray[np.bool_],
+) -> None:
+    """Whether the windows on either side of boundaries deviate from those beyond."""
+    for i in range(first, after):
+        a, b = _shifted(means, i, -4, down), _shifted(means, i, -1, down)
+        c, d = _shifted(means, i, 2, down), _shifted(means, i, 5, down)
+        row = limits[i // BLOCK]
+        for j in range(result.shape[1]):
+            result[i, j] = _exceeds(a[j], b[j], c[j], d[j], row[j])[0]
+
+
+@njit(cache=True, nogil=True)
+def _find_crossings(
+    first: int,
+    after: int,
+    pixels: NDArray[np.float32],
     sides: NDArray[np.uint8],
-    lone: NDArray[np.float32],
+    limits: NDArray[np.float32],
     clear: NDArray[np.float32],
-) -> NDArray[np.bool_]:
-    """Jumps (H, W-1) between pixels and those to their right, see `plane_deviation`."""
-    jumps, stands_out = _exceeds(inverse, 1, lone)
-    both, (here, there) = sides[:, :-1] | sides[:, 1:], (inverse[:, :-1], inverse[:, 1:])
-    jumps = (jumps & (both > 0)) | (stands_out & (np.abs(there - here) > clear[:, :-1]))
-    return jumps | ((both == 3) & (here > 0) & (there > 0))
+    down: bool,
+    result: NDArray[np.bool_],
+) -> None:
+    """Jumps between pixels, see `plane_deviation`."""
+    for i in range(first, after):
+        a, b = _shifted(pixels, i, -1, down), _shifted(pixels, i, 0, down)
+        c, d = _shifted(pixels, i, 1, down), _shifted(pixels, i, 2, down)
+        one, other = sides[i], sides[i + 1] if down else sides[i, 1:]
+        row, clear_row = limits[i // BLOCK], clear[i // BLOCK]
+        for j in range(result.shape[1]):
+            jumps, stands_out = _exceeds(a[j], b[j], c[j], d[j], row[j])
+            both = one[j] | other[j]
+            jumps = (jumps & (both > 0)) | (stands_out & (abs(c[j] - b[j]) > clear_row[j]))
+            result[i, j] = jumps | ((both == 3) & (b[j] > 0) & (c[j] > 0))
 
 
-def _exceeds(
-    values: NDArray[np.float32], size: int, limit: NDArray[np.float32]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether the step to the right exceeds those before and after it, in one direction (H, W-1).
+@njit(cache=True, inline='always')
+def _shifted(values: NDArray[np.float32], i: int, offset: int, down: bool) -> NDArray[np.float32]:
+    """Row i of framed values, or what lies `offset` further down or to the right."""
+    if down:
+        return values[_FRAME + i + offset, _FRAME:]
+    return values[_FRAME + i, _FRAME + offset :]
 
-    And whether it differs from both in any direction. Between means (H, W) of adjoining windows
-    of this size. Of those beyond the step, one that was not measured (0) is left out; there is no
-    step without the two beside it.
+
+@njit(cache=True, inline='always')
+def _exceeds(a: float, b: float, c: float, d: float, limit: float) -> tuple[Any, Any]:
+    """Whether the step from b to c exceeds those from a to b and from c to d, in one direction.
+
+    And whether it differs from both in any direction. Of a and d, one that was not measured (0) is
+    left out; there is no step without b and c.
     """
-    margin, width = size + size // 2, values.shape[1] - 1
-    framed = np.pad(values, ((0, 0), (margin, margin)))
-    a, b, c, d = (framed[:, k * size : k * size + width] for k in range(4))
-    here, limit = c - b, limit[:, :-1]
+    # Without branches, so that the compiler takes many at a time.
+    here = c - b
     before, after = here - (b - a), here - (d - c)
     first, last, known = a == 0, d == 0, (b > 0) & (c > 0)
-    higher, lower = first | (before > limit), first | (before < -limit)
-    rises, falls = last | (after > limit), last | (after < -limit)
-    jumps = known & ((higher & rises) | (lower & falls)) & ~(first & last)
-    return jumps, known & (higher | lower) & (rises | falls)
+    higher, lower = before > limit, before < -limit
+    rises, falls = after > limit, after < -limit
+    above, below = (first | higher) & (last | rises), (first | lower) & (last | falls)
+    apart = (first | higher | lower) & (last | rises | falls)
+    return known & (above | below) & ~(first & last), known & apart
 
 
 def sobel(image: RangeImage) -> GridEdges:
