@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 
-# Of every n-th row and column that are segmented, the share of the processor time of all pixels on
-# Kinect frames of 640 x 480 (docs/benchmark.md).
+# Of bins n times as wide, the budget from which on they are taken (docs/benchmark.md).
 _SHARES = {1: 1.0, 2: 0.55, 4: 0.35}
 
 STEPS = tuple(_SHARES.values())
@@ -13,7 +12,7 @@ STEPS = tuple(_SHARES.values())
 
 
 def step_within(budget: float) -> int:
-    """Rows and columns of which one is looked at, for a share `budget` of the full work, 0...1."""
+    """By how much bins are wider, for a share `budget` of the full work, 0...1."""
     return next((step for step, share in _SHARES.items() if budget >= share), max(_SHARES))
 
 
