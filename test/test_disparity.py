@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -32,6 +33,7 @@ def test_disparities_are_found_and_segmented_as_such(seen, levels):
     result = Segmenter().segment(image)
     assert result.image is image and result.verdict.invalid
     assert result.verdict.reasons[0] == 'disparity instead of depth'
+    assert result.ground is None and not result.terrain.any()
     depth = Segmenter().segment(RangeImage.from_depth(seen.depth, seen.camera))
     assert depth.verdict.ok
     for plane in depth.planes[:3]:
@@ -63,3 +65,10 @@ def test_a_crease_is_no_bend(size):
     assert not shows_disparity(RangeImage.from_depth(depth, camera))
     # A small image tells too little.
     assert shows_disparity(RangeImage.from_depth(1 / depth, camera)) == (size[0] > 160)
+
+
+@pytest.mark.parametrize('focal', [1e4, 1e7, 1e12])
+def test_narrow_views_tell_nothing_and_pass(focal):
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+    depth = np.random.default_rng(1).uniform(1, 2, camera.shape)
+    assert not shows_disparity(RangeImage.from_depth(depth, camera))

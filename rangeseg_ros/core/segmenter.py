@@ -79,7 +79,8 @@ class Segmenter:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
         if shows_disparity(image):
             result = self._undone(from_disparity(image))
-            return replace(result, image=image, disparity=True)
+            # Heights in no unit are no ground to drive on.
+            return replace(result, image=image, disparity=True, survey=None)
         return self._undone(image)
 
     def _undone(self, image: RangeImage) -> Segmentation:

@@ -28,7 +28,12 @@ def shows_disparity(image: RangeImage) -> bool:
     inverse, rays = _blocks(image)
     if not len(inverse):
         return False
-    fit = np.linalg.inv(rays.transpose(0, 2, 1) @ rays) @ rays.transpose(0, 2, 1)
+    square = rays.transpose(0, 2, 1) @ rays
+    # Rays of a very narrow view are all but one: rounding alone would make it singular.
+    square += (
+        np.finfo(np.float64).eps * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
+    )
+    fit = np.linalg.inv(square) @ rays.transpose(0, 2, 1)
     # Behind the camera where no plane fits.
     level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))
     both = np.concatenate([inverse, 1 / level], axis=2)
