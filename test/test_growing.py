@@ -8,7 +8,6 @@ from rangeseg_ros.core.by_planes.patches import find_patches
 from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts, least_contact
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.sensing.binning import pixel_area
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import View, weights
@@ -36,7 +35,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
     edges = weights(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(pixel_noise=0.0, **sensor))
-    area = pixel_area(image.rays)
+    area = image.pixel_area
     view = View(image, image, Blocks.of(image), edges, model, least, area, True)
     nodes = Nodes.of(view)
     return join_surfaces(*find_patches(nodes, model), nodes, view, SMOOTHNESS)

@@ -16,7 +16,6 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.moves import Labelling
 from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
-from rangeseg_ros.core.sensing.binning import pixel_area
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, weights
 from rangeseg_ros.core.sensing.moments import RATIO
@@ -215,7 +214,7 @@ def small_room(seed=900):
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config(pixel_noise=0.0))
     edges = weights(image)
-    view = View(image, image, Blocks.of(image), edges, sensor, 1, pixel_area(image.rays), True)
+    view = View(image, image, Blocks.of(image), edges, sensor, 1, image.pixel_area, True)
     nodes = Nodes.of(view)
     found = join_surfaces(*find_patches(nodes, sensor), nodes, view, LAMBDA)
     problem = Problem.of(image, sensor, edges, LAMBDA)

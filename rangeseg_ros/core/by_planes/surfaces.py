@@ -72,12 +72,14 @@ def join_surfaces(
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Group the patches (rows, columns) of blocks, of moments (P + 1, 13), into planar surfaces.
 
-    The surface of each block, 0 for none, otherwise 1...K, and moments (K + 1, 13). Surfaces are
-    as large as the `least` plane of the view: smaller ones are clutter.
+    The surface of each block, 0 for none, otherwise 1...K, and moments (K + 1, 13). Those with
+    fewer pixels than the whole blocks inside the `least` square plane of the view have, or than
+    four blocks, are clutter.
     """
     expected = Expected.of(view, NODE, smoothness)
     roots = _agglomerate(patches, nodes.right, nodes.below, moments, expected)
-    surface, moments = renumbered(roots, moments, float(view.least))
+    least = max(view.least**0.5 - NODE, 2 * NODE) ** 2
+    surface, moments = renumbered(roots, moments, least)
     return surface[patches], moments
 
 

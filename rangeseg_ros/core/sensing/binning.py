@@ -10,11 +10,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
+from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.runtime.work import step_within
-from rangeseg_ros.core.sensing.blocks import BLOCK, for_pixels
+from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -36,7 +38,8 @@ class Bins(NamedTuple):
     """Squares of `side` x `side` pixels of an image (H, W), and a pixel for each in `means`.
 
     That is the mean of what was measured, (ceil(H / side), ceil(W / side)); `spread` of the same
-    shape is the largest difference in each, 1/m. The `area` is that of a bin, see `pixel_area`.
+    shape is the largest difference in each, 1/m. The `area` is that of a bin at inverse range
+    1, m^2.
     """
 
     side: int
@@ -48,21 +51,19 @@ class Bins(NamedTuple):
     @classmethod
     def of(cls, image: RangeImage, side: int) -> Bins:
         """Those of an image; of one pixel each, they are the image."""
-        area = side**2 * pixel_area(image.rays)
+        area = side**2 * image.pixel_area
         if side == 1:
             return cls(1, image, image, np.zeros(image.shape, np.float32), area)
-        each = np.stack(_places(image.inverse, side))
-        known = each > 0
-        least = np.where(known, each, np.float32(np.inf)).min(axis=0)
-        spread = np.maximum(each.max(axis=0) - least, 0)
+        inverse, spread = np.empty((2, *(-(-n // side) for n in image.shape)), np.float32)
+        run_rows(_average, len(inverse), image.inverse, side, inverse, spread)
+        means = replace(image, inverse=inverse)
         if image.camera:
             camera = camera_of_cells(Cells(side, 0, 0), image.camera)
-            count = np.maximum(known.sum(axis=0), 1).astype(np.float32)
-            inverse: NDArray[np.float32] = np.divide(each.sum(axis=0), count)
-            means = replace(image, rays=camera.rays, inverse=inverse, camera=camera)
+            means = replace(means, rays=camera.rays, camera=camera)
         else:
+            known = [each > 0 for each in _places(image.inverse, side)]
             xyz = [_means(_places(image.rays[..., k], side), known) for k in range(3)]
-            means = replace(image, rays=np.stack(xyz, axis=2), inverse=_means(each, known))
+            means = replace(means, rays=np.stack(xyz, axis=2))
         if image.body is not None:
             means = replace(means, body=np.any(_places(image.body, side), axis=0))
         return cls(side, image, means, spread, area)
@@ -111,6 +112,30 @@ class Bins(NamedTuple):
         return replace(self.means, inverse=inverse, rays=rays)
 
 
+@njit(cache=True, nogil=True)
+def _average(
+    first: int,
+    after: int,
+    pixels: NDArray[np.float32],
+    side: int,
+    means: NDArray[np.float32],
+    spread: NDArray[np.float32],
+) -> None:
+    """Means of what was measured in some rows of bins, and the largest difference in each."""
+    height, width = pixels.shape
+    for i in range(first, after):
+        for j in range(means.shape[1]):
+            total, count, most, least = 0.0, 0, np.float32(0), np.float32(np.inf)
+            for u in range(i * side, min((i + 1) * side, height)):
+                for v in range(j * side, min((j + 1) * side, width)):
+                    y = pixels[u, v]
+                    if y > 0:
+                        total, count = total + np.float64(y), count + 1
+                        most, least = max(most, y), min(least, y)
+            means[i, j] = total / max(count, 1)
+            spread[i, j] = max(most - least, np.float32(0))
+
+
 def _places(pixels: NDArray, side: int) -> list[NDArray]:
     """The first pixel of every bin, the second, ...: views (rows, columns) of pixels (H, W)."""
     margin = [(0, -length % side) for length in pixels.shape]
@@ -118,23 +143,16 @@ def _places(pixels: NDArray, side: int) -> list[NDArray]:
     return [pixels[i::side, j::side] for i, j in np.ndindex(side, side)]
 
 
-def _means(values: NDArray | Sequence[NDArray], kept: NDArray[np.bool_]) -> NDArray[np.float32]:
+def _means(
+    values: NDArray | Sequence[NDArray], kept: NDArray | Sequence[NDArray]
+) -> NDArray[np.float32]:
     """Means (...) of those of the values (K, ...) that are kept; 0 of none."""
     total = np.zeros(values[0].shape)
     for each, some in zip(values, kept, strict=True):
         total += np.where(some, each, 0)
-    return (total / np.maximum(kept.sum(axis=0), 1)).astype(np.float32)
+    return (total / np.maximum(np.sum(kept, axis=0), 1)).astype(np.float32)
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
     """Pixels along the side of the bins of an image (H, W): 2 of VGA, more with less work."""
     return step_within(work_budget) * max(round(float(np.sqrt(shape[0] * shape[1] / _BINS))), 1)
-
-
-def pixel_area(rays: NDArray[np.float32]) -> float:
-    """Median area of a pixel at inverse range 1 of an image with `rays` (H, W, 3), m^2."""
-    step = max(BLOCK, *(side // 16 for side in rays.shape[:2]))  # a few hundred pixels tell it
-    here = rays[::step, ::step].astype(np.float64)
-    across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
-    area = np.linalg.norm(np.cross(across, down), axis=2) / step**2
-    return float(np.median(area)) if area.size else 0.0

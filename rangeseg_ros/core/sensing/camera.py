@@ -169,6 +169,11 @@ class Camera:
         rays.setflags(write=False)
         return rays
 
+    @cached_property
+    def pixel_area(self) -> float:
+        """Median area of a pixel at depth 1, m^2."""
+        return pixel_area(self.rays)
+
     def rays_at(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
         """Directions (..., 3) scaled to depth 1 of columns u and rows v (...); NaN without one."""
         with np.errstate(over='ignore', invalid='ignore'):
@@ -179,6 +184,15 @@ class Camera:
         rays = np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
         rays[~((np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST))] = np.nan
         return rays if self.turn == OPTICAL else rays @ self.axes.T
+
+
+def pixel_area(rays: NDArray[np.float32]) -> float:
+    """Median area of a pixel of an image with `rays` (H, W, 3) at inverse range 1, m^2."""
+    step = max(1, *(side // 16 for side in rays.shape[:2]))  # a few hundred pixels tell it
+    here = rays[::step, ::step].astype(np.float64)
+    across, down = np.diff(here, axis=1)[:-1], np.diff(here, axis=0)[:, :-1]
+    area = np.linalg.norm(np.cross(across, down), axis=2) / step**2
+    return float(np.median(area)) if area.size else 0.0
 
 
 def positive_integer(name: str, value: Any) -> int:

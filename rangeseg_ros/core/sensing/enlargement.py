@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ SIGNIFICANT = 5.0
 # Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
 _LARGEST = 16  # enlargement that is looked for
+_PERIODS = np.arange(2, _LARGEST + 1)
 
 
 class Cells(NamedTuple):
@@ -49,13 +51,18 @@ class Cells(NamedTuple):
         return array[np.ix_(v, u)]
 
 
+# As long as the camera of the pixels lives: of 12 megapixels, the rays take 150 MB.
+_cameras: WeakKeyDictionary[Camera, dict[Cells, Camera]] = WeakKeyDictionary()
+
+
 def camera_of_cells(cells: Cells, camera: Camera) -> Camera:
     """The camera that has a pixel for each cell, at its centre; kept, as its rays are."""
-    # Of a copy without rays, 150 MB of 12 megapixels, which would be kept as well.
-    return _camera_of_cells(cells, replace(camera))
+    known = _cameras.setdefault(camera, {})
+    if cells not in known:
+        known[cells] = _camera_of_cells(cells, camera)
+    return known[cells]
 
 
-@lru_cache(maxsize=4)
 def _camera_of_cells(cells: Cells, camera: Camera) -> Camera:
     k, middle = cells.factor, (cells.factor - 1) / 2
     return replace(
@@ -104,36 +111,44 @@ def interpolation(image: RangeImage) -> Cells | None:
     column has a line in its spectrum (Fisher, Tests of significance in harmonic analysis, 1929),
     for k = 2 that of third differences. One of every k x k pixels is as good as another.
     """
-    amplitude = np.full(_LARGEST + 1, np.inf)
+    amplitude = np.full(len(_PERIODS), np.inf)
     for lines in (image.inverse, image.inverse.T):
-        some = lines[:: max(len(lines) // _FEW, 1)]
-        found = _spectrum(some, 2)
-        found[2] = _spectrum(some, 3)[2]
+        some = lines[:: max(len(lines) // _FEW, 1)].astype(np.float64)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            distance = 1 / some
+            second = np.diff(distance, 2)
+            third = np.diff(second)
+        found = _spectrum(second, distance, slice(0, None))
+        found[:1] = _spectrum(third, distance, slice(0, 1))
         amplitude = np.minimum(amplitude, found)
         # Of a period all divisors show.
-        periods = np.flatnonzero(amplitude > SIGNIFICANT)
+        periods = _PERIODS[amplitude > SIGNIFICANT]
         if not len(periods):
             return None
     return Cells(int(periods[-1]), 0, 0)
 
 
-def _spectrum(lines: NDArray[np.float32], order: int) -> NDArray[np.float64]:
-    """Amplitude of the differences' size at each period 0..._LARGEST, in standard errors."""
-    amplitude = np.zeros(_LARGEST + 1)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        size = np.abs(np.diff(1 / lines.astype(np.float64), order))
-        distance = 1 / lines[:, : size.shape[1]]
+def _spectrum(
+    differences: NDArray[np.float64], distance: NDArray[np.float64], periods: slice
+) -> NDArray[np.float64]:
+    """Amplitude of the size of differences along lines at each period, in standard errors."""
+    size = np.abs(differences)
     known = np.isfinite(size)
     # Of float32, and of sensors whose steps are wide, many are 0.
-    changes = size[known & (size > 1e-5 * distance)]
+    changes = size[known & (size > 1e-5 * distance[:, : size.shape[1]])]
     columns = np.flatnonzero(known.any(axis=0))
+    waves = _waves(distance.shape[1])[periods, columns]
     if not len(changes) or len(columns) < 2 * _LARGEST:
-        return amplitude
+        return np.zeros(len(waves))
     # Edges of objects are no part of it.
     size = np.where(known, np.minimum(size, 2 * np.median(changes)), 0)
     means = size.sum(axis=0)[columns] / known.sum(axis=0)[columns]
-    if means.std() > 0:
-        waves = np.exp(2j * np.pi * columns / np.arange(2, _LARGEST + 1)[:, None])
-        sums = np.abs((waves * (means - means.mean())).sum(axis=1))
-        amplitude[2:] = sums / (means.std() * len(columns) ** 0.5)
-    return amplitude
+    spread = means.std() * len(columns) ** 0.5
+    sums = np.abs((waves * (means - means.mean())).sum(axis=1))
+    return sums / max(spread, 1e-300)
+
+
+@lru_cache(maxsize=4)
+def _waves(width: int) -> NDArray[np.complex128]:
+    """A wave (periods, W) of each period along a line of so many pixels."""
+    return np.exp(2j * np.pi * np.arange(width) / _PERIODS[:, None])

@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.sensing.camera import OPTICAL, Camera
+from rangeseg_ros.core.sensing.camera import OPTICAL, Camera, pixel_area
 from rangeseg_ros.core.sensing.clouds import axes_of_frame, camera_of, depth_of
 
 
@@ -243,6 +243,11 @@ class RangeImage:
             return np.ones(self.shape, np.float32)
         along: NDArray[np.float32] = self.rays @ self.axes[:, 2].astype(np.float32)
         return along
+
+    @cached_property
+    def pixel_area(self) -> float:
+        """Median area of a pixel at inverse range 1, m^2."""
+        return pixel_area(self.rays) if self.camera is None else self.camera.pixel_area
 
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
