@@ -86,7 +86,6 @@ def _near_height_zero(_: Any) -> Any:
 
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
-_TURNING = 'fitting/error_law.py:fit_turning'
 _NOISE = ('noise', 'error_law', 'quantisation')
 _NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
 # Cost of a border that lets nothing merge by the energy.
@@ -108,10 +107,7 @@ MECHANISMS = (
               _sensor(white=lambda *_: 1.0, correlation=lambda *_: 0.0)),
     Mechanism('quantisation found', 'fitting/quantisation.py',
               {'segmenter.quantisation': _returning((0.0, 0.0))}),
-    Mechanism('noise of directions', _TURNING, _zero('column_noise', 'row_noise')),
-    Mechanism('scanners that turn', _TURNING,
-              {'fitting.noise.fit_turning':
-               lambda _: lambda strata, blocks, shown, law: law}),
+    Mechanism('noise of directions', 'sensing/sensor.py:tilt_variance', _zero('direction_noise')),
     Mechanism('errors in range', 'fitting/error_law.py:_scale_term,_deviance',
               {'fitting.noise.fit_law': _given(3, False)}),
     # Edges and holes.

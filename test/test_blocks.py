@@ -45,8 +45,7 @@ def test_slopes_do_not_need_the_rays_of_holes(hole):
     for holes in (hole, np.s_[4:, 5::2]):
         rays[holes], inverse[holes] = 0, 0
     blocks = Blocks.of(RangeImage(rays, inverse))
-    np.testing.assert_allclose(blocks.across, (0.1 / 50) ** 2, rtol=1e-3)
-    np.testing.assert_allclose(blocks.down, (0.05 / 50) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(blocks.slope, (0.1 / 50) ** 2 + (0.05 / 50) ** 2, rtol=1e-3)
 
 
 @pytest.mark.parametrize('shape', [(1, 1), (5, 131), (9, 300)])
@@ -122,7 +121,7 @@ def test_slopes_and_residuals_are_those_of_the_planes():
     assert blocks.residual[i, j] == pytest.approx(square[0], rel=1e-6)
     # Rays are 1/50 apart; white noise of variance v turns planes by 2 * 12 v / (16 * 15).
     expected = (np.hypot(*theta[:2]) / 50) ** 2 - square[0] / 13 / 10
-    assert blocks.across[i, j] + blocks.down[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
+    assert blocks.slope[i, j] == pytest.approx(max(expected, 0), rel=1e-4)
 
 
 @pytest.mark.parametrize('theta', [(0.0, 0.0, 0.3), (0.1, -0.8, 0.9), (-0.6, 0.1, 1.5)])

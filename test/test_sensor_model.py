@@ -86,18 +86,15 @@ def tilted_planes(random):
     return inverse, across, down
 
 
-@pytest.mark.parametrize('errors', [(0.6, 0.6), (0.6, 0.0), (0.0, 0.6), (0.0, 0.0)])
-def test_directions_err_both_ways_or_one(errors):
-    """As a camera's and a turning scanner's do."""
+@pytest.mark.parametrize('error', [0.6, 0.0])
+def test_errors_of_direction_are_told_from_others(error):
     random = np.random.default_rng(7)
     inverse, across, down = tilted_planes(random)
-    for error, slope in zip(errors, (across, down), strict=True):
+    for slope in (across, down):
         inverse += error * slope * random.normal(size=CAMERA.shape)
     inverse += random.normal(0, 0.0005, CAMERA.shape)
-    sensor = sensor_of(inverse, camera=CAMERA if errors[0] == errors[1] else None)
     # Blocks that are compared slope alike to a third or so.
-    assert sensor.column_noise == pytest.approx(errors[0], rel=0.3)
-    assert sensor.row_noise == pytest.approx(errors[1], rel=0.3)
+    assert sensor_of(inverse).direction_noise == pytest.approx(error, rel=0.3)
 
 
 @pytest.mark.parametrize(('count', 'told'), [(13, False), (200, False), (1000, True)])
@@ -106,8 +103,8 @@ def test_a_few_blocks_tell_no_kind_of_error(count, told):
     draw = np.random.default_rng(5)
     for _ in range(200):
         squared, none = draw.uniform(0.04, 4, (1, count)), np.zeros((1, count))
-        blocks = Blocks(none, squared, none, none, none)
-        strata = Strata.of(blocks, np.arange(count), none)
+        blocks = Blocks(none, squared, none, none)
+        strata = Strata.of(blocks, np.arange(count))
         shown = strata.medians(1e-6 * squared**2 * draw.uniform(0.5, 2, count))
         law = fit_law(strata, shown, np.zeros(len(shown)), in_range=True)
         assert (law.quartic > 0) == told and (law.constant > 0) != told
@@ -116,8 +113,8 @@ def test_a_few_blocks_tell_no_kind_of_error(count, told):
 def test_strata_are_ranges_of_equal_size_and_slopes_in_them():
     draw = np.random.default_rng(6)
     squared, slope = draw.integers(0, 50, (2, 30, 40)).astype(float)
-    blocks = Blocks(slope, squared, slope, slope, slope)
-    strata = Strata.of(blocks, np.arange(3, 1200), slope)
+    blocks = Blocks(slope, squared, slope, slope)
+    strata = Strata.of(blocks, np.arange(3, 1200))
     assert strata.blocks.shape == (24, 49) and len(np.unique(strata.blocks)) == strata.blocks.size
     for key, count in ((squared, 8), (slope, 3)):
         parts = key.ravel()[strata.blocks].reshape(8, 3, -1)
@@ -137,7 +134,7 @@ def test_slopes_explain_no_noise_that_is_of_two_kinds():
     inverse = np.maximum(inverse, 0.1)
     noise, range_noise = random.normal(size=(2, *CAMERA.shape))
     sensor = sensor_of(inverse + 0.002 * noise + 0.01 * inverse**2 * range_noise)
-    assert sensor.column_noise == sensor.row_noise == 0
+    assert sensor.direction_noise == 0
 
 
 @pytest.mark.parametrize('seed', range(3, 13))
@@ -227,30 +224,25 @@ def test_whatever_the_image_the_model_is_finite(seed, holes, scale):
 def test_steps_are_those_of_the_flat_blocks_around():
     """By the definition, block for block."""
     draw, shape = np.random.default_rng(9), (9, 11)
-    sensor = STATED._replace(
-        noise=0.001, quantum=0.003, range_quantum=0.004, column_noise=0.4, row_noise=0.2
-    )
-    across, down = draw.exponential(1e-5, (2, *shape))
+    sensor = STATED._replace(noise=0.001, quantum=0.003, range_quantum=0.004, direction_noise=0.4)
+    slope = draw.exponential(1e-5, shape)
     squared, moments = draw.uniform(0.1, 2, shape), np.zeros((*shape, SIZE))
     moments[..., COUNT] = draw.choice([3, 4, 16], shape)
     freedom = moments[..., COUNT] - 3
-    tilt = 0.16 * across + 0.04 * down
+    tilt = 0.16 * slope
     residual = draw.choice([0.99, 1.01, 9], shape) * ROUGH * (1e-6 + tilt) * freedom
-    found = jump_steps(Blocks(moments, squared, across, down, residual), sensor)
+    found = jump_steps(Blocks(moments, squared, slope, residual), sensor)
     flat = (freedom > 0) & (residual < ROUGH * (1e-6 + tilt) * freedom)
     for i, j in np.ndindex(shape):
         window = np.s_[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
         told = flat[window] if not flat[i, j] else np.zeros_like(flat[window])
-        tilts, slopes = tilt[window][told], (across + down)[window][told]
-        if flat[i, j]:
-            tilts, slopes = tilt[i, j], across[i, j] + down[i, j]
-        least, most = np.min(tilts, initial=1), np.max(tilts, initial=0)
+        slopes = slope[i, j] if flat[i, j] else slope[window][told]
+        least, most = np.min(slopes, initial=1), np.max(slopes, initial=0)
         least = least if flat[i, j] or told.any() else 0
-        steps = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + t)) for t in (least, most)]
+        steps = [5 * np.sqrt(0.72 * sensor.agreement * (1e-6 + 0.16 * t)) for t in (least, most)]
         steps = np.maximum(steps, 2.2 * max(0.003, 0.004 * squared[i, j]))
-        slope = np.sqrt(np.min(slopes, initial=1)) if flat[i, j] or told.any() else 0
         assert (found.windows[i, j], found.pixels[i, j]) == pytest.approx(tuple(steps), rel=1e-5)
-        assert found.slopes[i, j] == pytest.approx(slope, rel=1e-5)
+        assert found.slopes[i, j] == pytest.approx(np.sqrt(least), rel=1e-5)
     assert 20 < flat.sum() < 60
 
 

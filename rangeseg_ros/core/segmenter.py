@@ -170,7 +170,7 @@ def _preprocessed(
     # a surface seen at a grazing angle costs it less than one too few.
     grazing = sensor
     if config.method == 'normals':
-        grazing = sensor._replace(column_noise=0.0, row_noise=0.0)
+        grazing = sensor._replace(direction_noise=0.0)
     steps = jump_steps(blocks, grazing)
     if config.edge_step > 0:
         given = np.full_like(steps.windows, config.edge_step)

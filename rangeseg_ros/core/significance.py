@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 LEVEL = 0.999  # quantile that noise stays below: where it does not, something else is there
 OUTLIER = 4.0  # standard deviations from which an error is no noise: one of 16 000 by chance
-CERTAIN = 6.0  # the same for what is asked once of an image or a recording, and changes all of it
 CLEARLY = 2.0  # how many times more must speak for one of two things than for the other
 SAMPLES = 12  # that tell three parameters, those of a plane, or a quantile: four for each
 

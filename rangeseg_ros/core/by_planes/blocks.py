@@ -40,7 +40,7 @@ class Nodes(NamedTuple):
         kept[: view.whole.shape[0] // NODE, : view.whole.shape[1] // NODE] &= ~_crossed(view)
         count = kept * blocks.moments[..., COUNT]
         level = random_variance(sensor, blocks.squared)
-        tilt = tilt_variance(sensor, blocks.across, blocks.down) / level
+        tilt = tilt_variance(sensor, blocks.slope) / level
         weight = kept / (level * (1 + tilt))
         moments = blocks.moments
         moments *= weight[..., None]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.sensor import FLOOR
-from rangeseg_ros.core.significance import CERTAIN, f_quantile
+from rangeseg_ros.core.significance import f_quantile
 
 # Strata of the inverse range, in each of the slope, and blocks of one at least: the error of a
 # quantile of 40 blocks of 13 degrees of freedom is 7 % of a standard deviation.
@@ -23,14 +23,14 @@ _SIGNIFICANT = f_quantile(1, 22)
 
 
 class Law(NamedTuple):
-    """Variance constant + quartic y^4 + tilt . slopes, at the inverse range y, (1/m)^2.
+    """Variance constant + quartic y^4 + tilt slope, at the inverse range y, (1/m)^2.
 
-    The slopes are the squared ones along the row and down the column.
+    The slope is the square of that from pixel to pixel.
     """
 
     constant: float
     quartic: float
-    tilt: tuple[float, float] = (0.0, 0.0)
+    tilt: float = 0.0
 
     def facing(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances at these squared inverse ranges, on surfaces that face the sensor."""
@@ -38,13 +38,11 @@ class Law(NamedTuple):
 
     def variances(self, blocks: Blocks) -> NDArray[np.float64]:
         """Variances (rows, columns) of the pixels of blocks."""
-        level = self.facing(blocks.squared)
-        return level + self.tilt[0] * blocks.across + self.tilt[1] * blocks.down
+        return self.facing(blocks.squared) + self.tilt * blocks.slope
 
     def times(self, factor: float) -> Law:
         """So many times the variance."""
-        tilt = factor * self.tilt[0], factor * self.tilt[1]
-        return Law(factor * self.constant, factor * self.quartic, tilt)
+        return Law(factor * self.constant, factor * self.quartic, factor * self.tilt)
 
 
 class Strata(NamedTuple):
@@ -52,13 +50,13 @@ class Strata(NamedTuple):
 
     blocks: NDArray[np.intp]  # (S, N), flat indices of the blocks of each stratum
     squared: NDArray[np.float64]  # (S,), medians of the squared inverse range
-    slope: NDArray[np.float64]  # (S,), of what is taken for the slope
+    slope: NDArray[np.float64]  # (S,), of the slope
     slopes: int  # strata of a range
 
     @classmethod
-    def of(cls, blocks: Blocks, used: NDArray[np.intp], slope: NDArray[np.float64]) -> Strata:
-        """Strata of equal sizes of blocks (N,), but for a few left out, by a `slope` of all."""
-        squared, slope = blocks.squared.ravel()[used], slope.ravel()[used]
+    def of(cls, blocks: Blocks, used: NDArray[np.intp]) -> Strata:
+        """Strata of equal sizes of the blocks that are `used` (N,), but for a few left out."""
+        squared, slope = blocks.squared.ravel()[used], blocks.slope.ravel()[used]
         slopes = _SLOPES if len(used) >= _SLOPES * _PER_STRATUM else 1
         ranges = min(_RANGES, max(len(used) // (slopes * _PER_STRATUM), 1))
         size = len(used) // (ranges * slopes)
@@ -103,23 +101,7 @@ def fit_law(
     tilt, deviance = _scale_term(strata.slope, shown, known)
     if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:
         return law
-    return law._replace(tilt=(tilt, tilt))
-
-
-def fit_turning(strata: Strata, blocks: Blocks, shown: NDArray[np.float64], law: Law) -> Law:
-    """The law with the tilt of directions that err one way alone, where they certainly do so.
-
-    As those of scanners that turn do. `strata` are those of how much more the `blocks` slope down
-    the column than along the row.
-    """
-    known = law.facing(strata.squared)
-    across, down = strata.medians(blocks.across), strata.medians(blocks.down)
-    _, both = _scale_term(across + down, shown, known)
-    rows, along = _scale_term(across, shown, known)
-    columns, below = _scale_term(down, shown, known)
-    if _advantage(min(along, below), both, shown) < CERTAIN**2:
-        return law
-    return law._replace(tilt=(rows, 0.0) if along < below else (0.0, columns))
+    return law._replace(tilt=tilt)
 
 
 @njit(cache=True, nogil=True)

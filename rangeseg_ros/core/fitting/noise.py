@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, fit_turning, quantile
+from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, quantile
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -64,29 +64,20 @@ def measured_sensor(
     freedom = np.maximum(count - 3, 1)
     mean_square = coarse.residual / (freedom * _share(_median(freedom, used)))
 
-    def shown(strata: Strata) -> NDArray[np.float64]:
-        most = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
-        return np.maximum(most, least.facing(strata.squared))
-
-    strata = Strata.of(coarse, used, coarse.across + coarse.down)
-    noise = fit_law(strata, shown(strata), np.zeros(len(strata.blocks)), True)
-    if image.camera is None:
-        strata = Strata.of(coarse, used, coarse.down - coarse.across)
-        noise = fit_turning(strata, coarse, shown(strata), noise)
+    strata = Strata.of(coarse, used)
+    shown = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
+    shown = np.maximum(shown, least.facing(strata.squared))
+    noise = fit_law(strata, shown, np.zeros(len(shown)), True)
     found = _over_scales(image.rays, blocks, coarse, noise, least)
     if found is None:
         return prior
     within, between, filled, distortion = found
     total, white, width = _random(within, between, filled)
-    # Directions that err one way are those of a scanner that turns, anew in every pixel, so that
-    # blocks hide nothing of it.
-    turned = np.sqrt(np.multiply(noise.tilt, total if noise.tilt[0] == noise.tilt[1] else 1.0))
     # Blocks hide a part of the noise, and never show more than there is.
     return prior._replace(
         noise=max(float(np.sqrt(noise.constant * total)), rounding),
         range_noise=max(float(np.sqrt(noise.quartic * total)), range_rounding),
-        column_noise=float(turned[0]),
-        row_noise=float(turned[1]),
+        direction_noise=float(np.sqrt(noise.tilt * total)),
         white=white,
         correlation=width,
         distortion=max(float(np.sqrt(distortion.constant)), rounding),
@@ -114,7 +105,7 @@ def _over_scales(
     if not flat.any():
         return None
     used = _some(np.flatnonzero(flat), _ENOUGH)
-    strata = Strata.of(blocks, used, blocks.across + blocks.down)
+    strata = Strata.of(blocks, used)
     within = [_ratio(blocks, level, used, strata)]
     # What is new in every pixel shows in the smallest blocks, but for what numbers are rounded by.
     shown = noise.times(within[0])
@@ -127,7 +118,7 @@ def _over_scales(
         if len(used) < SAMPLES:
             break
         used = _some(used, _ENOUGH)
-        strata = Strata.of(larger, used, larger.across + larger.down)
+        strata = Strata.of(larger, used)
         level = _sum_of_four(level) / 4
         excess = np.maximum(larger.residual - _sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
         within.append(_ratio(larger, level, used, strata))

@@ -32,22 +32,19 @@ def jump_steps(blocks: Blocks, sensor: SensorModel) -> Steps:
     variance of `agreement` (0.67 to 0.76), and five standard deviations are no noise. Rounding
     alone makes steps of one quantum, and of two where noise adds to it.
     """
-    across, down, squared = blocks.across, blocks.down, blocks.squared
-    variance, tilt = random_variance(sensor, squared), tilt_variance(sensor, across, down)
-    freedom = blocks.moments[..., COUNT] - 3
-    flat = (freedom > 0) & (blocks.residual < ROUGH * (variance + tilt) * freedom)
+    squared, slope = blocks.squared, blocks.slope
+    variance, freedom = random_variance(sensor, squared), blocks.moments[..., COUNT] - 3
+    limit = ROUGH * (variance + tilt_variance(sensor, slope)) * freedom
+    flat = (freedom > 0) & (blocks.residual < limit)
     # That of a block that a jump crosses is the jump's: its neighbours' then.
     around = np.ones((3, 3), np.uint8)
-    slope, least = (
-        np.where(flat, values, cv2.erode(np.where(flat, values, np.inf), around))
-        for values in (across + down, tilt)
-    )
-    most = np.where(flat, tilt, cv2.dilate(np.where(flat, tilt, 0.0), around))
-    unknown = cv2.dilate(flat.astype(np.uint8), around) == 0
-    slope[unknown] = least[unknown] = 0.0
+    least = np.where(flat, slope, cv2.erode(np.where(flat, slope, np.inf), around))
+    most = np.where(flat, slope, cv2.dilate(np.where(flat, slope, 0.0), around))
+    least[cv2.dilate(flat.astype(np.uint8), around) == 0] = 0.0
     rounding = 2.2 * np.maximum(sensor.quantum, sensor.range_quantum * squared)
     factor = 25 * 0.72 * sensor.agreement
     windows, pixels = (
-        np.maximum(np.sqrt(factor * (variance + added)), rounding) for added in (least, most)
+        np.maximum(np.sqrt(factor * (variance + tilt_variance(sensor, added))), rounding)
+        for added in (least, most)
     )
-    return Steps(*(values.astype(np.float32) for values in (windows, pixels, np.sqrt(slope))))
+    return Steps(*(values.astype(np.float32) for values in (windows, pixels, np.sqrt(least))))

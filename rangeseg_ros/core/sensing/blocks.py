@@ -32,15 +32,13 @@ class Blocks(NamedTuple):
     """The blocks (rows, columns) of an image and the planes through each, in 1/m^2.
 
     `moments` (..., 13) of the measured pixels have unit weights. `squared` is the mean square of
-    the inverse range; `across` and `down` are the squares of its change from pixel to pixel on the
-    plane, along the row and down the column, less what noise adds to them; `residual` is the sum
-    of the squared residuals.
+    the inverse range; `slope` is the square of its change from pixel to pixel on the plane, less
+    what noise adds to it; `residual` is the sum of the squared residuals.
     """
 
     moments: NDArray[np.float64]
     squared: NDArray[np.float64]
-    across: NDArray[np.float64]
-    down: NDArray[np.float64]
+    slope: NDArray[np.float64]
     residual: NDArray[np.float64]
 
     @classmethod
@@ -62,7 +60,7 @@ class Blocks(NamedTuple):
     @classmethod
     def _empty(cls, rows: int, columns: int) -> Blocks:
         moments = np.empty((rows, columns, SIZE))
-        return cls(moments, *(np.empty((rows, columns)) for _ in range(4)))
+        return cls(moments, *(np.empty((rows, columns)) for _ in range(3)))
 
 
 def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
@@ -129,14 +127,13 @@ def _fit_planes(
             count = m[k, COUNT]
             blocks.squared[bi, bj] = m[k, CHI2] / max(count, 1.0)
             blocks.residual[bi, bj] = left
-            across = down = 0.0
+            slope = 0.0
             if count > 3:
-                across = _change((x, y, z), rays, (bi * size, bj * size), size, (0, 1)) ** 2
-                down = _change((x, y, z), rays, (bi * size, bj * size), size, (1, 0)) ** 2
+                slope += _change((x, y, z), rays, (bi * size, bj * size), size, (0, 1)) ** 2
+                slope += _change((x, y, z), rays, (bi * size, bj * size), size, (1, 0)) ** 2
             # Less the variance of the slopes by noise.
             noise = left / max(count - 3, 1.0) * 2 * 12 / (size * size - 1) / max(count, 1.0)
-            share = max(1 - noise / max(across + down, 1e-300), 0.0)
-            blocks.across[bi, bj], blocks.down[bi, bj] = share * across, share * down
+            blocks.slope[bi, bj] = max(slope - noise, 0.0)
 
 
 @njit(cache=True, inline='always')

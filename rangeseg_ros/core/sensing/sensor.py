@@ -31,8 +31,7 @@ class SensorModel(NamedTuple):
     range_distortion: float
     distortion_length: float  # width of the Gaussian it is smoothed with at most, pixels
     # Random error of a pixel's direction, pixels: what surfaces at grazing angles are noisier by.
-    column_noise: float = 0.0
-    row_noise: float = 0.0
+    direction_noise: float = 0.0
     quantum: float = 0.0  # step that the inverse range is rounded to, 0 for none
     range_quantum: float = 0.0
 
@@ -48,7 +47,6 @@ class SensorModel(NamedTuple):
             config.range_distortion,
             length_of_distortion(config.distortion_length, shape),
             config.pixel_noise,
-            config.pixel_noise,
         )
 
     def every(self, step: float) -> SensorModel:
@@ -56,8 +54,7 @@ class SensorModel(NamedTuple):
         return self._replace(
             correlation=self.correlation / step,
             distortion_length=self.distortion_length / step,
-            column_noise=self.column_noise / step,
-            row_noise=self.row_noise / step,
+            direction_noise=self.direction_noise / step,
         )
 
     def binned(self, side: int) -> SensorModel:
@@ -84,8 +81,7 @@ class SensorModel(NamedTuple):
         return self._replace(
             noise=self.noise * share**0.5,
             range_noise=self.range_noise * share**0.5,
-            column_noise=self.column_noise * share**0.5,
-            row_noise=self.row_noise * share**0.5,
+            direction_noise=self.direction_noise * share**0.5,
         )
 
     def __str__(self) -> str:
@@ -187,9 +183,9 @@ def random_variance(sensor: SensorModel, squared: NDArray[np.float64] | float) -
 
 
 @register_jitable(inline='always')
-def tilt_variance(sensor: SensorModel, across: Any, down: Any) -> Any:
-    """Variance that errors of direction add where the squared slopes are these, (1/m)^2."""
-    return sensor.column_noise**2 * across + sensor.row_noise**2 * down
+def tilt_variance(sensor: SensorModel, slope: Any) -> Any:
+    """Variance that errors of direction add where the square of the slope is this, (1/m)^2."""
+    return sensor.direction_noise**2 * slope
 
 
 @register_jitable(inline='always')
