@@ -65,6 +65,17 @@ def test_white_noise_is_measured_up_and_down(noise, holes):
     assert sensor.distortion < 0.6 * noise
 
 
+def test_the_standard_error_of_the_noise_is_what_it_scatters_by():
+    found = []
+    for seed in range(12):
+        inverse = three_planes() + np.random.default_rng(seed).normal(0, 0.003, CAMERA.shape)
+        found.append(sensor_of(inverse))
+    off = np.mean([sensor.noise / 0.003 - 1 for sensor in found])
+    scatter = np.std([sensor.noise / 0.003 for sensor in found])
+    told = np.mean([sensor.noise_error for sensor in found])
+    assert scatter / 2 < told < 3 * scatter and abs(off) < 2 * told
+
+
 def test_noise_of_the_range_is_told_from_that_of_its_inverse():
     random = np.random.default_rng(2)
     inverse = three_planes()

@@ -69,7 +69,7 @@ class Config:
         1.2, 'method planes: lambda of eq. 5.3, against half the squared residuals', 0.0, 10000.0
     )
     plane_probability: float = option(
-        0.3, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0
+        0.5, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0
     )
     plane_prior: float = option(
         0.5, 'share of planes among the regions, before their bend is looked at', 0.001, 0.999

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.sensor import FLOOR
-from rangeseg_ros.core.significance import f_quantile
+from rangeseg_ros.core.significance import chi2_quantile, f_quantile
 
 # Strata of the inverse range, in each of the slope, and blocks of one at least: the error of a
 # quantile of 40 blocks of 13 degrees of freedom is 7 % of a standard deviation.
@@ -20,6 +20,8 @@ _ROUNDS = 5
 # F with one and 22 degrees of freedom, those of the 24 strata of an image of VGA: slopes that
 # explain more are no chance.
 _SIGNIFICANT = f_quantile(1, 22)
+# Median of the size of a normal error, in standard deviations.
+_MEDIAN = chi2_quantile(1, 0.5) ** 0.5
 
 
 class Law(NamedTuple):
@@ -31,6 +33,7 @@ class Law(NamedTuple):
     constant: float
     quartic: float
     tilt: float = 0.0
+    error: float = 0.0  # standard error of its deviations, as a share of these
 
     def facing(self, squared: NDArray[np.float64]) -> NDArray[np.float64]:
         """Variances at these squared inverse ranges, on surfaces that face the sensor."""
@@ -42,7 +45,8 @@ class Law(NamedTuple):
 
     def times(self, factor: float) -> Law:
         """So many times the variance."""
-        return Law(factor * self.constant, factor * self.quartic, factor * self.tilt)
+        variances = factor * self.constant, factor * self.quartic, factor * self.tilt
+        return Law(*variances, self.error)
 
 
 class Strata(NamedTuple):
@@ -98,6 +102,11 @@ def fit_law(
         factor, other = _scale_term(quartic, ahead, before)
         law = Law(0.0, factor) if other < deviance else law
     known = known + law.facing(strata.squared)
+    # A deviation is off by half of what its square is. Strata that differ tell by how much, in the
+    # median, as clutter fills some.
+    ratio = shown / known
+    spread = np.median(np.abs(ratio - np.median(ratio))) / _MEDIAN
+    law = law._replace(error=float(spread / (2 * len(shown) ** 0.5)))
     tilt, deviance = _scale_term(strata.slope, shown, known)
     if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:
         return law

@@ -84,6 +84,8 @@ def measured_sensor(
         range_distortion=max(float(np.sqrt(distortion.quartic)), range_rounding),
         quantum=quantum,
         range_quantum=range_quantum,
+        noise_error=noise.error,
+        distortion_error=distortion.error,
     )
 
 

@@ -34,6 +34,9 @@ class SensorModel(NamedTuple):
     direction_noise: float = 0.0
     quantum: float = 0.0  # step that the inverse range is rounded to, 0 for none
     range_quantum: float = 0.0
+    # Standard errors of what was measured, as shares of it; 0 where they are not known.
+    noise_error: float = 0.0
+    distortion_error: float = 0.0
 
     @classmethod
     def from_config(cls, config: Config, shape: tuple[int, int] = (480, 640)) -> SensorModel:
@@ -85,16 +88,20 @@ class SensorModel(NamedTuple):
         )
 
     def __str__(self) -> str:
-        """Errors in one line, such as: noise 0.0034 1/m, correlated over 9 px, distortion ..."""
+        """Errors in one line, such as: noise 0.0034 1/m ± 3%, correlated over 9 px, ..."""
         errors = (
-            ('noise', self.noise, '1/m'),
-            ('range noise', self.range_noise, 'm'),
-            ('distortion', self.distortion, '1/m'),
-            ('range distortion', self.range_distortion, 'm'),
-            ('steps of', self.quantum, '1/m'),
-            ('steps of', self.range_quantum, 'm'),
+            ('noise', self.noise, '1/m', self.noise_error),
+            ('range noise', self.range_noise, 'm', self.noise_error),
+            ('distortion', self.distortion, '1/m', self.distortion_error),
+            ('range distortion', self.range_distortion, 'm', self.distortion_error),
+            ('steps of', self.quantum, '1/m', 0),
+            ('steps of', self.range_quantum, 'm', 0),
         )
-        said = [f'{name} {value:.2g} {unit}' for name, value, unit in errors if value > 0]
+        said = [
+            f'{name} {value:.2g} {unit}' + (f' ± {off:.0%}' if off > 0 else '')
+            for name, value, unit, off in errors
+            if value > 0
+        ]
         # Over as many pixels as the correlation along a line sums to.
         if self.white < 0.5 and _LINE * self.correlation > 1:
             said.insert(1, f'correlated over {_LINE * self.correlation:.0f} px')
