@@ -87,7 +87,7 @@ def _label_block_row(
                         continue
                     data[p] = NO_PLANE
                     for label in around[:count]:
-                        cost = data_cost(label, p, problem, models)
+                        cost = data_cost(int(np.intp(label)), int(np.intp(p)), problem, models)
                         if cost < data[p]:
                             labels[p], data[p] = label, cost
 
@@ -127,10 +127,10 @@ def _expand(
         sites = band(alpha, front, reach, labelling, rows)
         new = np.empty(len(sites), np.float32)
         for s in range(len(sites)):
-            p = int(sites[s])
+            p = int(np.intp(sites[s]))
             new[s] = data_cost(alpha, p, problem, models)
             if np.isnan(data[p]):
-                data[p] = data_cost(labels[p], p, problem, models)
+                data[p] = data_cost(int(np.intp(labels[p])), p, problem, models)
         if not expand(alpha, sites, new, labelling, LEAST_GAIN):
             break
         helped = True

@@ -220,7 +220,7 @@ def _grow(
                 seen[b] = turn
                 before = e
                 if moments[a, COUNT] + moments[b, COUNT] <= largest:
-                    common = common_residual(moments, a, b)
+                    common = common_residual(moments, int(np.intp(a)), int(np.intp(b)))
                     extra = common - residual[a] - residual[b]
                     apart = _misfit(extra, moments, a, b, agreement)
                     if apart < best:

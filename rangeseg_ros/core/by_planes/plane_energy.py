@@ -98,7 +98,10 @@ def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float
 
 @njit(cache=True)
 def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
-    """What a label costs a measured pixel."""
+    """What a label costs a measured pixel.
+
+    Call it with numbers of type intp: it is compiled once for each type of integer.
+    """
     if label == 0:
         return NO_PLANE
     # Unsigned and short, which divides in a fraction of the time.
@@ -120,7 +123,7 @@ def costs(labels: NDArray[np.int32], problem: Problem, models: Models) -> NDArra
     cost = np.zeros(len(labels), np.float32)
     for p in range(len(labels)):
         if problem.weight[p] > 0:
-            cost[p] = data_cost(labels[p], p, problem, models)
+            cost[p] = data_cost(int(np.intp(labels[p])), p, problem, models)
     return cost
 
 

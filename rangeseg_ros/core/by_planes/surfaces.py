@@ -119,7 +119,8 @@ def _agglomerate(
     strips, apart = np.zeros((2 * len(length), SIZE)), np.zeros(len(length))
     nearest, least = np.full(len(moments), -1), np.full(len(moments), np.inf)
     for e in range(len(length)):
-        a, b = min(target[2 * e], target[2 * e + 1]), max(target[2 * e], target[2 * e + 1])
+        one, other = int(np.intp(target[2 * e])), int(np.intp(target[2 * e + 1]))
+        a, b = min(one, other), max(one, other)
         for h in range(2 * e, 2 * e + 2):
             part = target[h ^ 1]
             # The side of a square patch borders on one other, or on several in part.
@@ -133,14 +134,14 @@ def _agglomerate(
         a = int(least.argmin())
         if not least[a] < 1:
             break
-        b = target[nearest[a]]
+        b = int(np.intp(target[nearest[a]]))
         residual[a] = common_residual(moments, a, b)
         parent[b], least[b] = a, np.inf
         moments[a] += moments[b]
         absorb(contacts, strips, a, b)
         h = contacts.head[a]
         while h >= 0:
-            c, e = target[h], h // 2
+            c, e = int(np.intp(target[h])), h // 2
             apart[e] = _apart(moments, residual, a, c, strips, 2 * e, length[e], expected)
             nearest[c], least[c] = least_contact(contacts, apart, c, 1.0)
             h = contacts.link[h]

@@ -79,8 +79,7 @@ class Strata(NamedTuple):
 def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     """Of values (..., N), the one (...,) that a share of them is below."""
     rank = int(share * (values.shape[-1] - 1))
-    result: NDArray[np.float64] = np.partition(values, rank)[..., rank]
-    return result
+    return np.partition(values, rank)[..., rank].copy()
 
 
 def fit_law(

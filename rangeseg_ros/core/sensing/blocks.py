@@ -80,7 +80,7 @@ def _sum_blocks(
         for j in range(parts.shape[1]):
             for k in range(COUNT + 1):
                 moments[i // 2, j // 2, k] += parts[i, j, k]
-    _fit_planes(0, len(moments), rays, size, blocks)
+    _fit_planes(int(np.intp(0)), len(moments), rays, size, blocks)
 
 
 @njit(cache=True, nogil=True)

@@ -139,7 +139,10 @@ def squares_left(moments: NDArray[np.float64], theta: NDArray[np.float64]) -> fl
 
 @njit(cache=True, error_model='numpy')
 def common_residual(moments: NDArray[np.float64], k: int, m: int) -> float:
-    """What `fit` returns for the sum of two of N moment vectors (N, 13), without views of them."""
+    """What `fit` returns for the sum of two of N moment vectors (N, 13), without views of them.
+
+    Call it with numbers of type intp: it is compiled once for each type of integer.
+    """
     sums = (
         moments[k, 0] + moments[m, 0],
         moments[k, 1] + moments[m, 1],
