@@ -75,6 +75,7 @@ def command(
     clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
     kinds = ('image', 'points') if clouds else ('image',)
     prepare(config, kinds, show, _SHOWN)
+    tilts = []
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), config)
@@ -90,6 +91,10 @@ def command(
         if not result.verdict.ok:
             click.echo(f'rangeseg: {path}: {result.verdict}', err=True)
         if result.tilt:
-            click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
+            tilts.append((path, result.tilt))
         if sensor:
             click.echo(f'{path}: {result.sensor}')
+    if tilts:
+        path, worst = max(tilts, key=lambda found: found[1].degrees)
+        others = f' ({len(tilts) - 1} more images like it)' if len(tilts) > 1 else ''
+        click.echo(f'rangeseg: {path}: {worst}{others}', err=True)
