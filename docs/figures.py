@@ -9,9 +9,10 @@ docs/figures/map.png: the map of a walk through a room, from above and from a si
 python docs/figures.py --detection DETECTION.json PICTURE.png: what `rangeseg evaluate --json` says
 of test pieces.
 
-python docs/figures.py --comparison DEPTH CAMERA.yaml PICTURE.png: a frame, and the planes of
-RANSAC, OpenCV and this package. docs/comparison.png is of the third depth image of ch5/rgbd of
-https://github.com/gaoxiang12/slambook2 (MIT licence).
+python docs/figures.py --comparison DEPTH CAMERA.yaml PICTURE.png PEAC.png: a frame, and the planes
+of RANSAC, of PEAC as labels of 16 bits, which is built from source, and of this package.
+docs/comparison.png is of the third depth image of ch5/rgbd of
+https://github.com/gaoxiang12/slambook2 (MIT licence), PEAC with windows of 5, support 1000.
 """
 
 import json
@@ -29,6 +30,7 @@ from matplotlib.figure import Figure
 from rangeseg_ros import Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.calibration.calibrate import calibrate, without_plane
 from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
+from rangeseg_ros.evaluation.label_files import read_label_image
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, write_image
 from rangeseg_ros.simulation.kinect import simulate_kinect
@@ -51,9 +53,9 @@ def main():
         write_image(picture, detection(json.loads(found.read_text())['detection']))
         return
     if sys.argv[1:2] == ['--comparison']:
-        depth, camera, picture = map(Path, sys.argv[2:])
+        depth, camera, picture, peac = map(Path, sys.argv[2:])
         image = RangeImage.from_depth(read_depth(depth), read_camera(camera))
-        write_image(picture, comparison(image))
+        write_image(picture, comparison(image, read_label_image(peac)))
         return
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else ROOT / 'docs')
     kinect, stereo = frame('kinect', 8, 1), frame('realsense', 3, 1)
@@ -100,16 +102,16 @@ def drawn(figure):
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
-def comparison(image):
-    """Depth and RANSAC above, OpenCV and this package below."""
-    depth = np.where(image.valid, image.points[..., 2], 0)
+def comparison(image, peac):
+    """Depth and RANSAC above, PEAC and this package below."""
+    seen = np.where(image.valid, image.points[..., 2], 0), image.camera
     pictures = [titled(in_grey(image), 'depth')]
-    for title, program in (
-        ('sequential RANSAC', benchmark.ransac),
-        ('OpenCV findPlanes', benchmark.opencv),
-        ('rangeseg_ros', benchmark.planes),
+    for title, labels in (
+        ('sequential RANSAC', benchmark.ransac(*seen)),
+        ('PEAC', peac),
+        ('rangeseg_ros', benchmark.planes(*seen)),
     ):
-        pictures.append(titled(coloured(image, program(depth, image.camera)), title))
+        pictures.append(titled(coloured(image, labels), title))
     return np.vstack([np.hstack(pictures[:2]), np.hstack(pictures[2:])])
 
 

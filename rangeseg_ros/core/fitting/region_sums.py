@@ -29,7 +29,7 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import OUTLIER
 
-MAX_CELLS = 36
+MAX_CELLS = 64
 """Cells of a region at most."""
 RAY, INVERSE, WEIGHT, POINT, SCATTER, PLACE, RECORD = 11, 14, 15, 16, 19, 25, 29
 """Entries of a cell after its moment vector, which lacks the variance ratios: w r (3), w y, w,
