@@ -8,6 +8,8 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
+from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -115,3 +117,12 @@ def test_a_bridge_is_the_ground_and_not_what_is_beside_it():
     terrain = terrain_of(image, STATED, up, (height, 0.015), Config())
     assert share(terrain, frame, GROUND, GROUND) > 0.97
     assert share(terrain, frame, DROP, GROUND) < 0.01
+
+
+@pytest.mark.parametrize('depth', [[[1e6, 1e6]], [[1e6, 0]], [[1e6], [1.0]], [[5e5]]])
+def test_ground_that_is_too_far_to_tell_is_not_found(depth):
+    height, width = np.shape(depth)
+    camera = Camera(width, height, 1.0, 1.0, (width - 1) / 2, height - 1.5)
+    image = RangeImage.from_depth(np.array(depth), camera)
+    result = Segmenter(Config(up_y=-1.0, sensor_height=1.0)).segment(image)
+    assert not result.ground.stand.found and not (result.terrain == GROUND).any()
