@@ -86,8 +86,8 @@ def _near_height_zero(_: Any) -> Any:
 
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
-_NOISE = ('noise', 'error_law')
-_NORMALS = ('method', 'normals', 'directions')
+_NOISE = ('noise', 'error_law', 'quantisation')
+_NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
 # Cost of a border that lets nothing merge by the energy.
 _NO_BORDER = -1e12
 
@@ -105,7 +105,7 @@ MECHANISMS = (
               _stated('white', 'correlation')),
     Mechanism('noise is correlated', f'{_CORRELATION} sensing/sensor.py:correlated_residuals',
               _sensor(white=lambda *_: 1.0, correlation=lambda *_: 0.0)),
-    Mechanism('quantisation found', 'fitting/noise.py:quantisation,_common_step',
+    Mechanism('quantisation found', 'fitting/quantisation.py',
               {'segmenter.quantisation': _returning((0.0, 0.0))}),
     Mechanism('noise of directions', 'sensing/sensor.py:tilt_variance', _zero('direction_noise')),
     Mechanism('errors in range', 'fitting/error_law.py:_scale_term,_deviance',
@@ -144,8 +144,7 @@ MECHANISMS = (
               {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
-    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'sensing/binning.py:step_within,bin_side',
-              {'work_budget': 0.9}),
+    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'runtime/work.py', {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',
               {'segmenter.bin_side': _returning(1)}),
     Mechanism('bins of one surface', 'sensing/binning.py:of_one_surface',

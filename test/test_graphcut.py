@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
+from rangeseg_ros.core.graphcut.energy import energy
 from rangeseg_ros.core.graphcut.moves import Labelling
-from rangeseg_ros.core.graphcut.sites import GridLabelling, band, energy, fronts
+from rangeseg_ros.core.graphcut.sites import GridLabelling, band, fronts
 from rangeseg_ros.core.sensing.grid import Grid
 
 

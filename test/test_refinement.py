@@ -6,14 +6,16 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
+from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
+from rangeseg_ros.core.by_planes.patches import find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.graphcut.moves import Labelling
-from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts, link_costs
+from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, weights
 from rangeseg_ros.core.sensing.moments import RATIO

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import fields, replace
 
 import numpy as np
@@ -15,12 +14,14 @@ from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.noise import measured_sensor, quantisation
+from rangeseg_ros.core.fitting.noise import measured_sensor
+from rangeseg_ros.core.fitting.quantisation import quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
 from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.runtime.work import Stopwatch
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -194,17 +195,3 @@ def _reason(image: RangeImage, planes: list[Plane]) -> str:
     if not image.valid.any():
         return 'no valid depth'
     return 'no flat region large enough'
-
-
-class Stopwatch:
-    """Times the stages of a run; `laps` are milliseconds per stage."""
-
-    def __init__(self) -> None:
-        self.laps: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """End the stage that has been running."""
-        now = time.perf_counter()
-        self.laps[stage] = 1000 * (now - self._last)
-        self._last = now

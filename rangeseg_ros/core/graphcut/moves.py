@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.graphcut import expansion
 from rangeseg_ros.core.graphcut.cut import ROUNDING, minimum_cut
-from rangeseg_ros.core.graphcut.sites import link_costs
+from rangeseg_ros.core.graphcut.energy import link_costs
 from rangeseg_ros.core.sensing.grid import Grid
 
 # Data cost (n,) of a label at pixels (n,) given by their index in raster order.

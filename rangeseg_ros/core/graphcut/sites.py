@@ -1,8 +1,6 @@
-"""The grid of pixels, in raster order, and its energy; the sites that an expansion may change.
+"""Sites of a grid that an expansion may change: those around each label.
 
-Both methods minimise E(f) = sum_p D_p(f_p) + lambda sum_pq u_pq [f_p != f_q]. D_p is the data cost
-of each: `by_normals.method.data_costs`, `by_planes.plane_energy.data_cost`. The other sum is the
-Potts prior over the 4-connected grid, with the neighbourhood weights u of `Grid`.
+Sites are pixels, numbered in raster order.
 """
 
 from __future__ import annotations
@@ -13,8 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.grid import Grid
-
 # Of each label: start (K + 1,) and sites (N,), label k's from start[k] to start[k + 1].
 Sites = tuple[NDArray[np.int64], NDArray[np.int32]]
 
@@ -24,7 +20,7 @@ class GridLabelling(NamedTuple):
 
     labels: NDArray[np.int32]  # (n,)
     data: NDArray[np.float32]  # (n,), data cost of each pixel's label
-    links: NDArray[np.float32]  # (2, n), see `link_costs`
+    links: NDArray[np.float32]  # (2, n), see `energy.link_costs`
     width: int  # pixels in a row
     position: NDArray[np.int32]  # (n,), scratch of the expansions: -1 between them
 
@@ -140,28 +136,3 @@ def beyond(
     for p in sites:
         position[p] = -1
     return result[:count]
-
-
-def energy(
-    data: NDArray[np.floating], labels: NDArray[np.integer], grid: Grid, smoothness: float
-) -> float:
-    """Value of E for labels (H, W) of data costs (H, W), lambda = `smoothness`."""
-    across = grid.right[labels[:, 1:] != labels[:, :-1]]
-    down = grid.below[labels[1:] != labels[:-1]]
-    boundary = across.sum(dtype=float) + down.sum(dtype=float)
-    return float(data.sum(dtype=float) + smoothness * boundary)
-
-
-def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:
-    """Lambda u of every edge of a grid (H, W), in the order of the sites; lambda = `smoothness`.
-
-    (2, H * W): of each pixel's edges to the right and down, 0 at the border. The edge between p
-    and its neighbour q on side k (0 right, 1 down, 2 left, 3 up) is [k % 2, min(p, q)]; before the
-    first pixel, where this counts from the end, is a border as well.
-    """
-    height, width = len(grid.right), grid.below.shape[1]
-    result = np.empty((2, height, width), np.float32)
-    result[0, :, -1] = result[1, -1] = 0
-    np.multiply(grid.right, np.float32(smoothness), out=result[0, :, :-1], casting='same_kind')
-    np.multiply(grid.below, np.float32(smoothness), out=result[1, :-1], casting='same_kind')
-    return result.reshape(2, -1)

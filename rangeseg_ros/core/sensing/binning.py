@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.runtime.work import step_within
 from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -31,11 +32,6 @@ _MEDIAN = chi2_quantile(1, 0.5)
 _SQUARE = (0, 0), (0, 1), (1, 0), (1, 1)
 # Slope of a surface that is seen at 5 degrees: what is steeper is a jump.
 _STEEPEST = 1 / np.tan(np.radians(5))
-# Of bins n times as wide, the budget from which on they are taken (docs/benchmark.md).
-_SHARES = {1: 1.0, 2: 0.55, 4: 0.35}
-
-STEPS = tuple(_SHARES.values())
-"""Budgets that make a difference, falling."""
 
 
 class Bins(NamedTuple):
@@ -160,8 +156,3 @@ def _means(
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
     """Pixels along the side of the bins of an image (H, W): 2 of VGA, more with less work."""
     return step_within(work_budget) * max(round(float(np.sqrt(shape[0] * shape[1] / _BINS))), 1)
-
-
-def step_within(budget: float) -> int:
-    """By how much bins are wider, for a share `budget` of the full work, 0...1."""
-    return next((step for step, share in _SHARES.items() if budget >= share), max(_SHARES))

@@ -1,0 +1,164 @@
+"""Alpha-expansion of squares of pixels, then of the pixels near the borders of their labels.
+
+A square stands for its largest part that no jump edge cuts. Its data cost and its links to other
+squares are the sums of those of the part's pixels, so that its energy is theirs. Squares begin
+with the direction nearest to their mean normal, pixels with the label of their square. Each label
+is expanded as far as it gains (thesis 4.8), from its borders on and, as squares hide narrow
+surfaces, from smaller squares that would lower the energy alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from rangeseg_ros.core.by_normals.angular_cost import data_costs, label_costs
+from rangeseg_ros.core.graphcut.cut import ROUNDING
+from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.graphcut.expansion import expand
+from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts, group_sites
+from rangeseg_ros.core.regions import connected_components
+from rangeseg_ros.core.runtime.threads import run_halves
+from rangeseg_ros.core.sensing.grid import Grid
+
+# Pixels along a side of a square, 4800 squares in VGA, and sites from a border to expand it to.
+_SIZE = 8
+
+
+def minimise(
+    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
+) -> NDArray[np.int32]:
+    """Labelling (H, W) of low energy (eq. 5.3 and 5.5, lambda = `smoothness`).
+
+    Labels are indices of directions (K, 3); normals (H, W, 3) are NaN where undefined.
+    """
+    height, width = normals.shape[:2]
+    links, inside = link_costs(grid, smoothness).reshape(2, height, width), _largest_parts(grid)
+    known = np.where(inside[..., None], normals, np.float32(np.nan))
+    squares = _nearest(known, directions, _SIZE)
+    nowhere = np.full(squares.shape, -1, np.int32)
+    for _ in range(2):
+        _expand(squares, nowhere, _SIZE, _between_squares(links, inside), known, directions)
+    labels = _enlarged(squares, _SIZE, (height, width))
+    seeds = _seeds(labels, normals, directions, smoothness)
+    _expand(labels, seeds, 1, links, normals, directions)
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def nearest_directions(
+    normals: NDArray[np.float32], directions: NDArray[np.float32]
+) -> NDArray[np.int32]:
+    """Direction (K, 3) nearest to each normal (h, w, 3), of any length: (h, w) index, else 0."""
+    labels = np.zeros(normals.shape[:2], np.int32)
+    for i in range(len(labels)):
+        for j in range(labels.shape[1]):
+            x, y, z = normals[i, j]
+            most = np.float32(-np.inf)
+            for k in range(len(directions)):
+                along = x * directions[k, 0] + y * directions[k, 1] + z * directions[k, 2]
+                if along > most:
+                    labels[i, j], most = k, along
+    return labels
+
+
+def _nearest(
+    normals: NDArray[np.float32], directions: NDArray[np.float32], size: int
+) -> NDArray[np.int32]:
+    """Direction nearest to the mean of each square's normals."""
+    return nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
+
+
+def _seeds(
+    labels: NDArray[np.int32],
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+    smoothness: float,
+) -> NDArray[np.int32]:
+    """Labels (H, W) of smaller squares that gain more by them than their border costs, else -1."""
+    size = _SIZE // 2
+    found = _nearest(normals, directions, size)
+    gain = _per_square(np.add, data_costs(labels, 1, normals, directions), size)
+    gain -= data_costs(found, size, normals, directions)
+    found[gain <= 4 * size * smoothness] = -1
+    return _enlarged(found, size, labels.shape)
+
+
+def _largest_parts(grid: Grid) -> NDArray[np.bool_]:
+    """Pixels (H, W) in the largest connected part of their square."""
+    shape = len(grid.right), grid.below.shape[1]
+    rows, columns = (-(-length // _SIZE) for length in shape)
+    squares = _enlarged(np.arange(rows * columns).reshape(rows, columns), _SIZE, shape)
+    parts = connected_components(squares, grid, np.ones(shape, np.bool_))
+    area = np.bincount(parts.ravel())[parts]
+    largest = _enlarged(_per_square(np.maximum, area, _SIZE), _SIZE, shape)
+    inside: NDArray[np.bool_] = area == largest
+    return inside
+
+
+def _between_squares(links: NDArray[np.float32], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Links (2, h, w) of the squares, sums of those (2, H, W) between pixels `inside` (H, W)."""
+    right, below = np.zeros_like(links)
+    last, next_ = slice(_SIZE - 1, -1, _SIZE), slice(_SIZE, None, _SIZE)
+    right[:, last] = links[0, :, last] * (inside[:, last] & inside[:, next_])
+    below[last] = links[1, last] * (inside[last] & inside[next_])
+    return np.stack([_per_square(np.add, right, _SIZE), _per_square(np.add, below, _SIZE)])
+
+
+def _per_square(function: np.ufunc, values: NDArray[Any], size: int) -> NDArray[Any]:
+    """Reduce the values (H, W, ...) of each square's pixels to one, (h, w, ...)."""
+    for axis in (0, 1):
+        values = function.reduceat(values, np.arange(0, values.shape[axis], size), axis=axis)
+    return values
+
+
+def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, ...]) -> NDArray[Any]:
+    """Values (h, w) of the squares for their pixels (H, W)."""
+    return squares.repeat(size, axis=0).repeat(size, axis=1)[: shape[0], : shape[1]].copy()
+
+
+def _expand(
+    labels: NDArray[np.int32],
+    seeds: NDArray[np.int32],
+    size: int,
+    links: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+) -> None:
+    """Expand the labels (h, w) of sites of `size` x `size` pixels; in place.
+
+    `seeds` (h, w) are labels that sites may begin with, -1 for none.
+    """
+    height, width = labels.shape
+    data = data_costs(labels, size, normals, directions)
+    labelling = GridLabelling.of(labels.ravel(), data.ravel(), links.reshape(2, -1), width)
+    run_halves(_expand_rows, height, labelling, seeds.ravel(), size, normals, directions)
+
+
+@njit(cache=True, nogil=True)
+def _expand_rows(
+    rows: tuple[int, int],
+    labelling: GridLabelling,
+    seeds: NDArray[np.int32],
+    size: int,
+    normals: NDArray[np.float32],
+    directions: NDArray[np.float32],
+) -> None:
+    """Expand every label in some rows from its borders and seeds, as far as it gains; in place."""
+    count = len(directions)
+    start, sites = fronts(labelling, count, rows)
+    first = rows[0] * labelling.width
+    found = first + np.flatnonzero(seeds[first : rows[1] * labelling.width] >= 0)
+    begin, grown = group_sites(seeds[found], found.astype(np.int32), count)
+    for alpha in range(count):
+        border = sites[start[alpha] : start[alpha + 1]]
+        front = np.concatenate((border, grown[begin[alpha] : begin[alpha + 1]]))
+        while len(front) > 0:
+            near = band(alpha, front, _SIZE, labelling, rows)
+            costs = label_costs(alpha, near, size, normals, directions)
+            if not expand(alpha, near, costs, labelling, ROUNDING):
+                break
+            front = beyond(alpha, near, labelling, rows)
