@@ -87,7 +87,7 @@ def _near_height_zero(_: Any) -> Any:
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
 _NOISE = ('noise', 'error_law', 'quantisation')
-_NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
+_NORMALS = ('method', 'labelling', 'normals', 'directions')
 # Cost of a border that lets nothing merge by the energy.
 _NO_BORDER = -1e12
 
@@ -137,10 +137,10 @@ MECHANISMS = (
               {'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
     Mechanism('labels expanded by cuts', 'by_planes/labelling.py graphcut/cut.py '
-              'graphcut/sites.py graphcut/expansion.py',
+              'graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None)}),
     Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/shifts.py '
-              'graphcut/cut.py graphcut/sites.py graphcut/expansion.py',
+              'graphcut/cut.py graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),

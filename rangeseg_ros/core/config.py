@@ -74,14 +74,6 @@ class Config:
     plane_prior: float = option(
         0.5, 'share of planes among the regions, before their bend is looked at', 0.001, 0.999
     )
-    moves: str = option(
-        'expansion',
-        'method normals with exact: alpha-expansion or alpha-beta-swap; swap is refused elsewhere',
-        choices=('expansion', 'swap'),
-    )
-    cycles: int = option(
-        0, 'method normals with exact: rounds of moves at most; 0 = until none helps', 0, 1000
-    )
     exact: bool = option(
         False, 'method normals: every label over all of the image until none changes (minutes)'
     )
@@ -210,8 +202,6 @@ class Config:
             value = checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
         check_directions(self.directions, self.direction_count)
-        if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
-            raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.work_budget < 1 and self.method != 'planes':
             raise ConfigError('parameter work_budget is for method planes')
         if self.odometry and not self.odometry_frame:
@@ -288,7 +278,9 @@ RENAMED = {
 }
 # Former parameters that nothing reads any more, and why.
 DROPPED = {
+    'cycles': 'exact goes on until no label helps',
     'flatness': 'plane_probability decides what is a plane',
+    'moves': 'exact expands labels: swaps take as long and leave a higher energy',
     'refits': 'planes are fitted to the final labels',
     'warm_start': 'no frame depends on those before',
 }
