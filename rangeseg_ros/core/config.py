@@ -34,19 +34,17 @@ class Config:
     )
     normals: str = option(
         'cross_product',
-        'observed normals: cross product of tangents, planes fitted in inverse range, or in space',
-        choices=('cross_product', 'plane_fit', 'orthogonal_fit'),
+        'observed normals: cross product of tangents, or planes fitted in inverse range',
+        choices=('cross_product', 'plane_fit'),
     )
     normal_baseline: int = option(
         3, 'pixels from a pixel to the neighbours of its cross product; the thesis uses 1', 1, 50
     )
-    normal_radius: int = option(
-        2, 'the window of plane_fit and orthogonal_fit has 2 r + 1 rows and columns', 1, 50
-    )
+    normal_radius: int = option(2, 'the window of plane_fit has 2 r + 1 rows and columns', 1, 50)
     directions: str = option(
         'platonic',
-        'method normals: subdivided icosahedron, regular angles, spiral, or random directions',
-        choices=('platonic', 'regular', 'spiral', 'random'),
+        'method normals: directions of a subdivided icosahedron, or at regular angles',
+        choices=('platonic', 'regular'),
     )
     direction_count: int = option(
         305, 'number of directions: platonic 4, 17, 73, 305, 1249; regular odd squares', 1, 5000
@@ -85,8 +83,8 @@ class Config:
     )
     noise_regions: str = option(
         'identify',
-        'regions of few pixels for their perimeter: leave, mark as no plane (identify), or merge',
-        choices=('leave', 'identify', 'merge'),
+        'regions of few pixels for their perimeter: leave, or mark as no plane (identify)',
+        choices=('leave', 'identify'),
     )
     min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)
     # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
@@ -190,7 +188,7 @@ class Config:
     cloud_resolution: float = option(
         0.0, 'side of the cells of ~/ground and ~/obstacles, metres; 0 = all pixels', 0.0, 1.0
     )
-    seed: int = option(0, 'of dithering and random directions', 0, 2147483647)
+    seed: int = option(0, 'of dithering', 0, 2147483647)
 
     def __new__(cls, *values: Any, **named: Any) -> Config:
         # The TypeError of the generated __init__ would suggest nothing.
@@ -257,7 +255,7 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 def check_directions(distribution: str, count: int) -> None:
     """Raise ConfigError if `distribution` cannot give `count` directions."""
-    if distribution not in ('platonic', 'regular', 'spiral', 'random'):
+    if distribution not in ('platonic', 'regular'):
         raise ConfigError(f'unknown distribution of directions {distribution!r}')
     if count < 1:
         raise ConfigError(f'parameter direction_count must be positive, not {count}')
