@@ -87,7 +87,7 @@ def _near_height_zero(_: Any) -> Any:
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
 _NOISE = ('noise', 'error_law', 'quantisation')
-_NORMALS = ('method', 'angular_cost', 'normals', 'coarse_to_fine', 'directions')
+_NORMALS = ('method', 'labelling', 'normals', 'directions')
 # Cost of a border that lets nothing merge by the energy.
 _NO_BORDER = -1e12
 
@@ -137,14 +137,15 @@ MECHANISMS = (
               {'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
     Mechanism('labels expanded by cuts', 'by_planes/labelling.py graphcut/cut.py '
-              'graphcut/sites.py graphcut/expansion.py',
+              'graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None)}),
     Mechanism('labels of pixels, not of blocks', 'by_planes/labelling.py by_planes/shifts.py '
-              'graphcut/cut.py graphcut/sites.py graphcut/expansion.py',
+              'graphcut/cut.py graphcut/expansion.py',
               {'by_planes.labelling.run_halves': _returning(None),
                'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
-    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'runtime/work.py', {'work_budget': 0.9}),
+    Mechanism('bins of 2 x 2 pixels, not of 4 x 4', 'sensing/binning.py:step_within',
+              {'work_budget': 0.9}),
     Mechanism('bins, not pixels', 'sensing/binning.py',
               {'segmenter.bin_side': _returning(1)}),
     Mechanism('bins of one surface', 'sensing/binning.py:of_one_surface',
@@ -153,7 +154,7 @@ MECHANISMS = (
               {'segmenter.with_sharp_borders': lambda _: lambda regions, surfaces, models, image,
                side, *rest: regions.repeat(side, 0).repeat(side, 1)[
                    : image.shape[0], : image.shape[1]] * image.valid}),
-    Mechanism('thin regions are noise', 'regions.py:_thin,merge', {'noise_regions': 'leave'}),
+    Mechanism('thin regions are noise', 'regions.py:_thin', {'noise_regions': 'leave'}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),

@@ -3,8 +3,8 @@
 python docs/experiments.py EXPERIMENT DIR --output FOLDER [--params FILE] [--images N] [--jobs N]
 
 directions      sets of directions, without post-processing (figure 6.2)
-lambda          lambda and the three post-processings, T = 0.8 (figure 6.3)
-postprocessing  post-processings against the tolerance (figure 6.4)
+lambda          lambda with and without post-processing, T = 0.8 (figure 6.3)
+postprocessing  the same against the tolerance (figure 6.4)
 weights         neighbourhood weights of section 5.5 (figure 5.5)
 comparison      ours on the test images, beside published results (figure 6.5, table B.1)
 
@@ -39,7 +39,6 @@ DIRECTIONS = {
 }
 POSTPROCESSING = {
     'none': {'noise_regions': 'leave'},
-    'merged': {'noise_regions': 'merge'},
     'identified': {'noise_regions': 'identify'},
 }
 WEIGHTS = {
@@ -181,7 +180,6 @@ def comparison(base, training, test, run):
     """Method `normals` with lambda trained, and method `planes`, on the test images."""
     normals = {
         'normals as published, identified': base,
-        'normals as published, merged': replace(base, noise_regions='merge'),
         'normals, defaults': Config(method='normals'),
     }
     tested = run({'planes, defaults': Config()}, test)

@@ -27,7 +27,7 @@ def rangeseg() -> None:
 def segment_planes() -> None:
     """Run the node."""
     try:
-        from rangeseg_ros.core.runtime.memory import share_memory
+        from rangeseg_ros.ros.memory import share_memory
 
         share_memory()  # before rclpy starts its threads
         from rangeseg_ros.ros.node import main

@@ -33,7 +33,7 @@ def mkdtemp(*arguments, **options):
 tempfile.mkdtemp = mkdtemp
 """
 KERNEL = """
-from rangeseg_ros.core.by_normals.angular_cost import degrees
+from rangeseg_ros.core.by_normals.labelling import degrees
 degrees(1.0)
 """
 

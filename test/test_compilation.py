@@ -18,7 +18,7 @@ from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.preparation import FIRST, KINDS, needs, prepare, rehearse
 from rangeseg_ros.compilation.worker import discover
 from rangeseg_ros.core.runtime.kernels import nothing_compiled
-from rangeseg_ros.core.runtime.work import STEPS
+from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 

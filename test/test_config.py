@@ -33,14 +33,12 @@ def test_mapping_gives_what_the_constructor_gives():
         ({'smoothness': -1.0}, ['smoothness', '0', '10000']),
         ({'smoothness': float('nan')}, ['smoothness']),
         ({'smoothness': 'high'}, ['smoothness', 'float']),
-        ({'cycles': 2.5}, ['cycles', 'int']),
-        ({'cycles': True}, ['cycles', 'int']),
+        ({'min_pixels': 2.5}, ['min_pixels', 'int']),
+        ({'min_pixels': True}, ['min_pixels', 'int']),
         ({'exact': 1}, ['exact', 'bool']),
         ({'method': 'magic'}, ['method', 'planes', 'normals']),
         ({'direction_count': 300}, ['direction_count', '305']),
         ({'directions': 'regular', 'direction_count': 224}, ['direction_count', '225']),
-        ({'method': 'normals', 'moves': 'swap'}, ['moves', 'exact']),
-        ({'exact': True, 'moves': 'swap'}, ['moves', 'normals']),
     ],
 )
 def test_refusals_name_the_parameter_and_what_it_takes(values, words):

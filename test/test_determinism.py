@@ -16,7 +16,7 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
-from rangeseg_ros.core.runtime.work import STEPS
+from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room

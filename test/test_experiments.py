@@ -20,7 +20,7 @@ def experiments(monkeypatch):
     return importlib.import_module('experiments')
 
 
-@pytest.mark.parametrize(('name', 'count'), [('lambda', 3 * 3), ('comparison', 4 * 6 + 9)])
+@pytest.mark.parametrize(('name', 'count'), [('lambda', 2 * 3), ('comparison', 3 * 6 + 9)])
 def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
     monkeypatch.setattr(experiments, 'LAMBDAS', (20.0, 85.0, 150.0))
     folder = segcomp_set(tmp_path / 'abw')

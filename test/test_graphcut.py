@@ -1,4 +1,4 @@
-"""Cuts, moves and bands of sites against exhaustive search, definitions and other programs."""
+"""Cuts, expansions and bands against exhaustive search, definitions and other programs."""
 
 from itertools import product
 
@@ -7,9 +7,16 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.graphcut.cut import minimum_cut
-from rangeseg_ros.core.graphcut.energy import energy
-from rangeseg_ros.core.graphcut.moves import Labelling
-from rangeseg_ros.core.graphcut.sites import GridLabelling, band, fronts
+from rangeseg_ros.core.graphcut.expansion import (
+    ROUNDING,
+    GridLabelling,
+    band,
+    energy,
+    expand,
+    fronts,
+    link_costs,
+    minimise,
+)
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -90,9 +97,20 @@ class Problem:
         return energy(data, labels, self.grid, 3.0)
 
     def labelling(self):
-        return Labelling(
-            self.start, lambda label, pixels: self.unary[label].ravel()[pixels], self.grid, 3.0
-        )
+        labels = self.start.astype(np.int32)
+        data = np.take_along_axis(self.unary, labels[None], 0).ravel()
+        return GridLabelling.of(labels.ravel(), data, link_costs(self.grid, 3.0), labels.shape[1])
+
+    def cost(self, label, pixels):
+        return self.unary[label].ravel()[pixels]
+
+    def expand(self, labelling, alpha):
+        pixels = np.flatnonzero(labelling.labels != alpha).astype(np.int32)
+        labelling.position[pixels] = np.arange(len(pixels))
+        return expand(alpha, pixels, self.cost(alpha, pixels), labelling, ROUNDING)
+
+    def image(self, labelling):
+        return labelling.labels.reshape(self.start.shape)
 
     def energies(self, labels):
         """Energies (n,) of labellings (n, h, w), written without the code under test."""
@@ -115,61 +133,44 @@ def choices(labels, free, values):
 SEEDS = range(25)
 
 
-@pytest.mark.parametrize('moves', ['expansion', 'swap'])
 @pytest.mark.parametrize('seed', SEEDS)
-def test_two_labels_give_the_optimum(seed, moves):
+def test_two_labels_give_the_optimum(seed):
     grid = Problem(seed, 3, 4, 2)
     labelling = grid.labelling()
-    labelling.minimise(2, moves)
+    minimise(labelling, 2, grid.cost)
     every = choices(grid.start, np.ones((3, 4), bool), (0, 1))
-    assert grid.energy(labelling.image) == pytest.approx(grid.energies(every).min())
+    assert grid.energy(grid.image(labelling)) == pytest.approx(grid.energies(every).min())
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_each_move_is_the_best_of_its_space(seed):
-    """From the definition: of a swap, the pixels of two labels; of an expansion, all to one."""
+def test_each_expansion_is_the_best_of_its_space(seed):
+    """From the definition: all pixels may take the label."""
     grid = Problem(seed, 3, 3, 4)
     labelling = grid.labelling()
-    for alpha, beta in ((0, 1), (3, None), (2, 0), (1, None), (1, 2), (0, None)):
-        before = labelling.image.copy()
-        if beta is None:
-            labelling.expand(alpha)
-            taken = choices(np.zeros((3, 3), int), np.ones((3, 3), bool), (0, 1))
-            every = np.where(taken, alpha, before)
-        else:
-            labelling.swap(alpha, beta)
-            every = choices(before, np.isin(before, (alpha, beta)), (alpha, beta))
-        best = grid.energies(every).min()
-        assert grid.energies(labelling.image[None])[0] == pytest.approx(best)
+    for alpha in (3, 1, 0, 2, 1):
+        before = grid.image(labelling).copy()
+        grid.expand(labelling, alpha)
+        taken = choices(np.zeros((3, 3), int), np.ones((3, 3), bool), (0, 1))
+        best = grid.energies(np.where(taken, alpha, before)).min()
+        assert grid.energies(grid.image(labelling)[None])[0] == pytest.approx(best)
 
 
-@pytest.mark.parametrize('moves', ['expansion', 'swap'])
-def test_no_accepted_move_raises_the_energy_and_none_is_left_that_lowers_it(moves):
+def test_no_accepted_expansion_raises_the_energy_and_none_is_left_that_lowers_it():
     grid = Problem(0, 20, 30, 6)
     labelling = grid.labelling()
-    last = grid.energy(labelling.image)
-    pairs = [(a, b) for a in range(6) for b in range(a)]
-    tries = [(label,) for label in range(6)] if moves == 'expansion' else pairs
-    attempt, accepted = labelling.expand if moves == 'expansion' else labelling.swap, 1
+    image = grid.image(labelling)
+    first = last = grid.energy(image)
+    accepted = 1
     while accepted:
         accepted = 0
-        for labels in tries:
-            before = labelling.image.copy()
-            helped = attempt(*labels)
-            now = grid.energy(labelling.image)
-            assert now < last if helped else np.array_equal(before, labelling.image)
+        for alpha in range(6):
+            before = image.copy()
+            helped = grid.expand(labelling, alpha)
+            now = grid.energy(image)
+            assert now < last if helped else np.array_equal(before, image)
             accepted, last = accepted + helped, now
-    labelling.minimise(6, moves)
-    assert grid.energy(labelling.image) == last
-
-
-def test_minimise_stops_after_the_rounds_it_is_given():
-    few, many = Problem(4, 12, 12, 5).labelling(), Problem(4, 12, 12, 5).labelling()
-    few.minimise(5, cycles=1)
-    for alpha in range(5):
-        many.expand(alpha)
-    np.testing.assert_array_equal(few.image, many.image)
-    assert any(few.expand(alpha) for alpha in range(5))
+    minimise(labelling, 6, grid.cost)
+    assert grid.energy(image) == last < first
 
 
 @pytest.mark.parametrize('reach', [1, 2, 3, 5])

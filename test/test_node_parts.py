@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.runtime.work import STEPS, step_within
+from rangeseg_ros.core.sensing.binning import STEPS, step_within
 from rangeseg_ros.ros import counting
 from rangeseg_ros.ros.counting import Losses, Window
 from rangeseg_ros.ros.pace import Pace

@@ -5,12 +5,7 @@ import pytest
 
 from rangeseg_ros import ConfigError
 from rangeseg_ros.core.by_normals.directions import directions, platonic, regular
-from rangeseg_ros.core.by_normals.normals import (
-    cross_product,
-    observed_normals,
-    orthogonal_fit,
-    plane_fit,
-)
+from rangeseg_ros.core.by_normals.normals import cross_product, observed_normals, plane_fit
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import Grid
@@ -33,8 +28,6 @@ METHODS = [
     lambda image: cross_product(image, 3),
     lambda image: plane_fit(image, 1),
     lambda image: plane_fit(image, 3),
-    lambda image: orthogonal_fit(image, 1),
-    lambda image: orthogonal_fit(image, 3),
 ]
 
 
@@ -62,7 +55,7 @@ def test_clouds_of_another_frame_point_to_the_sensor_too(method):
     np.testing.assert_allclose(found[15, 20], [-1, 0, 0], atol=2e-3)
 
 
-@pytest.mark.parametrize(('method', 'reach'), list(zip(METHODS, [1, 3, 1, 3, 1, 3], strict=True)))
+@pytest.mark.parametrize(('method', 'reach'), list(zip(METHODS, [1, 3, 1, 3], strict=True)))
 def test_undefined_at_the_border_and_beside_shadow_and_nowhere_else(method, reach):
     depth = plane_image((0, 0, -1), 1.0).points[..., 2].copy()
     depth[15, 20] = np.nan
@@ -96,18 +89,6 @@ def test_tangents_do_not_cross_disconnected_edges():
     assert found[11, 3:-3].all() and found[13, 3:-3].all()
 
 
-def test_orthogonal_fit_is_the_plane_of_least_distances():
-    depth = np.random.default_rng(3).uniform(1.9, 2.1, CAMERA.shape)
-    image = RangeImage.from_depth(depth, CAMERA)
-    found = orthogonal_fit(image, 2)
-    for y, x in ((2, 2), (11, 17), (20, 30)):
-        points = image.points[y - 2 : y + 3, x - 2 : x + 3].reshape(-1, 3).astype(float)
-        expected = np.linalg.svd(points - points.mean(axis=0))[2][2]
-        expected *= -np.sign(expected @ image.rays[y, x])
-        np.testing.assert_allclose(found[y, x], expected, atol=1e-5)
-    assert np.isnan(found[1, 5]).all()
-
-
 def test_counts_of_tables_a1_and_a3():
     for subdivisions, count in enumerate((4, 17, 73, 305, 1249)):
         assert len(platonic(subdivisions)) == len(directions('platonic', count)) == count
@@ -117,7 +98,7 @@ def test_counts_of_tables_a1_and_a3():
 
 @pytest.mark.parametrize(
     ('distribution', 'count'),
-    [('platonic', 305), ('regular', 225), ('spiral', 1), ('spiral', 300), ('random', 298)],
+    [('platonic', 305), ('platonic', 1249), ('regular', 1), ('regular', 225)],
 )
 def test_unit_vectors_towards_the_sensor_all_different(distribution, count):
     found = directions(distribution, count)
@@ -127,27 +108,13 @@ def test_unit_vectors_towards_the_sensor_all_different(distribution, count):
     assert len(np.unique(found.round(9), axis=0)) == count
 
 
-@pytest.mark.parametrize(('distribution', 'count'), [('platonic', 305), ('spiral', 305)])
-def test_even_distributions_leave_no_large_gap(distribution, count):
+def test_the_platonic_distribution_leaves_no_large_gap():
     """Each direction's share of the hemisphere is a cap of 4.6 degrees; no gap is twice that."""
     random = np.random.default_rng(0).normal(size=(4000, 3))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
     random = random[random[:, 2] < -0.2]
-    nearest = np.degrees(np.arccos((random @ directions(distribution, count).T).max(axis=1)))
+    nearest = np.degrees(np.arccos((random @ directions('platonic', 305).T).max(axis=1)))
     assert nearest.max() < 9
-
-
-def test_rejection_is_uniform_over_the_hemisphere():
-    """Height is uniform on a hemisphere (Archimedes): mean 1/2, variance 1/12."""
-    height = -directions('random', 5000, seed=3)[:, 2]
-    assert height.mean() == pytest.approx(1 / 2, abs=0.015)
-    assert height.var() == pytest.approx(1 / 12, abs=0.005)
-
-
-def test_rejection_repeats_with_its_seed():
-    first, again, other = (directions('random', 50, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first, again)
-    assert not np.array_equal(first, other)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +123,8 @@ def test_rejection_repeats_with_its_seed():
         ('platonic', 300, '17, 73, 305'),
         ('regular', 24, 'odd square'),
         ('regular', 16, 'odd square'),
-        ('spiral', 0, 'positive'),
+        ('regular', 0, 'positive'),
+        ('spiral', 305, 'spiral'),
         ('sunflower', 10, 'sunflower'),
     ],
 )

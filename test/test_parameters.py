@@ -85,22 +85,22 @@ def test_changes_apply_all_or_none(node_with):
     def change(**values):
         return node.set_parameters_atomically([Parameter(n, value=v) for n, v in values.items()])
 
-    assert change(smoothness=10.0, cycles=2).successful
-    assert applied == [NodeConfig(smoothness=10.0, cycles=2)]
+    assert change(smoothness=10.0, min_pixels=2).successful
+    assert applied == [NodeConfig(smoothness=10.0, min_pixels=2)]
     for values, reason in [
-        ({'cycles': 3, 'method': 'magic'}, 'method'),
-        ({'cycles': 3, 'smoothness': -1.0}, 'smoothness'),
-        ({'cycles': 3, 'smoothness': float('nan')}, 'smoothness'),
-        ({'cycles': 3, 'directions': 'regular'}, 'direction_count'),
-        ({'cycles': 3, 'smoothness': 'much'}, 'DOUBLE'),
+        ({'min_pixels': 3, 'method': 'magic'}, 'method'),
+        ({'min_pixels': 3, 'smoothness': -1.0}, 'smoothness'),
+        ({'min_pixels': 3, 'smoothness': float('nan')}, 'smoothness'),
+        ({'min_pixels': 3, 'directions': 'regular'}, 'direction_count'),
+        ({'min_pixels': 3, 'smoothness': 'much'}, 'DOUBLE'),
     ]:
         result = change(**values)
         assert not result.successful and reason in result.reason
-        assert node.get_parameter('cycles').value == 2
+        assert node.get_parameter('min_pixels').value == 2
     # Values that only together make sense go together.
     assert change(directions='regular', direction_count=225).successful
     assert applied[1:] == [
-        NodeConfig(smoothness=10.0, cycles=2, directions='regular', direction_count=225)
+        NodeConfig(smoothness=10.0, min_pixels=2, directions='regular', direction_count=225)
     ]
 
 

@@ -13,9 +13,7 @@ from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, re
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.graphcut.energy import link_costs
-from rangeseg_ros.core.graphcut.moves import Labelling
-from rangeseg_ros.core.graphcut.sites import GridLabelling, fronts
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, fronts, link_costs, minimise
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import Grid, View, weights
 from rangeseg_ros.core.sensing.moments import RATIO
@@ -225,15 +223,11 @@ def test_the_energy_is_nearly_that_of_expansions_to_all_pixels():
     """Of every label, from anywhere, until none helps."""
     problem, (surface, blocks, moments), sensor = small_room()
     labels, models = refine(problem, surface, blocks, moments, sensor)
-    cost = unary(problem, models).reshape(len(models.theta), -1)
-    everywhere = Labelling(
-        labels.reshape(-1, problem.width),
-        lambda k, pixels: cost[k, pixels],
-        Grid(*prior(problem)),
-        1,
-    )
-    everywhere.minimise(len(models.theta))
-    least = energy(everywhere.labels, problem, models)
+    cost = unary(problem, models).reshape(len(models.theta), -1).astype(np.float32)
+    everywhere, data = labels.copy(), cost[labels, np.arange(len(labels))]
+    labelling = GridLabelling.of(everywhere, data, problem.links, problem.width)
+    minimise(labelling, len(cost), lambda k, pixels: cost[k, pixels])
+    least = energy(everywhere, problem, models)
     assert least <= energy(labels, problem, models) < 1.05 * least
 
 

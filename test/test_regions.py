@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import connected_components, drop_regions, merge, plane_regions
+from rangeseg_ros.core.regions import connected_components, drop_regions, plane_regions
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -46,31 +46,6 @@ def test_thin_regions_are_noise(shape, least):
     assert kept == set(range(least, 10))
 
 
-def test_merge_erodes_towards_the_majority():
-    regions = np.zeros((5, 12), np.int32)
-    regions[:, :5] = 1
-    regions[:, 5:7] = 2
-    regions[:, 7:] = 3
-    merged = merge(regions, np.array([False, False, True, False]))
-    expected = np.where(np.arange(12) < 6, 1, 3)
-    assert (merged == expected).all()
-
-
-def test_merge_waits_for_a_majority():
-    """The middle, between two regions of two neighbours each, joins that of the pixel below."""
-    regions = np.array([[1, 1, 3, 3], [2, 2, 2, 2], [4, 1, 3, 3], [4, 4, 4, 4]], np.int32)
-    noise = np.array([False, False, True, False, False])
-    merged = merge(regions, noise)
-    # Left: 1 of region 1 below right, 2 above, 1 of 4; the pixels between are ties at first.
-    assert merged[1].tolist() == [1, 1, 3, 3]
-
-
-def test_merge_keeps_noise_that_touches_nothing():
-    regions = np.zeros((5, 5), np.int32)
-    regions[2, 2] = 1
-    assert merge(regions, np.array([False, True]))[2, 2] == 1
-
-
 def test_regions_left_keep_their_order():
     regions = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
     found = drop_regions(regions, np.array([True, False, True, False, False]))
@@ -78,10 +53,8 @@ def test_regions_left_keep_their_order():
     assert found.dtype == np.uint16
 
 
-@pytest.mark.parametrize(
-    ('noise_regions', 'line', 'speck'), [('leave', 2, 0), ('identify', 0, 0), ('merge', 1, 1)]
-)
-def test_noise_regions_are_left_marked_or_merged(noise_regions, line, speck):
+@pytest.mark.parametrize(('noise_regions', 'line', 'speck'), [('leave', 2, 0), ('identify', 0, 0)])
+def test_noise_regions_are_left_or_marked(noise_regions, line, speck):
     labels = np.zeros((40, 40), int)
     labels[:, 20] = 5
     labels[10, 10] = 5

@@ -8,7 +8,7 @@ from clouds import cloud_of
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.options import ConfigError
-from rangeseg_ros.core.runtime.work import STEPS, step_within
+from rangeseg_ros.core.sensing.binning import STEPS, step_within
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera

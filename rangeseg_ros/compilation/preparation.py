@@ -128,13 +128,10 @@ def rehearse(
     Frames of 64 x 48 pixels times `size`: small ones where kernels are interpreted, of 640 x 480,
     which take another path, where they are compiled.
     """
-    # The room has a few hundred pixels per plane. Few directions, once round: exact solutions with
-    # all of them take minutes, and run the same kernels.
-    few = 25 if config.directions == 'regular' else 17
-    count = min(config.direction_count, few)
-    config = replace(
-        config, min_pixels=min(config.min_pixels, 50), direction_count=count, cycles=1
-    )
+    # The room has a few hundred pixels per plane. Few directions: exact solutions with all of them
+    # take minutes, and run the same kernels.
+    count = min(config.direction_count, 9 if config.directions == 'regular' else 4)
+    config = replace(config, min_pixels=min(config.min_pixels, 50), direction_count=count)
     # What is measured in a small frame decides between paths; the stated sensor takes the other.
     stated = replace(config, sensor_model='fixed')
     for kind in kinds:

@@ -34,19 +34,17 @@ class Config:
     )
     normals: str = option(
         'cross_product',
-        'observed normals: cross product of tangents, planes fitted in inverse range, or in space',
-        choices=('cross_product', 'plane_fit', 'orthogonal_fit'),
+        'observed normals: cross product of tangents, or planes fitted in inverse range',
+        choices=('cross_product', 'plane_fit'),
     )
     normal_baseline: int = option(
         3, 'pixels from a pixel to the neighbours of its cross product; the thesis uses 1', 1, 50
     )
-    normal_radius: int = option(
-        2, 'the window of plane_fit and orthogonal_fit has 2 r + 1 rows and columns', 1, 50
-    )
+    normal_radius: int = option(2, 'the window of plane_fit has 2 r + 1 rows and columns', 1, 50)
     directions: str = option(
         'platonic',
-        'method normals: subdivided icosahedron, regular angles, spiral, or random directions',
-        choices=('platonic', 'regular', 'spiral', 'random'),
+        'method normals: directions of a subdivided icosahedron, or at regular angles',
+        choices=('platonic', 'regular'),
     )
     direction_count: int = option(
         305, 'number of directions: platonic 4, 17, 73, 305, 1249; regular odd squares', 1, 5000
@@ -74,14 +72,6 @@ class Config:
     plane_prior: float = option(
         0.5, 'share of planes among the regions, before their bend is looked at', 0.001, 0.999
     )
-    moves: str = option(
-        'expansion',
-        'method normals with exact: alpha-expansion or alpha-beta-swap; swap is refused elsewhere',
-        choices=('expansion', 'swap'),
-    )
-    cycles: int = option(
-        0, 'method normals with exact: rounds of moves at most; 0 = until none helps', 0, 1000
-    )
     exact: bool = option(
         False, 'method normals: every label over all of the image until none changes (minutes)'
     )
@@ -93,8 +83,8 @@ class Config:
     )
     noise_regions: str = option(
         'identify',
-        'regions of few pixels for their perimeter: leave, mark as no plane (identify), or merge',
-        choices=('leave', 'identify', 'merge'),
+        'regions of few pixels for their perimeter: leave, or mark as no plane (identify)',
+        choices=('leave', 'identify'),
     )
     min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)
     # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
@@ -198,7 +188,7 @@ class Config:
     cloud_resolution: float = option(
         0.0, 'side of the cells of ~/ground and ~/obstacles, metres; 0 = all pixels', 0.0, 1.0
     )
-    seed: int = option(0, 'of dithering and random directions', 0, 2147483647)
+    seed: int = option(0, 'of dithering', 0, 2147483647)
 
     def __new__(cls, *values: Any, **named: Any) -> Config:
         # The TypeError of the generated __init__ would suggest nothing.
@@ -210,8 +200,6 @@ class Config:
             value = checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
         check_directions(self.directions, self.direction_count)
-        if self.moves == 'swap' and (self.method != 'normals' or not self.exact):
-            raise ConfigError('parameter moves: swap is for method normals with exact')
         if self.work_budget < 1 and self.method != 'planes':
             raise ConfigError('parameter work_budget is for method planes')
         if self.odometry and not self.odometry_frame:
@@ -267,7 +255,7 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 def check_directions(distribution: str, count: int) -> None:
     """Raise ConfigError if `distribution` cannot give `count` directions."""
-    if distribution not in ('platonic', 'regular', 'spiral', 'random'):
+    if distribution not in ('platonic', 'regular'):
         raise ConfigError(f'unknown distribution of directions {distribution!r}')
     if count < 1:
         raise ConfigError(f'parameter direction_count must be positive, not {count}')
@@ -288,7 +276,9 @@ RENAMED = {
 }
 # Former parameters that nothing reads any more, and why.
 DROPPED = {
+    'cycles': 'exact goes on until no label helps',
     'flatness': 'plane_probability decides what is a plane',
+    'moves': 'exact expands labels: swaps take as long and leave a higher energy',
     'refits': 'planes are fitted to the final labels',
     'warm_start': 'no frame depends on those before',
 }

@@ -39,12 +39,8 @@ def plane_regions(
         _measure, len(components), components, int(components.max()) + 1
     )
     area, perimeter = upper + lower, upper_rim + lower_rim
-    noise = _thin(area, perimeter, labels.shape)
-    if noise_regions == 'merge':
-        components = merge(components, noise)
-        area = np.bincount(components.ravel(), minlength=len(area))
     if noise_regions != 'leave':
-        area = np.where(noise, 0, area)
+        area = np.where(_thin(area, perimeter, labels.shape), 0, area)
     area[0] = 0
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
 
@@ -120,39 +116,6 @@ def _thin(
     noise = (area < least * perimeter) | (area == perimeter)
     noise[0] = False
     return noise
-
-
-def merge(regions: NDArray[np.int32], noise: NDArray[np.bool_]) -> NDArray[np.int32]:
-    """Erode noise regions into those around them (thesis 6.1.4).
-
-    From the rims inwards, a pixel joins the region that the majority of its eight neighbours
-    belong to, of those that have a region already and are no noise. Where no pixel has a majority
-    any more, that of most neighbours is taken, as noise is to disappear. A noise region that
-    touches no other region stays. 0 is no region and takes no part.
-    """
-    height, width = regions.shape
-    framed = np.pad(regions, 1).ravel()
-    kept = ~noise
-    kept[0] = False
-    row = width + 2
-    around = np.array([-row - 1, -row, -row + 1, -1, 1, row - 1, row, row + 1])
-    pixels = np.flatnonzero(noise[framed])
-    while pixels.size:
-        neighbours = framed[pixels[:, None] + around]
-        neighbours = np.where(kept[neighbours], neighbours, 0)
-        # Votes for each neighbour's region; of equal counts the lowest region wins.
-        votes = (neighbours[:, :, None] == neighbours[:, None, :]).sum(axis=2)
-        votes = np.where(neighbours > 0, votes, 0)
-        best = np.where(votes == votes.max(axis=1, keepdims=True), neighbours, len(noise))
-        most = votes.max(axis=1)
-        joined = 2 * most > np.count_nonzero(votes, axis=1)
-        if not joined.any():
-            joined = most > 0
-        if not joined.any():
-            break
-        framed[pixels[joined]] = best.min(axis=1)[joined]
-        pixels = pixels[~joined]
-    return framed.reshape(height + 2, row)[1:-1, 1:-1].copy()
 
 
 @njit(cache=True, nogil=True)

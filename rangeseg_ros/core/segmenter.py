@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import fields, replace
 
 import numpy as np
@@ -21,7 +22,6 @@ from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
 from rangeseg_ros.core.runtime.threads import submit
-from rangeseg_ros.core.runtime.work import Stopwatch
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -32,6 +32,20 @@ from rangeseg_ros.core.sensing.grid import GridEdges, View, weights
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
+
+
+class Stopwatch:
+    """Times the stages of a run; `laps` are milliseconds per stage."""
+
+    def __init__(self) -> None:
+        self.laps: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, stage: str) -> None:
+        """End the stage that has been running."""
+        now = time.perf_counter()
+        self.laps[stage] = 1000 * (now - self._last)
+        self._last = now
 
 
 class Segmenter:

@@ -6,7 +6,7 @@ import math
 from collections import deque
 from statistics import median
 
-from rangeseg_ros.core.runtime.work import STEPS, step_within
+from rangeseg_ros.core.sensing.binning import STEPS, step_within
 
 # Seconds over which times are smoothed: a single slow frame is not followed, and a change of scene
 # is (95 % after three times as long) within the five seconds over which rates are counted.

@@ -13,7 +13,6 @@ from rclpy.node import Node
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.placement import HeldUp, Placement
-from rangeseg_ros.core.runtime.memory import give_back_memory
 from rangeseg_ros.core.runtime.threads import sharing_cores
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
@@ -23,6 +22,7 @@ from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.diagnostics import FrameStatistics
 from rangeseg_ros.ros.latest_ready import LatestReady
 from rangeseg_ros.ros.locator import Locator
+from rangeseg_ros.ros.memory import give_back_memory
 from rangeseg_ros.ros.pace import Pace
 from rangeseg_ros.ros.publication import Publication, Segmented
 from rangeseg_ros.ros.settings import Settings

@@ -19,21 +19,17 @@ _EQUATOR = 1e-9  # rounding
 
 
 @lru_cache(maxsize=8)
-def directions(distribution: str, count: int, seed: int = 0) -> NDArray[np.float64]:
+def directions(distribution: str, count: int) -> NDArray[np.float64]:
     """Unit vectors (count, 3) over the hemisphere, not to be written to.
 
     Distributions and counts are those of `Config`: platonic has 4, 17, 73, 305 or 1249 (thesis,
-    table A.3), regular an odd square (A.1), spiral and random any. `ConfigError` for others.
+    table A.3), regular an odd square (A.1). `ConfigError` for others.
     """
     check_directions(distribution, count)
     if distribution == 'platonic':
         found = platonic(PLATONIC_COUNTS.index(count))
-    elif distribution == 'regular':
-        found = regular((math.isqrt(count) + 1) // 2)
-    elif distribution == 'spiral':
-        found = spiral(count)
     else:
-        found = hypercube_rejection(count, seed)
+        found = regular((math.isqrt(count) + 1) // 2)
     found.setflags(write=False)
     return found
 
@@ -62,29 +58,6 @@ def regular(n: int) -> NDArray[np.float64]:
     phi, theta = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing='ij'))
     ring = np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), -np.sin(phi)], 1)
     return np.vstack([[[0.0, 0.0, -1.0]], ring[::-1]])
-
-
-def spiral(count: int) -> NDArray[np.float64]:
-    """Points on a spiral from the pole to the equator, each for an equal area (thesis 5.2.1)."""
-    k = np.arange(count) + 0.5
-    z = 1 - k / count
-    turn = np.pi * (3 - 5**0.5) * k
-    radius = np.sqrt(1 - z * z)
-    return np.stack([radius * np.cos(turn), radius * np.sin(turn), -z], 1)
-
-
-def hypercube_rejection(count: int, seed: int = 0) -> NDArray[np.float64]:
-    """Uniform points of a cube, those outside its sphere rejected (thesis 5.2.1)."""
-    random = np.random.default_rng(seed)
-    found = np.empty((0, 3))
-    while len(found) < count:
-        cube = random.uniform(-1, 1, (2 * count, 3))
-        radius = np.linalg.norm(cube, axis=1)
-        cube /= np.maximum(radius, _EQUATOR)[:, None]
-        inside = (radius > _EQUATOR) & (radius <= 1) & (np.abs(cube[:, 2]) > _EQUATOR)
-        found = np.vstack([found, cube[inside]])
-    found[:, 2] = -np.abs(found[:, 2])
-    return found[:count]
 
 
 def _subdivide(

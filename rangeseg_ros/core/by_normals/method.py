@@ -8,13 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_normals import coarse_to_fine
-from rangeseg_ros.core.by_normals.angular_cost import data_costs, label_costs
 from rangeseg_ros.core.by_normals.directions import directions
+from rangeseg_ros.core.by_normals.labelling import data_costs, minimise, minimise_exactly
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.graphcut import moves as graphcut
-from rangeseg_ros.core.graphcut.energy import energy
+from rangeseg_ros.core.graphcut.expansion import energy
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -44,34 +42,9 @@ def segment(
     """Give every pixel a direction; `lap` is told the name of every stage that ends."""
     normals = observed_normals(image, grid, config)
     lap('normals')
-    unturned = directions(config.directions, config.direction_count, config.seed)
+    unturned = directions(config.directions, config.direction_count)
     labels_of = (unturned @ image.axes.T).astype(np.float32)
-    problem = normals, labels_of, grid, config.smoothness
-    if config.exact:
-        labels = minimise_exactly(*problem, config.moves, config.cycles)
-    else:
-        labels = coarse_to_fine.minimise(*problem)
+    minimiser = minimise_exactly if config.exact else minimise
+    labels = minimiser(normals, labels_of, grid, config.smoothness)
     lap('labels')
     return Labelling(labels, labels_of, normals, grid, config.smoothness)
-
-
-def minimise_exactly(
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    grid: Grid,
-    smoothness: float,
-    moves: str = 'expansion',
-    cycles: int = 0,
-) -> NDArray[np.int32]:
-    """What `coarse_to_fine.minimise` finds, from the nearest direction at every pixel on.
-
-    No move of a label improves it; `moves` and `cycles` as in `moves.Labelling.minimise` (4.8).
-    """
-
-    def cost(label: int, pixels: NDArray[np.integer]) -> NDArray[np.float32]:
-        return label_costs(label, pixels, 1, normals, directions)
-
-    nearest = coarse_to_fine.nearest_directions(normals, directions)
-    labelling = graphcut.Labelling(nearest, cost, grid, smoothness)
-    labelling.minimise(len(directions), moves, cycles)
-    return labelling.image

@@ -24,8 +24,6 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[n
     """
     if config.normals == 'plane_fit':
         return plane_fit(image, config.normal_radius)
-    if config.normals == 'orthogonal_fit':
-        return orthogonal_fit(image, config.normal_radius)
     normals = cross_product(image, config.normal_baseline)
     if config.jump_edges == 'plane':
         reach = config.normal_baseline
@@ -55,9 +53,9 @@ def cross_product(image: RangeImage, baseline: int = 1) -> NDArray[np.float32]:
 def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     """Plane of least squares in inverse range through 2 radius + 1 rows and columns (5.7.2).
 
-    That is where the noise of structured light and stereo is constant; `orthogonal_fit` is of
-    distances in space. The plane n . p + d = 0 is linear in inverse range, (-n/d) . ray = inverse,
-    so that the sums of the normal equations are box filters over the image.
+    That is where the noise of structured light and stereo is constant. The plane n . p + d = 0 is
+    linear in inverse range, (-n/d) . ray = inverse, so that the sums of the normal equations are
+    box filters over the image.
     """
     rays = np.where(image.valid[..., None], image.rays, 0).astype(np.float64)
     products = _means(rays[..., _ROWS] * rays[..., _COLUMNS], radius)
@@ -65,22 +63,6 @@ def plane_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
     right = _means(rays * image.inverse[..., None], radius)
     # Cramer's rule, without the determinant: the result is normalised anyhow.
     return _towards_sensor((inverse @ right[..., None])[..., 0], image, radius)
-
-
-def orthogonal_fit(image: RangeImage, radius: int = 2) -> NDArray[np.float32]:
-    """Plane of least orthogonal distances to the points of such a window (thesis 5.7.2).
-
-    The eigenvector of the smallest eigenvalue of the points' covariance.
-    """
-    valid = image.valid
-    # About their mean, so that the products of coordinates keep their digits.
-    points = image.points.astype(np.float64)
-    points = np.where(valid[..., None], points - points[valid].mean(axis=0), 0)
-    mean = _means(points, radius)
-    products = _means(points[..., _ROWS] * points[..., _COLUMNS], radius)
-    covariance = (products - mean[..., _ROWS] * mean[..., _COLUMNS])[..., _SYMMETRIC]
-    # Eigenvalues ascend.
-    return _towards_sensor(np.linalg.eigh(covariance)[1][..., 0], image, radius)
 
 
 def _means(values: NDArray[np.float64], radius: int) -> NDArray[np.float64]:

@@ -15,8 +15,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
     data_cost,
 )
 from rangeseg_ros.core.by_planes.shifts import shifts
-from rangeseg_ros.core.graphcut.expansion import expand
-from rangeseg_ros.core.graphcut.sites import GridLabelling, band, beyond, fronts
+from rangeseg_ros.core.graphcut.expansion import GridLabelling, band, beyond, expand, fronts
 from rangeseg_ros.core.runtime.threads import run_halves, run_rows
 from rangeseg_ros.core.sensing.sensor import SensorModel
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.blocks import NODE
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
-from rangeseg_ros.core.graphcut.energy import link_costs
+from rangeseg_ros.core.graphcut.expansion import link_costs
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all

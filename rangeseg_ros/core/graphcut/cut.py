@@ -1,8 +1,8 @@
-"""Moves as minimum cuts (thesis 4.7, 4.8; Boykov, Veksler and Zabih, TPAMI 2001).
+"""Expansions as minimum cuts (thesis 4.7, 4.8; Boykov, Veksler and Zabih, TPAMI 2001).
 
-Both moves are binary problems: a free pixel p switches to alpha (x_p = 1) or stays (x_p = 0),
-and the best set of pixels to switch is a minimum cut. In an expansion, an edge of weight w
-between pixels of unlike labels, neither of them alpha, costs w unless both ends switch, and
+An expansion is a binary problem: a free pixel p switches to alpha (x_p = 1) or stays (x_p = 0),
+and the best set of pixels to switch is a minimum cut. An edge of weight w between pixels of
+unlike labels, neither of them alpha, costs w unless both ends switch, and
 
     w (1 - x_p x_q) = w/2 (1 - x_p) + w/2 (1 - x_q) + w/2 |x_p - x_q|,
 
@@ -24,8 +24,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-ROUNDING = 1e-3
-"""A move must lower the energy by more than the rounding of its sums."""
 # Parents that are not a neighbour: those have the number of their side, 0 to 3.
 _TERMINAL, _ORPHAN, _FREE = 4, 5, 6
 

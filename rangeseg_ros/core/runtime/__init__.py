@@ -1,1 +1,1 @@
-"""Compiled kernels, threads and memory: how kernels run, apart from what they compute."""
+"""Compiled kernels and threads: how kernels run, apart from what they compute."""

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.runtime.threads import run_rows
-from rangeseg_ros.core.runtime.work import step_within
 from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -151,6 +150,18 @@ def _means(
     for each, some in zip(values, kept, strict=True):
         total += np.where(some, each, 0)
     return (total / np.maximum(np.sum(kept, axis=0), 1)).astype(np.float32)
+
+
+# Of bins n times as wide, the budget from which on they are taken (docs/benchmark.md).
+_SHARES = {1: 1.0, 2: 0.55, 4: 0.35}
+
+STEPS = tuple(_SHARES.values())
+"""Budgets that make a difference, falling."""
+
+
+def step_within(budget: float) -> int:
+    """By how much bins are wider, for a share `budget` of the full work, 0...1."""
+    return next((step for step, share in _SHARES.items() if budget >= share), max(_SHARES))
 
 
 def bin_side(shape: tuple[int, int], work_budget: float) -> int:
