@@ -86,7 +86,7 @@ def _near_height_zero(_: Any) -> Any:
 
 _DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
 _CORRELATION = 'fitting/noise.py:_random'
-_NOISE = ('noise', 'error_law', 'quantisation')
+_NOISE = ('noise', 'error_law')
 _NORMALS = ('method', 'labelling', 'normals', 'directions')
 # Cost of a border that lets nothing merge by the energy.
 _NO_BORDER = -1e12
@@ -105,7 +105,7 @@ MECHANISMS = (
               _stated('white', 'correlation')),
     Mechanism('noise is correlated', f'{_CORRELATION} sensing/sensor.py:correlated_residuals',
               _sensor(white=lambda *_: 1.0, correlation=lambda *_: 0.0)),
-    Mechanism('quantisation found', 'fitting/quantisation.py',
+    Mechanism('quantisation found', 'fitting/noise.py:quantisation,_common_step',
               {'segmenter.quantisation': _returning((0.0, 0.0))}),
     Mechanism('noise of directions', 'sensing/sensor.py:tilt_variance', _zero('direction_noise')),
     Mechanism('errors in range', 'fitting/error_law.py:_scale_term,_deviance',

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
+from rangeseg_ros.core.by_planes.patches import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera

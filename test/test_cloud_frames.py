@@ -8,7 +8,7 @@ from clouds import scanned
 from message_classes import header, make_rosbags
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, Transform
-from rangeseg_ros.core.ground.classes import GROUND
+from rangeseg_ros.core.ground.cells import GROUND
 from rangeseg_ros.core.ground.points import drops, outlines
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 from rangeseg_ros.messages.outputs import OUTPUTS

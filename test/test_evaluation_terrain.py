@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.evaluation.detection import LEVEL, lower_bound
 from rangeseg_ros.io.cameras import write_camera

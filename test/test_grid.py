@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Config, RangeImage
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.points import thinned
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sequence import SequenceSegmenter

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.core.segmenter import Segmenter

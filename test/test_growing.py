@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
-from rangeseg_ros.core.by_planes.patches import find_patches
+from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts, least_contact
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config

@@ -16,7 +16,7 @@ from recordings import ROS2
 from ros_bench import DEPTH, INFO, Bench, values_of
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, corrected
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS

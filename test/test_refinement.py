@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes import labelling as refinement
-from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.patches import find_patches
+from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy, region_moments
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces

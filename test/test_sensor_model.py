@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.error_law import Strata, fit_law
-from rangeseg_ros.core.fitting.noise import ROUGH, measured_sensor
-from rangeseg_ros.core.fitting.quantisation import quantisation
+from rangeseg_ros.core.fitting.noise import ROUGH, measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.batch.frame_files import write_frame
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.stairs import StairsCheck, check_stairs, stairs_figures, stairs_line
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect

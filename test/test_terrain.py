@@ -7,7 +7,7 @@ from clouds import cloud_of
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage, Segmenter
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.scenes import Pose

@@ -15,8 +15,7 @@ from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.noise import measured_sensor
-from rangeseg_ros.core.fitting.quantisation import quantisation
+from rangeseg_ros.core.fitting.noise import measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from scipy.special import betaincinv
 
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.evaluation.terrain import Shares
 from rangeseg_ros.simulation.terrain.testpieces import PIECES
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.recfunctions import unstructured_to_structured
 
-from rangeseg_ros.core.ground.classes import GROUND, UNKNOWN
+from rangeseg_ros.core.ground.cells import GROUND, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundGrid, empty_grid
 from rangeseg_ros.core.rotations import rotation_matrix
 from rangeseg_ros.messages.clouds import POINT_TYPE, cloud_message

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground import points
-from rangeseg_ros.core.ground.classes import GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import GROUND, OBSTACLE
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.mapping.map_planes import moved_planes

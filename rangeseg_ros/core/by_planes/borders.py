@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import NODE
+from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.runtime.threads import run_rows

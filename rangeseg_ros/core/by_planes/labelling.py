@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import NODE
+from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import (
     LEAST_GAIN,
     NO_PLANE,

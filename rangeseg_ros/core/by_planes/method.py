@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import Nodes
 from rangeseg_ros.core.by_planes.labelling import refine
-from rangeseg_ros.core.by_planes.patches import find_patches
+from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces, unite_regions

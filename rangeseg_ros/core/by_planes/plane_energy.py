@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import NODE
+from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
 from rangeseg_ros.core.runtime.threads import map_halves

@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.blocks import NODE, Nodes
+from rangeseg_ros.core.by_planes.patches import NODE, Nodes
 from rangeseg_ros.core.by_planes.plane_energy import region_moments
 from rangeseg_ros.core.by_planes.posterior import PLANE_BEND
 from rangeseg_ros.core.by_planes.region_graph import (

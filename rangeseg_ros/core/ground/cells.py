@@ -18,13 +18,16 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.core.significance import OUTLIER
 
+UNKNOWN, GROUND, OBSTACLE, DROP = range(4)
+"""Values of `Segmentation.terrain`, what a measured point is to a robot that drives: not measured
+or not known, ground, in the way, below.
+"""
 # Rows of an image whose cells are 1 x 2 pixels.
 _ROWS = 120
 # Cells of a block of the ground continued, which is about square.

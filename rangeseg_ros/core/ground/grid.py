@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.cells import axes_of
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN, axes_of
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.significance import OUTLIER

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.shapes import TOLERANCE
-from rangeseg_ros.core.ground.classes import DROP, GROUND
+from rangeseg_ros.core.ground.cells import DROP, GROUND
 from rangeseg_ros.core.ground.terrain import Terrain
 from rangeseg_ros.core.sensing.clouds import completed_rays
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -19,7 +19,7 @@ MOST_POINTS = 20_000
 def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[np.float32]:
     """Points (N, 4) of the pixels of a class: x, y, z and height above the ground, metres.
 
-    In the frame of the image (H, W), in the order of the pixels; `kind` is one of `classes`.
+    In the frame of the image (H, W), in the order of the pixels; `kind` is `GROUND`, say.
     """
     where = terrain.classes == kind
     points = np.empty((np.count_nonzero(where), 4), np.float32)

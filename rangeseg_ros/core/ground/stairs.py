@@ -14,8 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.cells import axes_of
-from rangeseg_ros.core.ground.classes import GROUND
+from rangeseg_ros.core.ground.cells import GROUND, axes_of
 from rangeseg_ros.core.ground.terrain import CellTerrain, Terrain
 from rangeseg_ros.core.significance import OUTLIER, SAMPLES
 

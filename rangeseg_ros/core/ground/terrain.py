@@ -13,8 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.cells import Cells, GroundField, cells_of, classify, ground_field
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import (
+    DROP,
+    GROUND,
+    OBSTACLE,
+    UNKNOWN,
+    Cells,
+    GroundField,
+    cells_of,
+    classify,
+    ground_field,
+)
 from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -35,8 +44,8 @@ class CellTerrain(NamedTuple):
     """What the cells of an image are, (rows, columns), with the nearest row first.
 
     `place` (3, ...) and `error` (...) are those of `Cells`, `height` (...) is above the ground,
-    metres, NaN where not measured, `kind` (...) one of `classes`, and `crossing` (2, ...) where
-    the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
+    metres, NaN where not measured, `kind` (...) `GROUND` or another class, and `crossing` (2, ...)
+    where the ray crosses the ground continued, on the axes of `place`; NaN where it does not.
     """
 
     place: NDArray[np.float32]
@@ -52,7 +61,7 @@ class Terrain(NamedTuple):
     Attributes
     ----------
     classes : (H, W) uint8
-        See `classes`.
+        See `cells.GROUND`.
     height : (H, W) float32
         Metres along up above the ground; NaN where not measured or no ground is known.
     stand : Stand

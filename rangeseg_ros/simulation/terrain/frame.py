@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.simulation.sensors.sensor import Sensor
 from rangeseg_ros.simulation.solids import cast

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.simulation.solids import box
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, WIDE, Site, Terrain, Wave, slab
 

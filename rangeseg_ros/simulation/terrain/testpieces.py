@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.ground.classes import DROP, OBSTACLE
+from rangeseg_ros.core.ground.cells import DROP, OBSTACLE
 from rangeseg_ros.simulation.solids import box, cylinder
 from rangeseg_ros.simulation.terrain.scene import ALL, FAR, Site, Terrain, slab
 
