@@ -8,6 +8,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.scenes import Pose
 from rangeseg_ros.simulation.sensors.kinect import Kinect
@@ -115,3 +116,16 @@ def test_a_bridge_is_the_ground_and_not_what_is_beside_it():
     terrain = terrain_of(image, STATED, up, (height, 0.015), Config())
     assert share(terrain, frame, GROUND, GROUND) > 0.97
     assert share(terrain, frame, DROP, GROUND) < 0.01
+
+
+@pytest.mark.parametrize('metres', [1e4, 1e6, 1e8])
+def test_a_point_at_the_horizon_tells_no_height(metres):
+    """Level with the camera, where errors of the inverse range are none of the height."""
+    camera = Camera(2, 1, 1.0, 1.0, 1.0, 0.0)
+    up = np.array([0.0, -1.0, 0.0])
+    for beside in (0.0, 0.4 * metres, 0.8 * metres):
+        image = RangeImage.from_depth(np.array([[metres, beside]], np.float32), camera, 1.0)
+        for known in ((0.0, 0.0), (0.02, 0.015), (CAMERA, 0.015)):
+            terrain = terrain_of(image, STATED, up, known, Config())
+            assert not terrain.stand.found
+            assert not (terrain.classes == GROUND).any()
