@@ -8,7 +8,6 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
-from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.scenes import Pose
@@ -119,10 +118,14 @@ def test_a_bridge_is_the_ground_and_not_what_is_beside_it():
     assert share(terrain, frame, DROP, GROUND) < 0.01
 
 
-@pytest.mark.parametrize('depth', [[[1e6, 1e6]], [[1e6, 0]], [[1e6], [1.0]], [[5e5]]])
-def test_ground_that_is_too_far_to_tell_is_not_found(depth):
-    height, width = np.shape(depth)
-    camera = Camera(width, height, 1.0, 1.0, (width - 1) / 2, height - 1.5)
-    image = RangeImage.from_depth(np.array(depth), camera)
-    result = Segmenter(Config(up_y=-1.0, sensor_height=1.0)).segment(image)
-    assert not result.ground.stand.found and not (result.terrain == GROUND).any()
+@pytest.mark.parametrize('metres', [1e4, 1e6, 1e8])
+def test_a_point_at_the_horizon_tells_no_height(metres):
+    """Level with the camera, where errors of the inverse range are none of the height."""
+    camera = Camera(2, 1, 1.0, 1.0, 1.0, 0.0)
+    up = np.array([0.0, -1.0, 0.0])
+    for beside in (0.0, 0.4 * metres, 0.8 * metres):
+        image = RangeImage.from_depth(np.array([[metres, beside]], np.float32), camera, 1.0)
+        for known in ((0.0, 0.0), (0.02, 0.015), (CAMERA, 0.015)):
+            terrain = terrain_of(image, STATED, up, known, Config())
+            assert not terrain.stand.found
+            assert not (terrain.classes == GROUND).any()

@@ -97,9 +97,11 @@ def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) ->
         # The median: a cell on a jump edge scatters by more than noise.
         variance = np.maximum(random_variance(sensor, inverse**2), cv2.medianBlur(scatter[0], 5))
         error = np.where(inverse > 0, np.abs(place[0]) / inverse * np.sqrt(variance), 0)
+        rounding = np.finfo(np.float32).eps / inverse.astype(np.float64)
     whole = (inverse > 0) & (scatter <= OUTLIER * variance).all(axis=0)
     share = sensor.white / (size.rows * size.columns) + 1 - sensor.white
-    of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8, 0.0)
+    # No height is known better than it is computed, far away least of all.
+    of_mean = np.where(whole, error.astype(np.float64) ** 2 * share + 1e-8 + rounding**2, 0.0)
     return Cells(ray, inverse, place, error.astype(np.float32), of_mean, size, axes)
 
 

@@ -79,11 +79,7 @@ def continued(
     h, x, y = place
     distance = np.hypot(x, y)
     start = float(np.partition(distance, len(distance) // 100)[len(distance) // 100])
-    # About their middle, as cells may be so far away that all look like one; and from the height
-    # there to that below the camera.
-    middle = place[1:].mean(axis=1)
-    terms = np.stack([np.ones(len(x)), x - middle[0], y - middle[1], h])
-    back = np.append(1, -middle)
+    terms = np.stack([np.ones(len(x)), x, y, h])
     weighted = terms / (4 * variance)  # of a height, if all that errs alike were one measurement
     # The ground is level where it does not show its slope.
     prior = np.diag([1e-6, *2 * [4 / max(config.steepest, 1e-3) ** 2]])
@@ -95,7 +91,7 @@ def continued(
         # What the ground is off its plane goes on unseen: it tells two points, a way apart.
         off = np.append(-plane, 1)
         bent = (1 + 2 * start / way) * math.sqrt(max(off @ sums @ off, 0) / sums[0, 0])
-        sd = math.sqrt(height_sd**2 + back @ covariance @ back + bent**2)
-        a, b, c = float(back @ plane), *map(float, plane[1:])
+        sd = math.sqrt(height_sd**2 + covariance[0, 0] + bent**2)
+        a, b, c = map(float, plane)
         found.append(Continuation((a, b, c), sd, no_step(a, sd, config.least_step)))
     return max(found, key=lambda one: one.confidence)
