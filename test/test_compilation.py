@@ -1,8 +1,6 @@
 """Kernels compiled ahead: all that frames need, nothing else, by processes that do not collide."""
 
 import os
-import subprocess
-import sys
 from dataclasses import replace
 from functools import cache, partial
 from importlib import import_module
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 from clouds import cloud_of
 from numba import types
+from processes import python
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.compilation import preparation
@@ -115,9 +114,7 @@ Segmenter(Config(method='normals')).segment(image)
 def test_the_first_frame_says_that_kernels_are_compiled(tmp_path):
     """In Python, without the command line, as the configuration needs them."""
     environment = {**os.environ, 'NUMBA_CACHE_DIR': os.fspath(tmp_path)}
-    run = subprocess.run(
-        [sys.executable, '-c', FIRST_FRAME], capture_output=True, text=True, env=environment
-    )
+    run = python(FIRST_FRAME, env=environment)
     begin = 'rangeseg_ros: compiling kernels, once after the installation'
     assert run.stderr.splitlines() == [begin, "('image',), normals"]
 

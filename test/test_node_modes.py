@@ -1,8 +1,5 @@
 """The node under a lifecycle manager, at a target rate, and with a mask of the robot's body."""
 
-import subprocess
-import sys
-
 import cv2
 import numpy as np
 import pytest
@@ -11,6 +8,7 @@ pytest.importorskip('rclpy')
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from processes import python
 from rclpy.serialization import serialize_message
 from recordings import ROS2
 from ros_bench import DEPTH, INFO, Bench, values_of
@@ -71,13 +69,10 @@ print(*(publisher.topic_name for node in nodes for publisher in node.publishers
 sys.stdout.flush()
 os._exit(0)  # while kernels are being compiled
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    done = python(code)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split()[:2] == ['/front/segment_planes', '/rear/segment_planes']
-    assert done.stdout.split()[2:] == [
-        '/front/segment_planes/labels',
-        '/rear/segment_planes/labels',
-    ]
+    names = ['/front/segment_planes', '/rear/segment_planes']
+    assert done.stdout.split() == [*names, *(f'{name}/labels' for name in names)]
 
 
 @pytest.fixture(scope='module')

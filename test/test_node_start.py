@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
+from processes import python
 from ros_bench import DEPTH, INFO, NODE, Bench, ended, values_of
 
 from rangeseg_ros.ros.parameters import NodeConfig
@@ -25,12 +26,8 @@ QOS = f'qos_overrides.{DEPTH}.subscription'
 
 
 def test_where_there_is_no_rclpy_it_says_so():
-    code = (
-        'import sys\n'
-        "sys.modules['rclpy'] = None\n"
-        'from rangeseg_ros.start import segment_planes; segment_planes()'
-    )
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    code = "import sys; sys.modules['rclpy'] = None\n"
+    run = python(code + 'from rangeseg_ros.start import segment_planes; segment_planes()')
     assert run.returncode == 2
     assert run.stderr.startswith('segment_planes: no rclpy') and run.stderr.count('\n') == 1
 
@@ -89,8 +86,7 @@ for arguments in eval(sys.argv[1]):
 
 
 def test_bad_arguments_end_with_one_line():
-    command = [sys.executable, '-c', EACH_IN_A_FORK, repr([*BAD.values()])]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    run = python(EACH_IN_A_FORK, repr([*BAD.values()]))
     assert run.stdout.split() == ['2'] * len(BAD), run.stderr
     for line, words in zip(run.stderr.splitlines(), BAD, strict=True):
         assert line.startswith('segment_planes: ') and words in line
@@ -117,7 +113,7 @@ def test_without_a_place_for_log_files_it_starts_and_says_so():
 
 
 def test_help_names_every_parameter():
-    run = subprocess.run([*NODE, '--help'], capture_output=True, text=True, timeout=300)
+    run = python(NODE[-1], '--help')
     assert run.returncode == 0 and not run.stderr
     assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
 

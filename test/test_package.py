@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
+from processes import python
 
 from rangeseg_ros import __version__
 from rangeseg_ros.extras import EXTRAS
@@ -61,8 +62,7 @@ def test_segmenting_needs_no_library_of_an_extra():
     modules = 'cli.segment', 'cli.compile', 'notebook', 'core.sequence'
     code = ''.join(f'import rangeseg_ros.{name}\n' for name in modules)
     code += f'import sys; print(*set(sys.modules) & {set(EXTRAS)!r})'
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert not done.stdout.split()
+    assert python(code).stdout == '\n'
 
 
 def test_package_xml_names_the_messages_that_are_used():
@@ -146,10 +146,7 @@ def test_the_digest_follows_every_source_of_the_package(tmp_path):
 
     def digest():
         code = 'from rangeseg_ros.digest import code_digest; print(code_digest().hex())'
-        command = [sys.executable, '-c', code]
-        return subprocess.run(
-            command, cwd=tmp_path, capture_output=True, text=True, check=True
-        ).stdout
+        return python(code, cwd=tmp_path).stdout
 
     seen = {digest()}
     for name in ('core/config.py', 'io/tables.py', 'report/templates/replay.html'):
