@@ -350,30 +350,29 @@ def spoil_chunk(file, number):
 
 
 @pytest.fixture
-def chunks(tmp_path):
-    """A bag of 8 frames in several compressed chunks."""
-    recording = Recording()
-    for index, image in enumerate(depth_images(8, 480, 640)):
-        recording.add_camera(START + index * STEP, 640, 480)
-        recording.add_image(START + index * STEP, image)
-    recording.write(tmp_path / 'bag', compression='STORAGE')
+def packed(tmp_path):
+    """A bag with checksums, of 8 frames in 4 or 8 packed."""
+    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
+    with DepthBagWriter(tmp_path / 'bag', camera) as bag:
+        for index, image in enumerate(depth_images(8, 480, 640)):
+            bag.write(image, START + index * STEP)
     return tmp_path / 'bag'
 
 
-def test_a_damaged_chunk_costs_the_chunk(chunks):
-    (file,) = chunks.glob('*.mcap')
-    assert numbers_of(chunks)[0] == list(range(8))
+def test_a_damaged_chunk_costs_the_chunk(packed):
+    (file,) = packed.glob('*.mcap')
+    assert numbers_of(packed)[0] == list(range(8))
     spoil_chunk(file, 2)
-    numbers, bag = numbers_of(chunks)
+    numbers, bag = numbers_of(packed)
     assert 6 <= len(numbers) < 8 and numbers[-1] == 7
     assert bag.lost.total() == 8 - len(numbers) and 'damaged chunk' in bag.loss()
 
 
-def test_a_copy_leaves_out_a_bad_chunk(chunks, run):
-    (file,) = chunks.glob('*.mcap')
+def test_a_copy_leaves_out_a_bad_chunk(packed, run):
+    (file,) = packed.glob('*.mcap')
     spoil_chunk(file, 2)
-    out = chunks.parent / 'out'
-    code, _, error = run('replay', chunks, '--output', out, '--copy')
+    out = packed.parent / 'out'
+    code, _, error = run('replay', packed, '--output', out, '--copy')
     assert code == 1 and 'not copied' in error
     with DepthBag(out / 'bag') as bag:
         assert 6 <= len(list(bag)) < 8
@@ -386,16 +385,6 @@ def test_bags_without_any_good_frame_are_refused(tmp_path):
     recording.write(tmp_path / 'bag')
     with pytest.raises(BagError, match='64x20'):
         DepthBag(tmp_path / 'bag')
-
-
-@pytest.fixture
-def packed(tmp_path):
-    """A bag with checksums, of 8 frames in 4 or 8 chunks."""
-    camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5)
-    with DepthBagWriter(tmp_path / 'bag', camera) as bag:
-        for index, image in enumerate(depth_images(8, 480, 640)):
-            bag.write(image, START + index * STEP)
-    return tmp_path / 'bag'
 
 
 def without_index(whole):

@@ -30,11 +30,6 @@ def crease(noise=0.001):
     return inverse, np.where(left > right, 1, 2)
 
 
-def steps_and_slopes(step, slope):
-    blocks = -(-CAMERA.height // 4), -(-CAMERA.width // 4)
-    return np.full(blocks, step, np.float32), np.full(blocks, slope, np.float32)
-
-
 @pytest.mark.parametrize('cloud', [False, True])
 @pytest.mark.parametrize('holes', HOLES.values(), ids=HOLES)
 def test_holes_part_no_plane_and_stay_holes(holes, cloud):
@@ -49,25 +44,6 @@ def test_holes_part_no_plane_and_stay_holes(holes, cloud):
     for wall in (1, 2):
         found = result.labels[(truth == wall) & ~holes]
         assert np.bincount(found).max() > 0.95 * len(found)
-
-
-@pytest.mark.parametrize('gap', [1, 2, 3])
-def test_a_shadow_beside_a_jump_stays(gap):
-    inverse = np.where(COLUMNS < 80, 1.0, 0.5)
-    inverse[:, 80 : 80 + gap] = 0
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.001))
-    np.testing.assert_array_equal(whole.inverse, image.inverse)
-
-
-def test_what_is_bridged_lies_between_its_neighbours():
-    inverse, _ = crease(0.0)
-    holes = HOLES['every fourth column']
-    image = RangeImage(CAMERA.rays, np.where(holes, 0, inverse).astype(np.float32), CAMERA)
-    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
-    inner = holes & (COLUMNS < 159) & (np.abs(COLUMNS - 79.5) > 2)
-    np.testing.assert_allclose(whole.inverse[inner], inverse[inner], atol=1e-5)
-    np.testing.assert_array_equal(whole.inverse[~holes], image.inverse[~holes])
 
 
 def pairs_around(measured, i, j):
@@ -113,11 +89,7 @@ def test_a_hole_lies_between_two_of_its_row_column_or_diagonal(cloud):
     np.testing.assert_array_equal(whole.inverse[inverse > 0], inverse[inverse > 0])
 
 
-def test_wide_holes_stay_and_an_image_without_any_is_itself():
-    inverse, _ = crease(0.0)
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    assert bridge_holes(image, *steps_and_slopes(0.01, 0.01)) is image
-    inverse[40:60, 20:40] = 0
-    image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    whole = bridge_holes(image, *steps_and_slopes(0.01, 0.01))
-    assert not whole.inverse[42:58, 22:38].any()
+def test_an_image_without_holes_is_itself():
+    image = RangeImage(CAMERA.rays, crease()[0].astype(np.float32), CAMERA)
+    some = np.ones((30, 40), np.float32)
+    assert bridge_holes(image, some, some) is image

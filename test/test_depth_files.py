@@ -1,7 +1,6 @@
 """Depth in the files, folders and with the intrinsics that people have."""
 
 import json
-import shutil
 import sys
 
 import cv2
@@ -140,26 +139,6 @@ def test_intrinsics_of_numbers():
     assert Intrinsics(fov=90).of((48, 64)).fx == pytest.approx(32)
     with pytest.raises(ValueError, match='--camera FILE, --fov DEGREES'):
         Intrinsics().of((48, 64))
-
-
-def test_the_command_takes_folders_and_numbers(depth, tmp_path, run):
-    (tmp_path / 'in').mkdir()
-    np.save(tmp_path / 'in/a.npy', depth)
-    points = RangeImage.from_depth(depth, CAMERA).points
-    write_ply(tmp_path / 'in/b.ply', points)
-    out = tmp_path / 'out'
-    assert run('segment', tmp_path / 'in', '--fx', 60, '--output', out)[0] == 0
-    assert {path.name for path in out.glob('*_planes.csv')} == {'a_planes.csv', 'b_planes.csv'}
-    tum = tmp_path / 'tum/depth'
-    tum.mkdir(parents=True)
-    shutil.copy(tmp_path / 'in/a.npy', tum)
-    (tmp_path / 'tum/associations.txt').touch()
-    assert run('segment', tmp_path / 'tum', '--fov', 56, '--output', out / 'tum')[0] == 0
-    distance = [
-        float((folder / 'a_planes.csv').read_text().splitlines()[1].split(',')[6])
-        for folder in (out, out / 'tum')
-    ]
-    assert distance[0] == pytest.approx(5 * distance[1], rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -115,16 +115,6 @@ def choices(labels, free, values):
 SEEDS = range(25)
 
 
-@pytest.mark.parametrize('moves', ['expansion', 'swap'])
-@pytest.mark.parametrize('seed', SEEDS)
-def test_two_labels_give_the_optimum(seed, moves):
-    grid = Problem(seed, 3, 4, 2)
-    labelling = grid.labelling()
-    labelling.minimise(2, moves)
-    every = choices(grid.start, np.ones((3, 4), bool), (0, 1))
-    assert grid.energy(labelling.image) == pytest.approx(grid.energies(every).min())
-
-
 @pytest.mark.parametrize('seed', SEEDS)
 def test_each_move_is_the_best_of_its_space(seed):
     """From the definition: of a swap, the pixels of two labels; of an expansion, all to one."""

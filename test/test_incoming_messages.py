@@ -12,45 +12,27 @@ from hypothesis import given
 from hypothesis import strategies as st
 from message_classes import STORE, cloud, header, make_rosbags, needs_rclpy
 
-from rangeseg_ros import RangeImage, planes_from_message
-from rangeseg_ros.messages.cameras import camera_from_message
+from rangeseg_ros import Camera, RangeImage, planes_from_message
+from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import _POINT_FIELD_TYPES, points_from_message
 from rangeseg_ros.messages.images import depth_from_message
 from rangeseg_ros.messages.make import MessageError
 
 
-def camera_info(make=make_rosbags, **changes):
-    fields = {
-        'header': header(make),
-        'height': 480,
-        'width': 640,
-        'distortion_model': 'plumb_bob',
-        'd': [0.0] * 5,
-        'k': np.array([500.0, 0, 319, 0, 510, 239, 0, 0, 1]),
-        'r': np.eye(3).ravel(),
-        'p': np.zeros(12),
-        'binning_x': 0,
-        'binning_y': 0,
-        'roi': region(make),
-    }
-    return make('sensor_msgs/msg/CameraInfo', **{**fields, **changes})
-
-
-def region(make=make_rosbags, x_offset=0, y_offset=0, height=0, width=0):
-    return make(
-        'sensor_msgs/msg/RegionOfInterest',
-        x_offset=x_offset,
-        y_offset=y_offset,
-        height=height,
-        width=width,
-        do_rectify=False,
-    )
+def camera_info(make=make_rosbags, roi=None, **changes):
+    camera = Camera(640, 480, 500.0, 510.0, 319.0, 239.0)
+    message = camera_info_message(make, header(make), camera)
+    for name, value in {'p': np.zeros(12), **changes}.items():
+        setattr(message, name, value)
+    for name, value in (roi or {}).items():
+        setattr(message.roi, name, value)
+    return message
 
 
 @pytest.mark.parametrize('make', [make_rosbags, needs_rclpy])
 def test_camera_honours_binning_and_region(make):
     make = make() if make is needs_rclpy else make
-    roi = region(make, x_offset=100, y_offset=40, height=200, width=400)
+    roi = {'x_offset': 100, 'y_offset': 40, 'height': 200, 'width': 400}
     camera = camera_from_message(camera_info(make, binning_x=2, binning_y=2, roi=roi))
     assert camera.shape == (100, 200)
     assert (camera.fx, camera.fy) == (250, 255)

@@ -242,18 +242,3 @@ def test_no_link_joins_a_board_and_the_wall_behind_it(detector, steps, shadow, s
             depth, front = board(step, shadow, side, roll, turn)
             image = RangeImage.from_depth(depth, KINECT)
             assert mixed(flooded(image, config), front, image.valid) == 0, (step, roll, turn)
-
-
-@pytest.mark.parametrize('method', ['planes', 'normals'])
-@pytest.mark.parametrize('detector', ['sobel', 'plane'])
-@pytest.mark.parametrize('side', SIDES)
-def test_no_region_holds_a_board_and_the_wall_behind_it(side, detector, method):
-    """Down to the steps that the detector can see, but for a few pixels of a border."""
-    config = Config(method=method, jump_edges=detector, edge_step=EDGE_STEP, min_pixels=100)
-    for step, shadow in ((1.0, 12), (0.1, 1), (0.05, 0)):
-        depth, front = board(step, shadow, side, roll=5)
-        image = RangeImage.from_depth(depth, KINECT)
-        labels = Segmenter(config).segment(image).labels
-        judged = labels > 0
-        assert mixed(labels, front & judged, judged) <= 30, (step, shadow)
-        assert (front & judged).any(), (step, shadow)

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture(scope='module')
 def node():
-    with Bench('-p', 'stall_timeout:=3.0') as bench:
+    with Bench(stall_timeout=3.0) as bench:
         yield bench
 
 

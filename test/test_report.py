@@ -1,7 +1,6 @@
 """The pages of replay and evaluate: what they say, and what a browser makes of them."""
 
 import re
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote
@@ -12,7 +11,6 @@ from replays import record_walls, walls
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.batch.frame_files import write_frame
-from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
@@ -131,7 +129,7 @@ def test_each_plane_of_a_chart_has_a_fifth_of_an_inch():
     assert height(30) - height(10) == pytest.approx(20 * 0.2 * 72)
 
 
-def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch):
+def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch, run):
     monkeypatch.chdir(tmp_path)
     names = ['walls', 'torn #2']
     for name in names:
@@ -139,13 +137,9 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     file = next((tmp_path / names[1]).glob('*.mcap'))
     with file.open('r+b') as stream:
         stream.truncate(file.stat().st_size - 100)
-    arguments = ['rangeseg', 'replay', *names, '--output', 'out', '--jobs', '1']
     pages = []
     for _ in range(2):  # the second time, all is found done
-        monkeypatch.setattr(sys, 'argv', arguments)
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert end.value.code == 1
+        assert run('replay', *names, '--output', 'out', '--jobs', 1)[0] == 1
         pages.append((tmp_path / 'out/index.html').read_text(encoding='utf-8'))
     assert pages[0] == pages[1]
     page = Page(tmp_path / 'out/index.html')

@@ -68,21 +68,17 @@ def test_noise_free_png_is_rounded_and_bag_exact(tmp_path, run):
     assert np.abs(1000 * frame.depth - depth).max() <= 0.501
 
 
-def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, run):
-    output = tmp_path / 'rooms'
-    output.mkdir()
-    (output / 'precious').touch()
-    code, _, error = run('simulate', 'kinect', '--output', output)
-    assert code == 2 and 'exists already' in error
+def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, refused):
+    (tmp_path / 'rooms').mkdir()
+    (tmp_path / 'rooms/precious').touch()
+    assert 'exists already' in refused('simulate', 'kinect', '--output', tmp_path / 'rooms')
 
     def fail(*_arguments, **_options):
         raise OSError('disk full')
 
     monkeypatch.setattr('rangeseg_ros.cli.simulate.write_image', fail)
-    code, _, error = run(
-        'simulate', 'kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other'
-    )
-    assert code == 2 and 'disk full' in error
+    words = 'simulate', 'kinect', '--scenes', 1, *SMALL, '--output', tmp_path / 'other'
+    assert 'disk full' in refused(*words)
     assert [path.name for path in tmp_path.iterdir()] == ['rooms']
 
 
@@ -90,9 +86,9 @@ def test_nothing_is_overwritten_or_left_half_written(tmp_path, monkeypatch, run)
     ('option', 'value'),
     [('--noise', 'loud'), ('--scenes', 0), ('--seed', -1), ('--width', 1), ('--scene', 'desert')],
 )
-def test_bad_option(tmp_path, option, value, run):
-    code, _, error = run('simulate', 'kinect', option, value, '--output', tmp_path / 'rooms')
-    assert code == 2 and option in error and str(value) in error
+def test_bad_option(tmp_path, option, value, refused):
+    error = refused('simulate', 'kinect', option, value, '--output', tmp_path / 'rooms')
+    assert option in error and str(value) in error
     assert not any(tmp_path.iterdir())
 
 
