@@ -55,31 +55,21 @@ def test_planes_read_back_as_they_were():
     message = planes_message(make_rosbags, header(), [stated_plane(1), stated_plane(2)])
     assert (message.height, message.width) == (1, 2)
     planes = planes_from_message(message)
-    np.testing.assert_array_equal(planes['label'], [1, 2])
-    np.testing.assert_array_equal(planes['id'], [101, 102])
-    np.testing.assert_array_equal(planes['count'], [1000, 2000])
-    np.testing.assert_array_equal(planes['x'], [0.25, 0.5])
-    np.testing.assert_array_equal(planes['normal_z'], [-1, -1])
-    np.testing.assert_array_equal(planes['distance'], [2, 2])
+    assert [ROLES[number] for number in planes['role']] == ['floor', 'wall']
     covariance = {
         f'covariance_{row}{column}': 4 * i + j
         for i, row in enumerate('xyzd')
         for j, column in enumerate('xyzd')
         if i <= j
     }
-    np.testing.assert_array_equal(planes['surface'], [1, 2])
-    assert [ROLES[number] for number in planes['role']] == ['floor', 'wall']
-    np.testing.assert_array_equal(planes['confidence'], np.float32([0.9, 0.9]))
     for column, value in {
-        'probability': 0.75,
-        'length': 2,
-        'width': 1.5,
-        'centre_y': 0.25,
-        'orientation_x': 1,
-        'orientation_w': 0,
+        **{'label': [1, 2], 'id': [101, 102], 'surface': [1, 2], 'count': [1000, 2000]},
+        **{'x': [0.25, 0.5], 'normal_z': -1, 'distance': 2, 'length': 2, 'width': 1.5},
+        **{'confidence': np.float32(0.9), 'probability': 0.75, 'centre_y': 0.25},
+        **{'orientation_x': 1, 'orientation_w': 0},
         **covariance,
     }.items():
-        np.testing.assert_array_equal(planes[column], [value, value])
+        np.testing.assert_array_equal(planes[column], np.broadcast_to(value, 2), column)
 
 
 @pytest.mark.parametrize(

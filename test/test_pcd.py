@@ -89,26 +89,15 @@ def test_damaged_lzf_is_refused(data):
         (lambda d: d.replace(b'WIDTH 3', b'WIDTH 10000000000'), 'truncated'),
         (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 1 99999999999'), 'malformed'),
         (lambda d: d.replace(b'COUNT 1 1 3', b'COUNT 1 1 ' + b'9' * 5000), 'malformed'),
+        (lambda d: encoded('ascii')[:-4], 'malformed'),
+        (lambda d: encoded('binary_compressed')[:-5], 'truncated'),
+        (lambda d: HEADER.format('binary_compressed').encode() + bytes(4), 'malformed'),
     ],
 )
 def test_malformed(tmp_path, change, fault):
     path = tmp_path / 'bad.pcd'
     path.write_bytes(change(encoded('binary')))
-    with pytest.raises(FileError, match=fault) as error:
+    # The folder has the name of the test: words of it prove nothing.
+    with pytest.raises(FileError, match=rf'^{path}: .*{fault}') as error:
         read_pcd(path)
-    assert str(path) in str(error.value) and '\n' not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ('kind', 'cut', 'fault'),
-    [
-        ('ascii', 4, 'malformed'),
-        ('binary_compressed', 5, 'truncated'),
-        ('binary_compressed', 200, 'truncated'),
-    ],
-)
-def test_truncated(tmp_path, kind, cut, fault):
-    path = tmp_path / 'bad.pcd'
-    path.write_bytes(encoded(kind)[:-cut])
-    with pytest.raises(FileError, match=fault):
-        read_pcd(path)
+    assert '\n' not in str(error.value)
