@@ -3,6 +3,7 @@
 import os
 import pickle
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from processes import python
@@ -98,6 +99,17 @@ def test_folders_that_the_user_names_come_first_but_where_others_can_write(
     assert ('poison' in run.stdout) == (mode == 0o1777)
     told = 'is not used' in run.stderr
     assert told == (variable == 'NUMBA_CACHE_DIR' and mode != 0o1777)
+
+
+@pytest.mark.parametrize(
+    ('mode', 'group', 'private'),
+    [(0o770, 0, True), (0o770, 1, False), (0o755, 1, True), (0o702, 0, False)],
+)
+def test_a_group_with_the_number_of_its_user_is_the_user(monkeypatch, mode, group, private):
+    user = os.getuid()
+    found = SimpleNamespace(st_uid=user, st_gid=user + group, st_mode=mode)
+    monkeypatch.setattr(Path, 'lstat', lambda path: found)
+    assert cache._private(Path('/somewhere/else')) == private
 
 
 def test_help_needs_no_place_to_write_to():

@@ -1,5 +1,6 @@
 """Learning the distortion of a sensor: against a known field, what cannot be, and the command."""
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -10,10 +11,11 @@ from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.core.calibration.calibrate import (
     CalibrationError,
     _blocks,
+    _deviation,
     calibrate,
     without_plane,
 )
-from rangeseg_ros.core.calibration.field import _roughness, solve
+from rangeseg_ros.core.calibration.field import _roughness, residuals, robust_weights, solve
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
 from rangeseg_ros.io.bag_writer import BagWriter, DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
@@ -190,6 +192,66 @@ def test_joint_solution_is_that_of_dense_least_squares():
     assert without_plane(found.reshape(grid), known) == pytest.approx(
         expected, abs=0.02 * rms(expected)
     )
+
+
+def test_weights_follow_what_planes_leave():
+    """As robust deviations of planes and residuals have it, with 5 of 6 planes alike."""
+    cells = seen(3, true_map())
+    noisy = cells.plane() == 1
+    draw = np.random.default_rng(0)
+    inverse = cells.inverse + draw.normal(0, np.where(noisy, 0.05, 0.0005))
+    cells = cells._replace(inverse=inverse)
+    error = draw.normal(0, 0.001, len(inverse))
+    left = inverse - error
+    for k in range(len(cells.frame)):
+        own = cells.plane() == k
+        ray = cells.ray[own]
+        left[own] -= ray @ np.linalg.lstsq(ray, left[own], rcond=None)[0]
+    np.testing.assert_allclose(residuals(cells, inverse - error), left, atol=1e-8)
+    size = [max(np.median(abs(left[cells.plane() == k])), np.median(abs(left))) for k in range(6)]
+    spread = 1.4826 * np.array(size)[cells.plane()]
+    expected = (1.4826 * np.median(abs(left)) / spread) ** 2 / (1 + (left / spread / 2.385) ** 2)
+    np.testing.assert_allclose(robust_weights(cells, error), expected, rtol=1e-5)
+
+
+def test_deviations_are_those_of_a_jackknife_and_the_bias():
+    draw, known = np.random.default_rng(1), np.ones((12, 16), bool)
+    known[:, 13:] = False
+    fields, bias = draw.normal(size=(5, 12, 16)), 0.3 * draw.normal(size=(12, 16))
+    left = np.stack([without_plane(field, known) for field in (*fields, bias)])
+    squares = 4 * left[:5].var(axis=0) + left[5] ** 2
+    # Means over the cells around, of those that are known.
+    weights = np.zeros((12, 16, 12, 16))
+    for place in np.ndindex(12, 16):
+        one = np.zeros((12, 16))
+        one[place] = known[place]
+        weights[place] = cv2.GaussianBlur(one, (0, 0), 5.0)
+    expected = np.tensordot(squares, weights, 2) / weights.sum(axis=(0, 1))
+    np.testing.assert_allclose(_deviation(fields, bias, known) ** 2, expected * known, rtol=1e-9)
+
+
+def test_sightings_are_means_of_cells_inside_a_plane():
+    """Cells of 2 x 2 pixels, two from any other region, without what is five deviations off."""
+    draw, camera = np.random.default_rng(6), Camera(80, 60, 73.0, 70.0, 39.0, 30.0)
+    labels = np.ones(camera.shape, np.uint16)
+    labels[:, 41:], labels[20:23, :9] = 2, 0
+    inverse = camera.rays @ np.array([0.1, -0.1, 0.5]) + draw.normal(0, 1e-3, camera.shape)
+    inverse[draw.random(camera.shape) < 0.2] = 0
+    inverse[30, 10:20] *= 1.03
+    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    cells = find_sightings(labels, image)
+    expected = []
+    for label in (1, 2):
+        rim = cv2.dilate((labels != label).astype(np.uint8), np.ones((5, 5), np.uint8))
+        own = (rim == 0) & image.valid & ~(image.inverse > camera.rays @ [0.1, -0.1, 0.5] + 0.007)
+        for number, (i, j) in enumerate(np.ndindex(30, 40)):
+            part = np.s_[2 * i : 2 * i + 2, 2 * j : 2 * j + 2]
+            if np.count_nonzero(own[part]) >= 2:
+                ray = camera.rays[part][own[part]].mean(axis=0)
+                expected.append([number, image.inverse[part][own[part]].mean(), *ray])
+    found = np.column_stack([cells.cell, cells.inverse, cells.ray])
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+    assert (cells.frame.tolist(), cells.frames, len(cells.start)) == ([0, 0], 1, 3)
 
 
 def test_smoothness_does_not_punish_what_is_free():

@@ -120,13 +120,39 @@ def test_bars_break_where_a_plane_is_out_of_sight():
     assert charts.runs(np.arange(10)) == [(0, 9)]
 
 
-def test_each_plane_of_a_chart_has_a_fifth_of_an_inch():
-    def height(count):
-        seen = sightings(*((0, number, 1.0, 2.0) for number in range(count)))
-        picture = charts.id_bars(seen, np.array([0.0]))
-        return float(re.search(r'<svg [^>]*height="([.\d]+)pt"', picture)[1])
+@pytest.fixture
+def times(monkeypatch):
+    """Seconds of frames; charts give their figure."""
+    monkeypatch.setattr(charts, 'svg', lambda figure: figure)
+    return np.arange(10) * 0.5
 
-    assert height(30) - height(10) == pytest.approx(20 * 0.2 * 72)
+
+def test_bars_are_as_long_as_planes_are_in_sight(times):
+    seen = sightings(*((frame, number, 1.0, 2.0) for frame in (1, 2, 5) for number in (4, 9)))
+    figure = charts.id_bars(seen, times)
+    (axes,) = figure.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ['4', '9']
+    assert figure.get_size_inches().tolist() == [10, 1.2 + 0.2 * 2]
+    for row, bars in enumerate(axes.collections):
+        spans = [path.get_extents().extents.tolist() for path in bars.get_paths()]
+        assert spans == [[0.5, row - 0.4, 1.5, row + 0.4], [2.5, row - 0.4, 3.0, row + 0.4]]
+    (bars,) = charts.id_bars(sightings((0, 4, 1.0, 2.0)), times[:1]).axes[0].collections
+    assert bars.get_paths()[0].get_extents().width == 1
+
+
+def test_drifts_are_told_from_medians_and_break_where_a_plane_is_out_of_sight(times):
+    seen = sightings((0, 5, 1.0, 2.0), (1, 5, 1.0, 2.01), (4, 5, 1.0, 2.03))
+    tilted = 0.0, np.sin(0.02), -np.cos(0.02)
+    seen['normal'][1] = tilted
+    upper, lower = charts.drifts(seen, times).axes
+    for axes, expected in (
+        (upper, [-10, 0, np.nan, 20]),
+        (lower, [0, np.degrees(0.02), np.nan, 0]),
+    ):
+        (line,) = axes.lines
+        np.testing.assert_allclose(line.get_xdata(), [0, 0.5, np.nan, 2])
+        np.testing.assert_allclose(line.get_ydata(), expected, atol=1e-6)
+    assert lower.get_ylim()[0] == 0
 
 
 def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch, run):

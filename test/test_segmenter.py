@@ -185,6 +185,14 @@ def test_noise_free_patches_are_found_to_the_pixel():
     np.testing.assert_array_equal(found[known], minimise_exactly(*arguments)[known])
 
 
+def test_the_first_of_the_nearest_directions_is_taken():
+    normals = np.random.default_rng(1).normal(size=(6, 7, 3)).astype(np.float32)
+    normals[0], normals[1] = 0, np.nan
+    expected = (np.nan_to_num(normals) @ DIRECTIONS.T).argmax(axis=2)
+    found = coarse_to_fine.nearest_directions(normals, DIRECTIONS)
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize('shape', [(1, 1), (1, 30), (7, 9), (8, 16)])
 def test_any_size_of_image(shape):
     normals = np.tile(DIRECTIONS[5].astype(np.float32), (*shape, 1))

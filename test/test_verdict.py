@@ -9,7 +9,12 @@ import pytest
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
 from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.enlargement import enlargement, interpolation, replication
-from rangeseg_ros.core.sensing.verdict import filled_share, judge
+from rangeseg_ros.core.sensing.verdict import (
+    _share_of_range,
+    filled_share,
+    improbable_scale,
+    judge,
+)
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
@@ -154,6 +159,50 @@ def test_filled_holes_are_told_with_their_share(seen, axis):
         filled[k] = np.where(filled[k] == 0, filled[k - 1], filled[k])
     image = RangeImage.from_depth(np.swapaxes(filled, 0, axis), seen.camera)
     assert 0.01 < filled_share(image) <= holes
+
+
+@pytest.mark.parametrize(
+    ('run', 'jump', 'share'), [(6, 1.06, 0.03), (4, 0.5, 0.02), (3, 0.5, 0), (6, 1.04, 0)]
+)
+def test_what_copies_its_neighbour_up_to_a_jump_was_filled(run, jump, share):
+    draw, (height, width) = np.random.default_rng(2), (400, 200)
+    inverse = draw.uniform(0.5, 0.502, (height, width))
+    inverse[:, 101 - run : 101] = inverse[:, 100:101]
+    inverse[:, 101:] *= jump
+    camera = Camera(width, height, 200.0, 200.0, 99.5, 199.5)
+    for turned in (inverse, inverse[:, ::-1]):
+        image = RangeImage(camera.rays, turned.astype(np.float32), camera)
+        assert filled_share(image) == pytest.approx(share)
+
+
+def levels(steps):
+    """Range image of inverse ranges so many steps apart, each of 4 x 4 pixels."""
+    inverse = np.kron(np.cumsum([0.1, *steps])[None], np.ones((4, 4))).astype(np.float32)
+    return RangeImage(np.ones((*inverse.shape, 3), np.float32), inverse)
+
+
+@pytest.mark.parametrize('factor', [5.0, 0.2, 10.0, 0.1, 1000.0, 0.001, 1.0])
+def test_units_are_told_by_the_steps_of_a_kinect(factor):
+    step, told = 1 / (8 * 580 * 0.075) / factor, 0 if factor == 1 else factor
+    for off, count, expected in ((1.04, 40, told), (0.94, 40, 0), (1.0, 20, told), (1.0, 19, 0)):
+        assert improbable_scale(levels([off * step] * count)) == expected
+    # Half of the steps are even within a tenth, or less than half.
+    assert improbable_scale(levels([1.05 * step, step, 0.95 * step, 1.2 * step] * 10)) == told
+    assert (
+        improbable_scale(levels([step, 1.2 * step, 1.2 * step, 0.8 * step, 0.8 * step] * 9)) == 0
+    )
+
+
+def test_planes_tell_their_share_of_the_bend_of_ranges():
+    draw = np.random.default_rng(3)
+    rays = np.column_stack([draw.uniform(-0.5, 0.5, (2, 400)).T, np.ones(400)])
+    theta = np.array([0.1, -0.2, 0.5])
+    for share in (0, 0.5, 1):
+        inverse = (rays @ theta) * (1 + share * (1 / np.linalg.norm(rays, axis=1) - 1))
+        inverse += draw.normal(0, 1e-4, 400)
+        inverse[:20] += 0.1
+        found, variance = _share_of_range(rays, inverse, theta)
+        assert abs(found - share) < 4 * variance**0.5 < 0.02
 
 
 def test_curved_surfaces_keep_their_pixels():
