@@ -12,6 +12,7 @@ from rangeseg_ros.simulation.render import NOT_PLANAR, visible_regions
 from rangeseg_ros.simulation.scenes import Pose, Scene
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, prism, sphere
+from rangeseg_ros.simulation.terrain.scene import Site
 
 ORIGIN = np.zeros(3)
 UPRIGHT = np.eye(3)
@@ -134,6 +135,13 @@ def test_truth_ids_persist_while_the_camera_moves():
         moved = faces[plane.face]
         assert moved.normal == pytest.approx(turn @ plane.normal)
         assert moved.distance == pytest.approx(plane.distance - turn @ plane.normal @ shift)
+
+
+def test_a_wall_of_a_terrain_is_as_far_as_it_says():
+    site = Site('', 0)
+    site.wall(3.0)
+    distance, _ = cast([site.pieces[0].solid], (0, 0, 1), [(1, 0, 0), (0, 1, 0)])
+    assert distance.tolist() == [3, np.inf]
 
 
 def test_pose_looks_where_it_says():
