@@ -11,10 +11,13 @@ from planes_of_labels import stated_plane
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Camera, RangeImage, Segmentation, planes_from_message
+from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
+from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.ground.roles import ROLES
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
 from rangeseg_ros.messages.clouds import planes_message
+from rangeseg_ros.messages.grids import grid_message, grid_points_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.markers import (
     ARROW_LENGTH,
@@ -131,6 +134,27 @@ def test_bytes_of_markers_are_those_of_the_message(drawn):
         assert [(p.x, p.y, p.z) for p in read.points] == list(map(tuple, marker.points))
         assert (read.pose.position.z, read.scale.y, read.color.b) == (3.0, 0.2, 0.75)
         assert read.header == header()
+
+
+@pytest.mark.parametrize('frame', ['map', ''])
+def test_cells_of_a_grid_are_where_its_axes_say(frame):
+    classes = np.array([[GROUND, UNKNOWN], [OBSTACLE, DROP], [GROUND, UNKNOWN]], np.uint8)
+    height = np.array([[0.3, np.nan], [0.4, np.nan], [np.nan, 0.5]], np.float32)
+    others = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+    turn = Rotation.from_euler('z', 90, degrees=True).as_quat()
+    grid = GroundGrid(classes, height, *others, 0.5, np.array([10.0, 20, 0.2]), turn, frame)
+    message = grid_message(make_rosbags, header(), grid)
+    assert message.data.tolist() == [0, -1, 100, 100, 0, -1]
+    assert (message.info.width, message.info.height, message.info.resolution) == (2, 3, 0.5)
+    assert message.header.frame_id == (frame or 'optical')
+    # Columns go along y here, and rows against x.
+    points = grid_points_message(make_rosbags, header(), grid).data.view('<f4').reshape(-1, 6)
+    expected = [[9.75, 20.25], [9.25, 20.25], [9.25, 20.75], [8.75, 20.25]]
+    np.testing.assert_allclose(points[:, :2], expected)
+    known = [0.3, 0.4, 0.2, 0.2] if frame else [0.2] * 4
+    np.testing.assert_allclose(points[:, 2], known)
+    np.testing.assert_array_equal(points[:, [3, 5]], others[:, classes != UNKNOWN].T)
+    assert points[:, 4].view('<u4').tolist() == [GROUND, OBSTACLE, DROP, GROUND]
 
 
 def message_of(planes):

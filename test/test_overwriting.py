@@ -4,12 +4,14 @@ import json
 import os
 import shutil
 import stat
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 from replays import record_walls, results
 
+from rangeseg_ros.cli.options import check_replaceable
 from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
@@ -58,6 +60,15 @@ def test_segment_replaces_no_input_and_nothing_without_being_told(folder, run, r
     assert planes.read_text() == 'mine'
     assert run(*segment, 'out', '--overwrite')[0] == 0
     assert planes.read_text() != 'mine'
+
+
+def test_what_begins_as_a_result_does_may_be_replaced(tmp_path):
+    path = tmp_path / 'file'
+    check_replaceable(path, b'{')
+    for content, refused in ((b'', False), (b'{}', False), (b'mine', True)):
+        path.write_bytes(content)
+        with pytest.raises(OSError, match='exists') if refused else nullcontext():
+            check_replaceable(path, b'{')
 
 
 def test_figures_replace_figures_alone(folder, run, refused):

@@ -186,6 +186,7 @@ def test_colours_can_be_told_apart():
     assert distance.min() > 5 * 2.3
     assert np.hypot(lab[:, 1], lab[:, 2]).min() > 5 * 2.3  # nor taken for grey
     np.testing.assert_array_equal(colours([5, 9, 49]), palette[[4, 8, 0]])
+    assert palette[0].argmax() == 2, 'blue'
 
 
 def test_unlabelled_pixels_stay_grey_and_labelled_ones_have_their_colour():
@@ -216,6 +217,21 @@ def test_colours_follow_ids_not_labels():
         overlay(inverse, one, [plane]), overlay(inverse, 2 * one, [other])
     )
     assert (overlay(inverse, one, [plane]) != overlay(inverse, one)).any()
+
+
+def test_an_id_is_written_where_its_region_is_widest():
+    labels = np.zeros((240, 320), np.uint16)
+    labels[:220, 20:40] = labels[100:220, 20:140] = 1
+    labels[:, 200:206] = 2
+    planes = [SimpleNamespace(label=1, id=8), SimpleNamespace(label=2, id=8)]
+    picture = overlay(np.full(labels.shape, 0.5, np.float32), labels, planes)
+    white = (picture > 200).all(axis=2)
+    rows, columns = np.nonzero(white)
+    assert (rows.mean(), columns.mean()) == pytest.approx((160.5, 78), abs=1.5)
+    (wide, high), _ = cv2.getTextSize('8', cv2.FONT_HERSHEY_SIMPLEX, 0.8, 1)
+    assert high / 2 < np.ptp(rows) < high and wide / 3 < np.ptp(columns) < wide
+    outline = cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)) > white
+    assert picture[outline].max(axis=1).mean() < 80, 'dark around'
 
 
 def test_what_is_near_is_bright_between_the_extremes():
