@@ -132,7 +132,7 @@ def test_node_and_replay_place_the_same_planes_whatever_becomes_of_tf(tmp_path, 
 
     for n in range(count):
         stamp = 10**18 + n * 60_000_000
-        recording.add_camera(stamp, 160, 120, k=k, p=np.insert(k, (3, 6, 9), 0.0))
+        recording.add_camera(stamp, 160, 120, k=k)
         recording.add_image(stamp, depth)
         # The last one is the first to tell where the image is, whatever comes first.
         group = sample(n, -10_000_000), sample(n - 1, 30_000_000), sample(n, 10_000_000)
