@@ -14,9 +14,10 @@ from rangeseg_ros import Camera, RangeImage, Segmentation, planes_from_message
 from rangeseg_ros.core.ground.classes import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.grid import GroundGrid
 from rangeseg_ros.core.ground.roles import ROLES
+from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.messages.cameras import camera_from_message, camera_info_message
-from rangeseg_ros.messages.clouds import planes_message
+from rangeseg_ros.messages.clouds import planes_message, stairs_message
 from rangeseg_ros.messages.grids import grid_message, grid_points_message
 from rangeseg_ros.messages.images import depth_from_message, image_message
 from rangeseg_ros.messages.markers import (
@@ -24,7 +25,9 @@ from rangeseg_ros.messages.markers import (
     LINE_STRIP,
     Marker,
     markers_bytes,
+    of_outline,
     of_planes,
+    of_stairs,
 )
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -155,6 +158,24 @@ def test_cells_of_a_grid_are_where_its_axes_say(frame):
     np.testing.assert_allclose(points[:, 2], known)
     np.testing.assert_array_equal(points[:, [3, 5]], others[:, classes != UNKNOWN].T)
     assert points[:, 4].view('<u4').tolist() == [GROUND, OBSTACLE, DROP, GROUND]
+
+
+def test_stairs_and_the_outline_of_the_ground():
+    edge = np.array([[1.0, 2, 3], [3.0, 2, 5]])
+    stairs = [Stairs(edge, 2.5, 4, 0.17, 0.28, way) for way in ('up', 'down')]
+    message = stairs_message(make_rosbags, header(), stairs)
+    assert (message.height, message.width) == (1, 2)
+    points = message.data.view('<f4').reshape(2, -1)
+    expected = [2, 2, 4, *edge.ravel(), 2.5, 0.17, 0.28]
+    np.testing.assert_allclose(points[:, :-2], [expected] * 2, rtol=1e-6)
+    assert points[:, -2:].view('<i4').tolist() == [[4, 1], [4, -1]]
+    line, text, *_ = of_stairs(stairs)
+    assert (line.namespace, line.number, line.kind) == ('edges', 0, LINE_STRIP)
+    np.testing.assert_array_equal(line.points, edge)
+    assert (text.namespace, text.text) == ('stairs', 'up 4 x 0.17 / 0.28 m')
+    assert text.position == (2, 2, 4)
+    (ring,) = of_outline([np.eye(3)])
+    np.testing.assert_array_equal(ring.points, np.eye(3)[[0, 1, 2, 0]])
 
 
 def message_of(planes):
