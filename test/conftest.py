@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 
+import numpy as np
 import pytest
 import yaml
 from hypothesis import settings
@@ -13,6 +14,7 @@ from hypothesis import settings
 # on a busy machine. To be set before NumPy is imported, here and in the processes tests start.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
 
+from rangeseg_ros import Camera
 from rangeseg_ros.cli.main import main
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import write_image
@@ -46,6 +48,29 @@ def run(monkeypatch, capsys):
         return done.value.code or 0, output, error.replace(f'{COMPILES}\n', '')
 
     return run_command
+
+
+@pytest.fixture
+def refused(run):
+    """Run a command that ends with code 2, one line on standard error and none on the other."""
+
+    def run_command(*arguments):
+        code, output, error = run(*arguments)
+        assert (code, output, error.count('\n')) == (2, '', 1)
+        assert error.startswith('rangeseg: ')
+        return error
+
+    return run_command
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Working folder with camera.yaml and two depth images, one of them of a wall."""
+    monkeypatch.chdir(tmp_path)
+    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
+    write_image(tmp_path / 'depth' / '2.png', np.full((48, 64), 1500, np.uint16))
+    write_image(tmp_path / 'depth' / '10.png', np.zeros((48, 64), np.uint16))
+    return tmp_path
 
 
 @pytest.fixture

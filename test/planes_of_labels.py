@@ -1,9 +1,37 @@
-"""Planes of labels that a test knows, without a segmentation."""
+"""Planes without a segmentation: of labels that a test knows, and of stated values."""
 
+import numpy as np
+
+from rangeseg_ros import Plane
 from rangeseg_ros.core.description.planes import describe_regions
+from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.mapping.map_planes import MapOutline
+
+SQUARE = ((-1, -1, 2), (-1, 1, 2), (1, 1, 2), (1, -1, 2))
 
 
 def fit_planes(labels, image, sensor):
     """Plane of every region, fitted and described as those of a segmentation."""
     return describe_regions(labels, image, Fits.of(labels, image, sensor))
+
+
+def stated_plane(label, hull=SQUARE, holes=()):
+    """A region of the plane z = 2 m."""
+    centre, orientation = np.array([0.0, 0.25, 2.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    return Plane(
+        label=label,
+        id=label + 100,
+        surface=label,
+        role=('other', 'floor', 'wall')[label % 3],
+        normal=np.array([0.0, 0.0, -1.0]),
+        distance=2.0,
+        covariance=np.arange(16.0).reshape(4, 4),
+        centroid=np.array([0.25 * label, 0.5, 2.0]),
+        count=1000 * label,
+        rms=0.003,
+        confidence=0.9,
+        probability=0.75,
+        shape=Shape(4.0, np.array([2.0, 1.5]), centre, orientation),
+        outline=MapOutline([[np.array(ring, float).reshape(-1, 3) for ring in (hull, *holes)]]),
+    )

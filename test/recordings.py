@@ -70,7 +70,7 @@ class Recording:
         model='plumb_bob',
         **changes,
     ):
-        k = np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1])
+        k = changes.get('k', np.array([focal, 0, 31.5, 0, focal, 23.5, 0, 0, 1]))
         matrices = {
             'd': np.zeros(5),
             'k': k,

@@ -12,9 +12,11 @@ from contextlib import contextmanager
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
+from message_classes import cdr
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosbags import rosbag2
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from rangeseg_ros.messages.make import message_class
@@ -40,6 +42,16 @@ def corner_depth(camera):
     return np.round(1000 * 2 / (1 + np.abs(x))).astype(np.uint16)
 
 
+def assert_replayed(bench, folder, topics, count):
+    """The node has published, byte for byte, what a replay has written into a folder."""
+    with rosbag2.Reader(folder / 'bag') as bag:
+        written = [(connection.topic, bytes(data)) for connection, _, data in bag.messages()]
+    for name, kind in topics.items():
+        published = [cdr(message, kind) for message in bench.received[name]]
+        replayed = [data for topic, data in written if topic == f'/segment_planes/{name}']
+        assert len(replayed) == count and published == replayed, name
+
+
 def values_of(status):
     """Values of a diagnostic status by their keys."""
     return {value.key: value.value for value in status.values}
@@ -58,15 +70,25 @@ def ended(process):
 class Bench:
     """Starts `segment_planes` and talks to it."""
 
-    def __init__(self, *arguments, camera=None, namespace='', name='segment_planes', command=None):
+    def __init__(
+        self,
+        *arguments,
+        camera=None,
+        namespace='',
+        name='segment_planes',
+        command=None,
+        **parameters,
+    ):
         self.camera = camera or kinect_camera(160, 120)
+        self.topics = [f'/{namespace}{topic}'.replace('//', '/') for topic in (DEPTH, INFO)]
+        set_to = [word for name in parameters for word in ('-p', f'{name}:={parameters[name]}')]
         self.received = {name: [] for name in [*TYPES, 'diagnostics']}
         command = command or NODE
         self.inputs = set()
         self.spins = False
         self.errors = tempfile.TemporaryFile('w+')  # noqa: SIM115
         self.process = subprocess.Popen(
-            [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *arguments],
+            [*command, '--ros-args', '-r', f'__ns:=/{namespace}', *arguments, *set_to],
             start_new_session=True,
             stderr=self.errors,
         )
@@ -116,8 +138,9 @@ class Bench:
             self.node.destroy_publisher(publisher)
 
     @contextmanager
-    def camera_on(self, image_topic=DEPTH, info_topic=INFO, kind=Image, qos=RELIABLE):
+    def camera_on(self, image_topic=None, info_topic=None, kind=Image, qos=RELIABLE):
         """Advertise depth and camera_info, and wait for the subscriptions of the node."""
+        image_topic, info_topic = image_topic or self.topics[0], info_topic or self.topics[1]
         with (
             self.advertised(kind, image_topic, qos) as self.depth,
             self.advertised(CameraInfo, info_topic, qos) as self.camera_info,

@@ -4,7 +4,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import subprocess
 import sys
 import threading
 import time
@@ -13,6 +12,7 @@ import warnings
 import cv2
 import numpy as np
 import pytest
+from processes import python
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
@@ -61,7 +61,7 @@ def in_another_process(function, **environment):
     """What a function of this module returns there."""
     environment = {**os.environ, 'PYTHONPATH': os.pathsep.join(sys.path), **environment}
     code = f'import json, test_determinism as t; print(json.dumps(t.{function.__name__}()))'
-    return json.loads(subprocess.check_output([sys.executable, '-c', code], env=environment))
+    return json.loads(python(code, env=environment).stdout)
 
 
 def test_another_process_gives_the_same_bits(digests):
@@ -235,7 +235,7 @@ def test_a_program_ends_after_its_tasks():
         'cv2.setNumThreads(2); submit(lambda: (time.sleep(0.5), print("over", flush=True)))\n'
         'time.sleep(0.1)'
     )
-    ended = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    ended = python(program)
     assert (ended.returncode, ended.stdout) == (0, 'over\n')
 
 

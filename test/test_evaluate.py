@@ -1,14 +1,19 @@
-"""`rangeseg evaluate` on small scenes whose regions and planes are known exactly."""
+"""`rangeseg evaluate` and `compare` on scenes whose regions and planes are known exactly."""
 
 import csv
+import importlib
+import re
+import sys
 from functools import partial
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from corner_set import CAMERA, LEFT, RIGHT, corner, depth_and_truth, segcomp_set
-from dataset_files import literal_lzf
+from dataset_files import literal_lzf, raster
 
+from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.measure import (
@@ -20,7 +25,41 @@ from rangeseg_ros.evaluation.measure import (
     class_picture,
 )
 from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.segcomp import abw_calibration
+
+CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
+# Two walls that meet in the vertical line x = 0, z = 2.
+LEFT = np.array([np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
+RIGHT = np.array([-np.sqrt(0.5), 0.0, -np.sqrt(0.5), 2 * np.sqrt(0.5)])
+
+
+def corner(rays):
+    """Distance along rays from the origin to a corner of two walls, and labels 1 and 2."""
+    reach = np.stack([-plane[3] / (rays @ plane[:3]) for plane in (LEFT, RIGHT)])
+    reach[reach <= 0] = np.inf
+    return reach.min(axis=0), (reach.argmin(axis=0) + 1).astype(np.uint16)
+
+
+def depth_and_truth():
+    depth, truth = corner(CAMERA.rays.astype(float))
+    depth = np.rint(1000 * depth).astype(np.uint16)
+    depth[:6], truth[:6] = 0, 0
+    return depth, truth
+
+
+def segcomp_set(folder):
+    """One ABW test image of the corner, 1.1 times nearer, with its truth and its angle."""
+    folder.mkdir()
+    calibration = abw_calibration(1)
+    rays = calibration.camera.rays.astype(float)
+    depth, truth = corner(rays)
+    values = (500 * depth - calibration.offset) * calibration.scale
+    values = np.rint(values).clip(1, 255).astype(np.uint8)
+    (folder / 'abw.test.1.range').write_bytes(raster(values))
+    (folder / 'abw.test.1.gt-seg').write_bytes(raster((truth + 9).astype(np.uint8)))
+    (folder / 'abw.test.1.gt-ang').write_text('1\n10 11 90.0\n')
+    return folder
 
 
 @pytest.fixture
@@ -154,24 +193,156 @@ def test_labelled_scan(tmp_path):
     assert distance == pytest.approx(0, abs=1e-5)
 
 
-def refuse(result, *parts):
-    code, figures, _, err = result
-    assert code == 2 and figures is None
-    assert err.count('\n') == 1
-    for part in parts:
-        assert str(part) in err
+def test_refusals_of_evaluate(simulated, refused, tmp_path):
+    def error(folder):
+        return refused('evaluate', folder, '--jobs', 1)
 
-
-def test_refusals(simulated, evaluate, tmp_path):
     assert cv2.imwrite(str(simulated / 'truth/000002.png'), np.ones((4, 5), np.uint16))
-    refuse(evaluate(simulated), '000002.png', 'truth is 5x4', '96x72')
+    assert re.search('000002.png: .*truth is 5x4.*96x72', error(simulated))
     (simulated / 'truth' / '000010.png').unlink()
-    refuse(evaluate(simulated), '000010.png', 'no ground truth')
+    assert '000010.png: no ground truth' in error(simulated)
     folder = tmp_path / 'annotated'
     folder.mkdir()
-    refuse(evaluate(folder), folder, 'known layout')
+    assert re.search(f'{folder}: .*known layout', error(folder))
     for name, image in zip(('depth', 'truth'), depth_and_truth(), strict=True):
         assert cv2.imwrite(str(folder / f'{name}.png'), image)
     for text in ('1 2 3', 'nan 1 1 1'):
         (folder / 'camera.txt').write_text(text)
-        refuse(evaluate(folder), 'camera.txt')
+        assert 'camera.txt' in error(folder)
+
+
+def write(path, labels):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    image = np.array(labels, np.uint16)
+    if path.suffix == '.png':
+        assert cv2.imwrite(str(path), image)
+    else:
+        path.write_bytes(raster(image.astype(np.uint8)))
+    return path
+
+
+def test_two_png_files(tmp_path, figures_of):
+    # Truth 1: 4 pixels, all in found 5 (5 pixels): (1, 0.8). Truth 2: 3 pixels, 2 in found 6.
+    truth = write(tmp_path / 'truth.png', [[1, 1, 1, 1, 2, 2, 2, 0]])
+    labels = write(tmp_path / 'labels.png', [[5, 5, 5, 5, 5, 6, 6, 0]])
+    code, figures, *_ = figures_of('compare', truth, labels, '--tolerance', '0.8', '0.9')
+    assert code == 0
+    names = 'regions', 'correct', 'over', 'under', 'missed', 'noise', 'mean_iou', 'pixel_accuracy'
+    shares = pytest.approx((4 / 5 + 2 / 3) / 2), pytest.approx(6 / 7)
+    assert figures['tolerances'] == {
+        '0.8': dict(zip(names, (2, 1, 0, 0, 1, 1, *shares), strict=True)),
+        '0.9': dict(zip(names, (2, 0, 0, 0, 2, 2, *shares), strict=True)),
+    }
+
+
+def test_rasters_count_regions_from_ten(tmp_path, figures_of):
+    # 0-3 are no regions on either side, so nothing is noise.
+    truth = write(tmp_path / 'abw.test.1.gt-seg', [[10, 10, 2, 3], [11, 11, 0, 1]])
+    labels = write(tmp_path / 'abw.test.1.ms-seg', [[12, 12, 3, 2], [10, 10, 1, 0]])
+    code, figures, *_ = figures_of('compare', truth, labels)
+    assert code == 0
+    assert list(figures['tolerances']) == ['0.51', '0.6', '0.7', '0.8', '0.9', '0.95']
+    row = figures['tolerances']['0.95']
+    assert (row['regions'], row['correct'], row['noise']) == (2, 2, 0)
+
+
+def test_folders_are_paired_by_name_and_summed(tmp_path, figures_of):
+    write(tmp_path / 'gt/2_truth.png', [[1, 1, 0]])
+    write(tmp_path / 'gt/10_truth.png', [[1, 2, 0]])
+    write(tmp_path / 'ms/2_depth_labels.png', [[1, 1, 0]])
+    write(tmp_path / 'ms/10_depth_labels.png', [[0, 2, 3]])
+    write(tmp_path / 'ms/10_depth_overlay.png', [[9, 9, 9]])
+    code, figures, *_ = figures_of(
+        'compare', tmp_path / 'gt', tmp_path / 'ms', '--tolerance', '0.8'
+    )
+    assert code == 0
+    assert figures['images'] == 2
+    row = figures['tolerances']['0.8']
+    assert (row['regions'], row['correct'], row['missed'], row['noise']) == (3, 2, 1, 1)
+    # Over all three regions and four pixels, not the mean of two images.
+    assert row['mean_iou'] == pytest.approx(2 / 3)
+    assert row['pixel_accuracy'] == pytest.approx(3 / 4)
+    assert list(figures['per_image']) == ['2', '10']
+    assert figures['per_image']['10']['tolerances']['0.8']['missed'] == 1
+
+
+NONE = 65535
+# Found 7 has four pixels, of which one is not judged and one judged curved: 2 / 3. Without 65535
+# in the truth every pixel counts: 2 / 4.
+CURVED, FLAT, WIDE = [1, 1, 0, NONE, NONE], [1, 1, 0, 0, 0], [7, 7, 7, 7, 0]
+# Found 8 has 2 of its 6 pixels on truth 1, the rest is not judged; 7 has the other 8.
+RIM, PARTS = [1] * 10 + [0] * 4 + [NONE], [7] * 8 + [8] * 6 + [0]
+# Half of its 4 judged: it counts, whatever its size.
+HALF = [7] * 8 + [8] * 4 + [0] * 3
+
+
+@pytest.mark.parametrize(
+    ('truth', 'labels', 'least', 'expected'),
+    [
+        (CURVED, WIDE, 1, {'regions': 1, 'noise': 1, 'mean_iou': pytest.approx(2 / 3)}),
+        (FLAT, WIDE, 1, {'mean_iou': 1 / 2}),
+        (RIM, PARTS, 1, {'correct': 0, 'over': 1, 'noise': 0}),
+        (RIM, PARTS, 3, {'correct': 1, 'over': 0, 'noise': 0}),
+        (RIM, HALF, 3, {'over': 1}),
+        ([1, 1, 1, 2], [1, 1, 1, 0], 1, {'missed': 1}),
+        ([1, 1, 1, 2], [1, 1, 1, 0], 2, {'regions': 1, 'missed': 0}),
+        ([0, 0], [0, 0], 1, {'mean_iou': None}),
+    ],
+)
+def test_what_is_not_judged_or_too_small_does_not_count(
+    tmp_path, figures_of, truth, labels, least, expected
+):
+    truth, labels = (write(tmp_path / f'{k}.png', [row]) for k, row in enumerate((truth, labels)))
+    row = figures_of('compare', truth, labels, '--min-pixels', least)[1]['tolerances']['0.8']
+    assert {name: row[name] for name in expected} == expected
+
+
+def test_refusals_of_compare(tmp_path, refused):
+    one, wide = write(tmp_path / 'gt/1.png', [[1]]), write(tmp_path / 'wide.png', [[1, 1]])
+    extra = [write(tmp_path / f'ms/{k}.png', [[1]]) for k in (1, 2)][1]
+    for words, *arguments in (
+        *(('above 0.5', one, one, '--tolerance', value) for value in ('0.5', '1.2', '80', 'nan')),
+        ('differ in size', wide, one),
+        ('two files or two folders', one, one.parent),
+        (f'{extra}: no ground truth', one.parent, extra.parent),
+        (f'{extra}: no segmentation', extra.parent, one.parent),
+    ):
+        assert words in refused('compare', *arguments)
+
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture
+def experiments(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / 'docs'))
+    return importlib.import_module('experiments')
+
+
+@pytest.mark.parametrize(('name', 'count'), [('lambda', 2 * 3), ('comparison', 3 * 6 + 9)])
+def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
+    monkeypatch.setattr(experiments, 'LAMBDAS', (20.0, 85.0, 150.0))
+    folder = segcomp_set(tmp_path / 'abw')
+    words = [name, folder, '--output', tmp_path / 'out', '--jobs', 1]
+    monkeypatch.setattr(sys, 'argv', ['experiments.py', *map(str, words)])
+    experiments.main()
+    with (tmp_path / f'out/{name}.csv').open(newline='') as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == count
+    assert (tmp_path / f'out/{name}.png').stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ('sensor', 'changes'),
+    [
+        ('perceptron', {}),
+        ('abw', {'dithering': 0.001}),
+        ('kinect', {'smoothness': 100.0, 'noise_regions': 'leave'}),
+    ],
+)
+def test_parameter_files_hold_the_published_settings(sensor, changes):
+    path = ROOT / 'params' / f'thesis_{sensor}.yaml'
+    thesis = {'method': 'normals', 'normal_baseline': 1, 'jump_edges': 'sobel', 'min_pixels': 2}
+    assert read_config(path) == Config(**{**thesis, 'smoothness': 55.0, **changes})
+    # Whatever the defaults become.
+    assert {*thesis, 'smoothness'} <= set(read_params(path))

@@ -138,11 +138,9 @@ def test_the_height_in_the_table_is_told_unless_it_shall_not_be(drawn, evaluate)
         (lambda folder: change(folder, ',-1,2,,,,', ''), 'malformed table'),
     ],
 )
-def test_errors_are_one_line(drawn, evaluate, damage, says):
+def test_errors_are_one_line(drawn, refused, damage, says):
     damage(drawn)
-    code, figures, _, err = evaluate(drawn)
-    assert code == 2 and figures is None
-    assert len(err.splitlines()) == 1 and says in err
+    assert says in refused('evaluate', drawn, '--jobs', 1)
 
 
 def cut(path):

@@ -1,18 +1,20 @@
-"""Depth images, cameras, parameter files and plane tables: what is read back, what is refused."""
+"""Images, cameras, parameters and tables: what is read back, and refused in one line."""
 
 import csv
+import os
 import resource
-from dataclasses import fields
+import struct
+import zlib
+from dataclasses import fields, replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
+from planes_of_labels import stated_plane
 
-from rangeseg_ros import CameraError, Config, ConfigError, Plane
+from rangeseg_ros import CameraError, Config, ConfigError
 from rangeseg_ros.cli.errors import one_line
-from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import (
@@ -22,6 +24,7 @@ from rangeseg_ros.io.images import (
 )
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.tables import columns, open_table, values
+from rangeseg_ros.io.yaml_files import read_yaml
 
 
 def test_what_is_no_depth_image_is_named(tmp_path):
@@ -149,8 +152,6 @@ def test_the_parameter_files_of_the_package_are_valid():
         ('- 1', 'not a mapping'),
         ('a: [', 'not a YAML file'),
         ('smoothnes: 3', "unknown parameter 'smoothnes'; is 'smoothness' meant"),
-        ('smoothness: -3', r'smoothness must be in \[0, 10000\]'),
-        ('smoothness: soft', 'smoothness must be of type float'),
         ('3: 4', 'unknown parameter 3'),
         ('node: {ros__parameters: {smoothness: 1.0}}', 'no ros__parameters of segment_planes'),
         ('segment_planes: {ros__parameters: [1, 2]}', 'no mapping'),
@@ -171,42 +172,129 @@ def test_bad_parameters_are_named(tmp_path, content, message):
         read_params(tmp_path / 'none.yaml')
 
 
-TRIANGLE = np.array([[0.0, 0, 1], [1, 0, 1], [0, 1, 1]])
-
-
-def _plane(**changes):
-    """Plane of arbitrary values in all fields, whatever fields there are."""
-    values = {
-        'label': 1,
-        'normal': np.array([0.0, 0.6, -0.8]),
-        'covariance': np.arange(16.0).reshape(4, 4),
-        'centroid': np.array([0.1, 0.2, 1.7]),
-        'shape': Shape(
-            area=1.5,
-            extents=np.array([2.0, 1.0]),
-            centre=np.array([0.3, 0.4, 1.8]),
-            orientation=np.array([0.1, 0.2, 0.3, 0.4]),
-        ),
-        'outline': SimpleNamespace(hull=TRIANGLE, holes=[TRIANGLE, TRIANGLE]),
-        **changes,
-    }
-    return Plane(**{field.name: values.get(field.name, 1.5) for field in fields(Plane)})
-
-
 def test_plane_table(tmp_path):
     path = tmp_path / 'planes.csv'
     with open_table(path, ['frame', *columns()]) as append:
         assert path.read_text() == ','.join(['frame', *columns()]) + '\n'
-        append([0, *values(plane)] for plane in (_plane(), _plane(label=2)))
+        append([0, *values(plane)] for plane in (stated_plane(1), stated_plane(2)))
         append([])
-        append([[2, *values(_plane(distance=1 / 3))]])
+        append([[2, *values(replace(stated_plane(1), distance=1 / 3))]])
         with path.open() as file:  # on disk before the table is closed
             rows = list(csv.DictReader(file))
     assert [(row['frame'], row['label']) for row in rows] == [('0', '1'), ('0', '2'), ('2', '1')]
-    assert [float(rows[0][f'normal_{axis}']) for axis in 'xyz'] == [0.0, 0.6, -0.8]
+    assert [float(rows[0][f'normal_{axis}']) for axis in 'xyz'] == [0.0, 0.0, -1.0]
     assert float(rows[0]['covariance_yd']) == 7.0  # normal_y with distance
     assert float(rows[2]['distance']) == pytest.approx(1 / 3, rel=1e-8)
-    assert rows[0]['hull'] == '0 0 1;1 0 1;0 1 1'
+    assert rows[0]['hull'] == '-1 -1 2;-1 1 2;1 1 2;1 -1 2'
     assert all(None not in row and None not in row.values() for row in rows)
     # No array is written as numpy prints it.
     assert not any('[' in value for row in rows for value in row.values())
+
+
+def grown(part, whole):
+    """A small file whose aliases stand for millions of nodes."""
+    lines = [f'a{k}: &a{k} ' + whole.format(9 * part.format(f'*a{k - 1}')) for k in range(1, 9)]
+    return '\n'.join(['a0: &a0 {y: 1}', *lines])
+
+
+def test_aliases_are_read(tmp_path):
+    path = tmp_path / 'file.yaml'
+    path.write_text('a: &a {x: 1, y: 2}\nb: {<<: *a, y: 3}\nc: [*a, *a]')
+    a = {'x': 1, 'y': 2}
+    assert read_yaml(path) == {'a': a, 'b': {'x': 1, 'y': 3}, 'c': [a, a]}
+
+
+@pytest.mark.parametrize(
+    ('content', 'message'),
+    [
+        ('[' * 20000, 'nested too deeply'),
+        ('a: ' + 'x' * 2**21, 'too large'),
+        ('a: 2001-99-99', 'not a YAML file'),
+        ('a: \x00', 'not a YAML file'),
+        (grown('{}, ', '{{x: [{}]}}'), 'too often'),
+        (grown('{}, ', '{{<<: [{}]}}'), 'too often'),
+        (
+            f'a: &a {{{"".join(f"{k}: 1, " for k in range(3000))}}}\nb: [{"*a, " * 9000}]',
+            'too often',
+        ),
+    ],
+)
+def test_yaml_that_would_take_for_ever(tmp_path, content, message):
+    path = tmp_path / 'file.yaml'
+    path.write_text(content)
+    with pytest.raises(FileError, match=message) as caught:
+        read_yaml(path)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
+
+
+def test_pipes_are_not_waited_for(folder, refused):
+    os.mkfifo('pipe')
+    seen = 'depth/2.png'
+    for image, camera in (('pipe', 'camera.yaml'), (seen, 'pipe'), (seen, '/dev/zero')):
+        error = refused('segment', image, '--camera', camera, '--output', 'out')
+        assert 'not a regular file' in error
+
+
+def test_a_shared_file_may_name_parameters_of_other_nodes(tmp_path):
+    path = tmp_path / 'file.yaml'
+    path.write_text('/**: {ros__parameters: {min_pixels: 7, exposure: 3, use_sim_time: true}}')
+    with pytest.warns(UserWarning, match='left out exposure'):
+        assert read_config(path) == Config(min_pixels=7)
+
+
+def test_numbers_of_numpy_are_taken():
+    config = Config(noise=np.float32(0.5), min_pixels=np.int64(7), exact=np.bool_(True))
+    assert config == Config(noise=0.5, min_pixels=7, exact=True)
+    kinds = [type(getattr(config, name)) for name in ('noise', 'min_pixels', 'exact')]
+    assert kinds == [float, int, bool]
+    with pytest.raises(ConfigError, match='type int'):
+        Config(min_pixels=np.float64(7.0))
+
+
+def png(width, height, data, bits=16):
+    def part(name, content):
+        crc = struct.pack('>I', zlib.crc32(name + content))
+        return struct.pack('>I', len(content)) + name + content + crc
+
+    header = struct.pack('>IIBBBBB', width, height, bits, 0, 0, 0, 0)
+    return b'\x89PNG\r\n\x1a\n' + part(b'IHDR', header) + part(b'IDAT', data) + part(b'IEND', b'')
+
+
+def test_sizes_are_checked_before_images_are_decoded(tmp_path, monkeypatch):
+    (tmp_path / 'large.png').write_bytes(png(9000, 9000, zlib.compress(bytes(10**6))))
+    cv2.imwrite(str(tmp_path / 'large.tiff'), np.zeros((300, 400), np.uint16))
+    monkeypatch.setattr(cv2, 'imdecode', None)
+    for name, size in (('large.png', '9000x9000'), ('large.tiff', '400x300')):
+        with pytest.raises(FileError, match=f'is {size}, its camera 64x48'):
+            read_depth(tmp_path / name, (48, 64))
+
+
+def test_damaged_images_are_one_line(tmp_path, capfd):
+    write_image(
+        tmp_path / 'a.png', np.random.default_rng(0).integers(0, 9999, (48, 64)).astype('u2')
+    )
+    whole = (tmp_path / 'a.png').read_bytes()
+    random = np.random.default_rng(1)
+    for number in range(60):
+        data = bytearray(whole)
+        data[random.integers(len(data))] ^= 1 << int(random.integers(8))
+        (tmp_path / 'b.png').write_bytes(
+            data if number % 2 else data[: random.integers(len(data))]
+        )
+        with pytest.raises(FileError):
+            read_depth(tmp_path / 'b.png')
+    assert capfd.readouterr().err == ''
+
+
+def test_of_several_pages_the_first_is_read_with_a_word(tmp_path):
+    pages = [np.full((3, 4), number, np.uint16) for number in (1, 2, 3)]
+    cv2.imwritemulti(str(tmp_path / 'a.tiff'), pages)
+    with pytest.warns(UserWarning, match='first of 3 pages'):
+        image = read_depth(tmp_path / 'a.tiff')
+    assert (image == 1).all()
+
+
+def test_errors_are_one_line_of_printable_characters():
+    assert one_line(ValueError('a\nb\x00\x1b[31m')) == 'a\\nb\\x00\\x1b[31m'
+    assert one_line(MemoryError()) == 'not enough memory'
+    assert one_line(FileNotFoundError(2, 'No such file', 'x')) == 'x: No such file'

@@ -37,22 +37,13 @@ class Drive:
         )
 
     def grid(self, x, second, pieces=(FLOOR, LANDING, BOX)):
-        pose = replace_position(self.pose, (x, 0, HEIGHT))
+        pose = replace(self.pose, position=np.array([x, 0, HEIGHT]))
         scene = Terrain('', tuple(pieces), (slab(-3, FAR, 0, 0, ALL),), pose)
         frame = simulate_terrain(scene, Kinect(), CAMERA, seed=int(second))
         told = Transform(pose.rotation, pose.position + np.array([0, 0, GROUND_IN_MAP]))
         at = told if self.sequence.config.map_frame else None
         image = RangeImage.from_depth(frame.depth, CAMERA)
         return self.sequence.segment(image, int(1e9 * second), pose=at).grid
-
-
-def replace_position(pose, position):
-    position = np.array(position, float)
-    return (
-        pose._replace(position=position)
-        if hasattr(pose, '_replace')
-        else replace(pose, position=position)
-    )
 
 
 def at(grid, x, y, values=None):

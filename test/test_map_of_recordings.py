@@ -10,6 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.io.files import FileError
+from rangeseg_ros.io.poses import match_poses, read_pose
+from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 
 FRAMES, STEP = 6, 0.05
@@ -100,3 +104,101 @@ def test_poses_in_files_become_a_map(tmp_path, run):
     code, told, error = run('replay', bag, *options, '--output', out)
     assert code == 0 and f'{FRAMES} frames, 2 planes in the map' in told, error
     check(out)
+
+
+CAMERA = """
+image_width: 64
+image_height: 48
+camera_matrix: {rows: 3, cols: 3, data: [60, 0, 31.5, 0, 60, 23.5, 0, 0, 1]}
+"""
+FRAME = 'camera_depth_optical_frame'
+
+
+@pytest.fixture
+def folders(tmp_path):
+    (tmp_path / 'camera.yaml').write_text(CAMERA)
+    images, poses = tmp_path / 'images', tmp_path / 'poses'
+    images.mkdir()
+    poses.mkdir()
+    for k in range(6):
+        cv2.imwrite(str(images / f'frame-{k:06d}.depth.png'), np.full((48, 64), 900, np.uint16))
+    return images, poses
+
+
+@pytest.fixture
+def pack(folders, run):
+    """Pack the images with their poses: the bag, and what is said."""
+
+    def run_command(*options):
+        images, poses = folders
+        bag = images.parent / 'bag'
+        files = '--camera', images.parent / 'camera.yaml', '--poses', poses, '--output', bag
+        code, output, error = run('pack', images, *files, *options)
+        assert code == 0, error
+        return bag, output
+
+    return run_command
+
+
+def some_pose(k):
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_rotvec([0.3 * k, 0.1, -0.7]).as_matrix()
+    pose[:3, 3] = k, -1, 0.5
+    return pose
+
+
+def test_poses_become_transforms_at_the_stamps_of_their_images(folders, pack):
+    for k in range(6):
+        np.savetxt(folders[1] / f'frame-{k}.pose.txt', some_pose(k))
+    bag, output = pack('--rate', '10')
+    assert output.splitlines()[-2:] == [f'{bag}: 6 images', '6 poses']
+    with RecordedTransforms(bag, timeout=0.0) as transforms:
+        for k in range(6):
+            stamp = 10**9 + k * 10**8
+            found = transforms.lookup('world', FRAME, stamp, stamp)
+            np.testing.assert_allclose(found.rotation, some_pose(k)[:3, :3], atol=1e-9)
+            np.testing.assert_allclose(found.shift, some_pose(k)[:3, 3], atol=1e-9)
+            # Not known before it was recorded.
+            with pytest.raises(TransformError, match='that late'):
+                transforms.lookup('world', FRAME, stamp + 5 * 10**7, stamp)
+
+
+def test_what_is_missing_or_no_pose_is_counted_and_said(folders, pack):
+    values = [some_pose(k) for k in range(6)]
+    values[1][0, 0] = np.nan
+    values[2][:3, :3] *= 1.5
+    values[3][:3, 0] *= -1
+    for k in (0, 1, 2, 3):
+        np.savetxt(folders[1] / f'{k}.txt', values[k])
+    (folders[1] / '4.txt').write_text('1 2 three')
+    bag, output = pack()
+    assert '1 poses, 5 without: 1.txt: values are not finite, and 4 more' in output
+    with RecordedTransforms(bag, timeout=1.0) as transforms:
+        transforms.lookup('world', FRAME, 10**9, 10**9)
+        with pytest.raises(TransformError):
+            transforms.lookup('world', FRAME, 2 * 10**9, 2 * 10**9)
+
+
+def test_poses_are_found_by_stem_or_else_by_number(tmp_path):
+    for name in ('a1.txt', 'b2.pose.txt', 'pose_0003.txt', 'notes.md'):
+        (tmp_path / name).write_text('')
+    images = [tmp_path / name for name in ('a1.png', 'b2.png', 'frame3.depth.tiff', 'frame4.png')]
+    found = match_poses(images, tmp_path)
+    assert {i.name: p.name for i, p in found.items()} == {
+        'a1.png': 'a1.txt',
+        'b2.png': 'b2.pose.txt',
+        'frame3.depth.tiff': 'pose_0003.txt',
+    }
+    (tmp_path / 'other-3.txt').write_text('')
+    with pytest.raises(FileError, match=r'may belong to other-3.txt or pose_0003.txt'):
+        match_poses(images, tmp_path)
+    with pytest.raises(FileError, match=r'no \.txt files'):
+        match_poses(images, tmp_path / 'nowhere')
+
+
+def test_a_pose_is_read_whatever_separates_its_numbers(tmp_path):
+    path = tmp_path / 'pose.txt'
+    path.write_text(', '.join(f'{value:.9f}' for value in some_pose(2).ravel()))
+    found = read_pose(path)
+    assert isinstance(found, Transform)
+    np.testing.assert_allclose(found.rotation, some_pose(2)[:3, :3], atol=1e-8)

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import BEST_EFFORT, DEPTH, INFO, Bench, corner_depth, values_of
+from ros_bench import DEPTH, INFO, Bench, corner_depth, values_of
 from sensor_msgs.msg import PointCloud2
 
 from rangeseg_ros import planes_from_message
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture(scope='module')
 def node():
-    with Bench('-p', 'stall_timeout:=3.0') as bench:
+    with Bench(stall_timeout=3.0) as bench:
         yield bench
 
 
@@ -76,9 +76,7 @@ def test_camera_info_of_another_frame_is_used_with_a_warning(bench):
 @pytest.mark.parametrize(
     'fields, words',
     [
-        ({'encoding': 'rgb8'}, 'rgb8'),
         ({'data': array('B', bytes(1000))}, '1000 bytes'),
-        ({'width': 161}, '161x120'),
         ({'height': 2**32 - 1}, '4294967295'),
     ],
 )
@@ -113,17 +111,6 @@ def test_size_and_encoding_change_in_midstream(bench):
         labels = bench.segment(bench.image(depth, encoding), bench.info(camera))
         assert labels.shape == (height, width)
         assert len(set(labels.ravel()) - {0}) == (0 if width == 1 else 2)
-
-
-def test_publisher_goes_and_comes_back(node):
-    with node.listening('labels'):
-        with node.camera_on():
-            assert_segments(node)
-        error_about(node, 'no depth message')
-        with node.camera_on(qos=BEST_EFFORT):
-            assert node.stream().any()
-        with node.camera_on():
-            assert_segments(node)
 
 
 def test_a_topic_of_another_type_is_told(node):

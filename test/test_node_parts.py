@@ -16,44 +16,41 @@ from rangeseg_ros.ros.pairing import KEPT, Found, StampPairing
 from rangeseg_ros.ros.ticket_lock import TicketLock
 
 
-def test_one_of_the_same_stamp_wins_over_a_later_one():
+@pytest.mark.parametrize(
+    'events',
+    [
+        # One of the same stamp wins over a later one.
+        ['add 1 a', 'add 2 b', 'find 1 a own'],
+        # An image waits for its own once a pair was seen.
+        ['find 1', 'add 1 a', 'find 1 a own', 'find 2', 'add 2 b', 'find 2 b own'],
+        # One whose own never comes takes the last; and those after it do not wait, until one turns
+        # out to have been too early.
+        [
+            'add 1 a',
+            'find 1 a own',
+            'find 2',
+            'give up',
+            'find 2 a',
+            'find 3 a',
+            'add 3 c',
+            'find 4',
+        ],
+        # Sent once per session, or without a stamp.
+        ['add 1 a', 'find 5 a', 'find 6 a'],
+        ['add 0 a', 'add 0 b', 'find 0 b', 'find 0 b'],
+    ],
+)
+def test_which_camera_info_an_image_gets(events):
     pairing = StampPairing()
-    pairing.add(1, 'a')
-    pairing.add(2, 'b')
-    assert pairing.find(1) == Found('a', True)
-
-
-def test_an_image_waits_for_its_own_once_a_pair_was_seen():
-    pairing = StampPairing()
-    assert pairing.find(1) is None
-    pairing.add(1, 'a')
-    assert pairing.find(1) == Found('a', True)
-    assert pairing.find(2) is None
-    pairing.add(2, 'b')
-    assert pairing.find(2) == Found('b', True)
-
-
-def test_an_image_whose_own_never_comes_takes_the_last():
-    pairing = StampPairing()
-    pairing.add(1, 'a')
-    pairing.find(1)
-    assert pairing.find(2) is None
-    pairing.give_up()
-    assert pairing.find(2) == Found('a', False)
-    # And those after it do not wait, until one turns out to have been too early.
-    assert pairing.find(3) == Found('a', False)
-    pairing.add(3, 'c')
-    assert pairing.find(4) is None
-
-
-def test_one_sent_per_session_and_none_with_a_stamp():
-    pairing = StampPairing()
-    pairing.add(1, 'once')
-    assert [pairing.find(stamp) for stamp in (5, 6)] == [Found('once', False)] * 2
-    pairing = StampPairing()
-    pairing.add(0, 'a')
-    pairing.add(0, 'b')
-    assert pairing.find(0) == pairing.find(0) == Found('b', False)
+    for event in events:
+        what, stamp, *item = event.split()
+        if what == 'find':
+            expected = Found(item[0], item[1:] == ['own']) if item else None
+            assert pairing.find(int(stamp)) == expected, event
+        elif what == 'add':
+            pairing.add(int(stamp), *item)
+        else:
+            pairing.give_up()
 
 
 def test_few_are_kept():

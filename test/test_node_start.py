@@ -14,7 +14,8 @@ import pytest
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_bench import DEPTH, INFO, NODE, Bench, ended, values_of
+from processes import python
+from ros_bench import DEPTH, NODE, Bench, ended, values_of
 
 from rangeseg_ros.ros.parameters import NodeConfig
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -25,45 +26,38 @@ QOS = f'qos_overrides.{DEPTH}.subscription'
 
 
 def test_where_there_is_no_rclpy_it_says_so():
-    code = (
-        'import sys\n'
-        "sys.modules['rclpy'] = None\n"
-        'from rangeseg_ros.start import segment_planes; segment_planes()'
-    )
-    run = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    code = "import sys; sys.modules['rclpy'] = None\n"
+    run = python(code + 'from rangeseg_ros.start import segment_planes; segment_planes()')
     assert run.returncode == 2
     assert run.stderr.startswith('segment_planes: no rclpy') and run.stderr.count('\n') == 1
 
 
 def test_a_first_start_says_that_it_compiles(tmp_path, monkeypatch):
     monkeypatch.setenv('NUMBA_CACHE_DIR', os.fspath(tmp_path))
-    arguments = '-p', 'stall_timeout:=0.5'
-    topics = f'/first{DEPTH}', f'/first{INFO}'
     with (
-        Bench(*arguments, namespace='first') as bench,
+        Bench(stall_timeout=0.5, namespace='first') as bench,
         bench.listening('labels'),
-        bench.camera_on(*topics),
+        bench.camera_on(),
     ):
         told = r'no output for .* s: compiling kernels'
         status = bench.reported(lambda s: re.match(told, s.message), bench.send)
         assert status.level == DiagnosticStatus.ERROR
         assert 'compiling kernels' in bench.log()
-        assert f'will subscribe to {topics[0]} and {topics[1]}' in bench.log()
+        assert 'will subscribe to {} and {}'.format(*bench.topics) in bench.log()
 
 
 @pytest.mark.parametrize('presses', [1, 2])
 def test_interrupted_during_a_computation(presses):
-    slow = '-p', 'method:=normals', '-p', 'exact:=true'
-    with Bench(*slow, camera=kinect_camera(320, 240), namespace='busy') as bench:
-        topics = f'/busy{DEPTH}', f'/busy{INFO}'
-        with bench.listening('labels'), bench.camera_on(*topics):
-            bench.send()
-            bench.status(lambda status: 'segmenting' in values_of(status)['doing'])
-            assert not bench.received['labels'], 'the computation is over'
-            for _ in range(presses):
-                bench.interrupt()
-                time.sleep(0.05)
-            assert bench.process.wait(timeout=300) == 0
+    slow = {'method': 'normals', 'exact': True, 'camera': kinect_camera(320, 240)}
+    bench = Bench(namespace='busy', **slow)
+    with bench, bench.listening('labels'), bench.camera_on():
+        bench.send()
+        bench.status(lambda status: 'segmenting' in values_of(status)['doing'])
+        assert not bench.received['labels'], 'the computation is over'
+        for _ in range(presses):
+            bench.interrupt()
+            time.sleep(0.05)
+        assert bench.process.wait(timeout=300) == 0
 
 
 BAD = {
@@ -89,8 +83,7 @@ for arguments in eval(sys.argv[1]):
 
 
 def test_bad_arguments_end_with_one_line():
-    command = [sys.executable, '-c', EACH_IN_A_FORK, repr([*BAD.values()])]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    run = python(EACH_IN_A_FORK, repr([*BAD.values()]))
     assert run.stdout.split() == ['2'] * len(BAD), run.stderr
     for line, words in zip(run.stderr.splitlines(), BAD, strict=True):
         assert line.startswith('segment_planes: ') and words in line
@@ -117,7 +110,7 @@ def test_without_a_place_for_log_files_it_starts_and_says_so():
 
 
 def test_help_names_every_parameter():
-    run = subprocess.run([*NODE, '--help'], capture_output=True, text=True, timeout=300)
+    run = python(NODE[-1], '--help')
     assert run.returncode == 0 and not run.stderr
     assert all(f'  {field.name} (default' in run.stdout for field in fields(NodeConfig))
 

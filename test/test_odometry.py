@@ -172,7 +172,7 @@ def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
     stamps = [10**9 + k * 10**9 // 30 for k in range(0, 20, STEP)]
     for k, stamp in zip(range(0, 20, STEP), stamps, strict=True):
         view = simulate_kinect(scene, camera, frame=k, seed=4)
-        recording.add_camera(stamp, 160, 120, k=matrix, p=np.insert(matrix, (3, 6, 9), 0.0))
+        recording.add_camera(stamp, 160, 120, k=matrix)
         recording.add_image(stamp, view.depth)
         sequence.segment(RangeImage.from_depth(view.depth, camera), stamp)
     recording.write(tmp_path / 'recording')

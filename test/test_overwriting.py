@@ -4,15 +4,14 @@ import json
 import os
 import shutil
 import stat
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
-from recordings import depth_images
 from replays import record_walls, results
 
-from rangeseg_ros import Camera
-from rangeseg_ros.io.cameras import write_camera
+from rangeseg_ros.cli.options import check_replaceable
 from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
@@ -48,41 +47,39 @@ def test_pipes_and_devices_stay(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ['pipe']
 
 
-@pytest.fixture
-def images(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write_camera(tmp_path / 'camera.yaml', Camera(64, 48, 50.0, 50.0, 31.5, 23.5))
-    for name in ('a', 'a_labels'):
-        write_image(tmp_path / f'{name}.png', depth_images(1)[0])
-    return tmp_path
-
-
-def test_segment_replaces_no_input_and_nothing_without_being_told(images, run):
-    segment = ('segment', '--camera', 'camera.yaml', '--output')
-    before = (images / 'a_labels.png').read_bytes()
+def test_segment_replaces_no_input_and_nothing_without_being_told(folder, run, refused):
+    segment = ('segment', 'depth/2.png', '--camera', 'camera.yaml', '--output')
+    labels, planes = Path('depth/2_labels.png'), Path('out/2_planes.csv')
+    before = shutil.copy('depth/10.png', labels).read_bytes()
     for more in ((), ('--overwrite',)):
-        code, _, error = run(*segment, '.', 'a.png', 'a_labels.png', *more)
-        assert code == 2 and 'a_labels.png: is an input' in error and error.count('\n') == 1
-    assert (images / 'a_labels.png').read_bytes() == before
-    assert run(*segment, 'out', 'a.png')[0] == 0
-    (images / 'out/a_planes.csv').write_text('mine')
-    code, _, error = run(*segment, 'out', 'a.png')
-    assert code == 2 and 'exists already' in error
-    assert (images / 'out/a_planes.csv').read_text() == 'mine'
-    assert run(*segment, 'out', 'a.png', '--overwrite')[0] == 0
-    assert (images / 'out/a_planes.csv').read_text() != 'mine'
+        assert '2_labels.png: is an input' in refused(*segment, 'depth', labels, *more)
+    assert labels.read_bytes() == before
+    assert run(*segment, 'out')[0] == 0
+    planes.write_text('mine')
+    assert 'exists already' in refused(*segment, 'out')
+    assert planes.read_text() == 'mine'
+    assert run(*segment, 'out', '--overwrite')[0] == 0
+    assert planes.read_text() != 'mine'
 
 
-def test_figures_replace_figures_alone(images, run):
-    compare = ('compare', 'a.png', 'a.png', '--json')
-    before = (images / 'a_labels.png').read_bytes()
-    code, _, error = run(*compare, 'a_labels.png')
-    assert code == 2 and 'exists already' in error
-    assert (images / 'a_labels.png').read_bytes() == before
-    code, _, error = run(*compare, 'nowhere/x.json')
-    assert code == 2 and 'no such folder' in error and not (images / 'nowhere').exists()
+def test_what_begins_as_a_result_does_may_be_replaced(tmp_path):
+    path = tmp_path / 'file'
+    check_replaceable(path, b'{')
+    for content, refused in ((b'', False), (b'{}', False), (b'mine', True)):
+        path.write_bytes(content)
+        with pytest.raises(OSError, match='exists') if refused else nullcontext():
+            check_replaceable(path, b'{')
+
+
+def test_figures_replace_figures_alone(folder, run, refused):
+    compare = ('compare', 'depth/2.png', 'depth/2.png', '--json')
+    before = Path('depth/10.png').read_bytes()
+    assert 'exists already' in refused(*compare, 'depth/10.png')
+    assert Path('depth/10.png').read_bytes() == before
+    assert 'no such folder' in refused(*compare, 'nowhere/x.json')
+    assert not Path('nowhere').exists()
     os.mkfifo('pipe')
-    assert run(*compare, 'pipe')[0] == 2 and Path('pipe').is_fifo()
+    assert refused(*compare, 'pipe') and Path('pipe').is_fifo()
     for _ in range(2):
         assert run(*compare, 'x.json')[0] == 0
     assert json.loads(Path('x.json').read_text())['images'] == 1
@@ -95,24 +92,23 @@ def walls(tmp_path):
 
 
 @pytest.mark.parametrize('name', ['planes.csv', '000000_1.000000000_labels.png'])
-def test_replay_leaves_what_no_replay_has_written(walls, run, name):
+def test_replay_leaves_what_no_replay_has_written(walls, run, refused, name):
     recording, out = walls
     out.mkdir()
     (out / name).write_text('mine')
-    code, _, error = run('replay', recording, '--output', out)
-    assert code == 2 and f'{name}: exists already' in error and error.count('\n') == 1
+    assert f'{name}: exists already' in refused('replay', recording, '--output', out)
     assert [path.name for path in out.iterdir()] == [name]
     assert run('replay', recording, '--output', out, '--overwrite')[0] == 0
     assert (out / 'bag').exists() and not list(out.glob('.*'))
 
 
-def test_replay_leaves_the_overview_of_somebody_else(walls, run):
+def test_replay_leaves_the_overview_of_somebody_else(walls, run, refused):
     recording, out = walls
     shutil.copytree(recording, recording.with_name('more'))
     arguments = ('replay', recording, recording.with_name('more'), '--output', out, '--jobs', 1)
     out.mkdir()
     (out / 'index.html').write_text('mine')
-    assert run(*arguments)[0] == 2 and [path.name for path in out.iterdir()] == ['index.html']
+    assert refused(*arguments) and [path.name for path in out.iterdir()] == ['index.html']
     (out / 'index.html').unlink()
     for _ in range(2):
         assert run(*arguments)[0] == 0
@@ -136,17 +132,16 @@ def test_results_that_are_gone_or_changed_are_made_again(walls, run):
     assert 'done before' in run('replay', recording, '--output', out)[1]
 
 
-def test_a_recording_is_not_replaced_by_its_own_results(walls, run):
+def test_a_recording_is_not_replaced_by_its_own_results(walls, refused):
     recording, out = walls
     out.mkdir()
     shutil.move(recording, out / 'bag')
     for more in ((), ('--overwrite',)):
-        code, _, error = run('replay', out / 'bag', '--output', out, *more)
-        assert code == 2 and 'it is the recording' in error
+        assert 'it is the recording' in refused('replay', out / 'bag', '--output', out, *more)
     assert list((out / 'bag').glob('*.mcap'))
 
 
-def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run):
+def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run, refused):
     monkeypatch.chdir(tmp_path)
     for name in ('set/a/b', 'set/a_b', 'set/c'):
         folder = tmp_path / name
@@ -158,6 +153,5 @@ def test_images_of_like_names_are_told_apart(tmp_path, monkeypatch, run):
     figures = json.loads(Path('x.json').read_text())
     assert figures['images'] == 3 and len(figures['per_image']) == 3
     assert len(list(Path('out').glob('*_labels.png'))) == 3
-    code, _, error = run(*evaluate)
-    assert code == 2 and 'exists already' in error
+    assert 'exists already' in refused(*evaluate)
     assert run(*evaluate, '--overwrite')[0] == 0

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 
 import pytest
 import yaml
+from processes import python
 
 from rangeseg_ros import __version__
 from rangeseg_ros.extras import EXTRAS
@@ -61,8 +62,7 @@ def test_segmenting_needs_no_library_of_an_extra():
     modules = 'cli.segment', 'cli.compile', 'notebook', 'core.sequence'
     code = ''.join(f'import rangeseg_ros.{name}\n' for name in modules)
     code += f'import sys; print(*set(sys.modules) & {set(EXTRAS)!r})'
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
-    assert not done.stdout.split()
+    assert python(code).stdout == '\n'
 
 
 def test_package_xml_names_the_messages_that_are_used():
@@ -146,10 +146,7 @@ def test_the_digest_follows_every_source_of_the_package(tmp_path):
 
     def digest():
         code = 'from rangeseg_ros.digest import code_digest; print(code_digest().hex())'
-        command = [sys.executable, '-c', code]
-        return subprocess.run(
-            command, cwd=tmp_path, capture_output=True, text=True, check=True
-        ).stdout
+        return python(code, cwd=tmp_path).stdout
 
     seen = {digest()}
     for name in ('core/config.py', 'io/tables.py', 'report/templates/replay.html'):
@@ -159,28 +156,20 @@ def test_the_digest_follows_every_source_of_the_package(tmp_path):
     assert len(seen) == 4
 
 
-def build_as_colcon_does(folder, *options, **environment):
-    """Install into `folder` where importing numba fails; what that said on stderr."""
-    pytest.importorskip('setuptools')
-    (folder / 'numba.py').write_text("raise ImportError('numba is not for this test')\n")
-    commands = ['egg_info', '--egg-base', folder, 'build', '--build-base', folder / 'build']
-    commands += ['install', '--prefix', folder / 'install', '--record', folder / 'installed']
-    before = {name: value for name, value in os.environ.items() if name != 'RANGESEG_COMPILE'}
-    done = subprocess.run(
-        [sys.executable, 'setup.py', *commands, '--single-version-externally-managed', *options],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        env={**before, 'PYTHONPATH': os.fspath(folder), **environment},
-    )
-    assert done.returncode == 0, done.stderr
-    assert (folder / 'install').relative_to('/').as_posix() in (folder / 'installed').read_text()
-    return done.stderr
-
-
 def test_colcon_builds_without_numba_and_says_that_nothing_is_compiled(tmp_path):
-    errors = build_as_colcon_does(tmp_path)
-    (line,) = (line for line in errors.splitlines() if 'kernels' in line)
+    pytest.importorskip('setuptools')
+    (tmp_path / 'numba.py').write_text("raise ImportError('numba is not for this test')\n")
+    commands = ['egg_info', '--egg-base', tmp_path, 'build', '--build-base', tmp_path / 'build']
+    commands += ['install', '--prefix', tmp_path / 'install', '--record', tmp_path / 'installed']
+    commands += ['--single-version-externally-managed']
+    environment = {**os.environ, 'PYTHONPATH': os.fspath(tmp_path)}
+    environment.pop('RANGESEG_COMPILE', None)
+    code = "import runpy; runpy.run_path('setup.py', run_name='__main__')"
+    done = python(code, *commands, cwd=ROOT, env=environment)
+    assert done.returncode == 0, done.stderr
+    place = (tmp_path / 'install').relative_to('/').as_posix()
+    assert place in (tmp_path / 'installed').read_text()
+    (line,) = (line for line in done.stderr.splitlines() if 'kernels' in line)
     assert line == (
         'kernels are left for the first start to compile: ImportError: numba is not for this test'
     )

@@ -1,4 +1,4 @@
-"""ROS parameters are the configuration: declared from it, checked by it, and nothing besides."""
+"""Parts of the node over rclpy: parameters, settings in use, events, what /diagnostics says."""
 
 import os
 from dataclasses import fields
@@ -8,15 +8,46 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from threading import Event, Thread
+
+import pytest
 import rclpy
-import ros_bench  # noqa: F401 - gives DDS a domain of its own
 from rclpy.exceptions import InvalidParameterTypeException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_bench import DEPTH  # noqa: F401 - gives DDS a domain of its own
 
 from rangeseg_ros import Config, ConfigError
 from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.ros.parameters import NodeConfig, bind
+
+pytest.importorskip('rclpy')
+
+import pytest
+
+from rangeseg_ros.compilation.preparation import FIRST
+from rangeseg_ros.ros import settings
+from rangeseg_ros.ros.settings import Settings
+
+pytest.importorskip('rclpy')
+
+import time
+from types import SimpleNamespace
+
+import pytest
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from std_msgs.msg import Empty
+
+from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
+
+pytest.importorskip('rclpy')
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from rangeseg_ros.core.sensing.verdict import Verdict
+from rangeseg_ros.ros.counting import Losses, Window
+from rangeseg_ros.ros.diagnostics import FrameStatistics
 
 PARAMS = Path(__file__).parents[1] / 'params' / 'segment_planes.yaml'
 
@@ -127,3 +158,193 @@ def test_every_parameter_file_undoes_any_other():
     assert len(names) > 4
     for name, found in names.items():
         assert found == names['segment_planes.yaml'], name
+
+
+class Compilation:
+    """Takes the place of the compiler: of more than the first outputs once it is released."""
+
+    def __init__(self, monkeypatch):
+        self.came, self.release = [], Event()
+        monkeypatch.setattr(settings, 'prepare', self.prepare)
+
+    def prepare(self, config, kinds, report, outputs):
+        if outputs != FIRST:
+            self.release.wait()
+        self.came.append(outputs)
+
+
+def test_the_first_frames_wait_for_labels_and_other_outputs_for_their_kernels(monkeypatch):
+    compilation = Compilation(monkeypatch)
+    came = compilation.came
+
+    def publish():
+        came.append(used.ready_for('labels'))
+        came.append(used.ready_for('terrain'))
+
+    config = NodeConfig()
+    used = Settings(config, lambda progress: None, lambda: None)
+    assert used.in_use() is config
+    publication = Thread(target=publish)
+    publication.start()
+    publication.join(0.2)  # it must not end by itself
+    compilation.release.set()
+    publication.join()
+    used.close()
+    assert came[0] == FIRST and came[1] is True
+    assert set(came[2]) > set(FIRST) and came[3] is True
+
+
+def test_what_needs_no_other_kernels_is_in_use_at_once(monkeypatch):
+    compilation = Compilation(monkeypatch)
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    first = used.in_use()
+    other, normals = NodeConfig(min_pixels=500), NodeConfig(method='normals')
+    used.want(other)
+    assert used.in_use() is other is not first and not used.pending
+    used.want(normals)
+    assert used.in_use() is other and used.pending
+    compilation.release.set()
+    used.close()
+
+
+def test_what_is_asked_for_last_is_in_use_in_the_end(monkeypatch):
+    """Also when what was asked for before it is compiled later."""
+    first, normals, last = NodeConfig(), NodeConfig(method='normals'), NodeConfig(min_pixels=500)
+    begun, release, changed = Event(), Event(), Event()
+
+    def prepare(config, kinds, report, outputs):
+        if config.method == 'normals':
+            begun.set()
+            release.wait()
+
+    monkeypatch.setattr(settings, 'prepare', prepare)
+    used = Settings(first, lambda progress: None, changed.set)
+    assert used.in_use() is first and used.ready_for('terrain')
+    used.want(normals)
+    begun.wait()
+    assert used.in_use() is first
+    used.want(last)
+    release.set()
+    assert used.in_use() is last
+    exact = NodeConfig(method='normals', exact=True)
+    changed.clear()
+    used.want(exact)
+    changed.wait()
+    assert used.in_use() is exact and not used.pending
+    used.close()
+
+
+def test_whoever_waits_is_let_go_at_the_end(monkeypatch):
+    release = Event()
+    monkeypatch.setattr(settings, 'prepare', lambda *arguments: release.wait())
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    used.close()
+    assert used.in_use() is None
+    assert not used.ready_for('labels')
+    release.set()
+
+
+def test_what_a_robot_stops_for_comes_first_once_its_kernels_are_there(monkeypatch):
+    compilation = Compilation(monkeypatch)
+    used = Settings(NodeConfig(), lambda progress: None, lambda: None)
+    assert used.in_use()
+    names = ['labels', 'normals', 'drops']
+    assert used.ready_first(names) == names
+    compilation.release.set()
+    assert used.ready_for('drops')
+    assert used.ready_first(['drops', 'nothing', 'labels']) == ['drops', 'labels', 'nothing']
+    used.close()
+
+
+@pytest.mark.ros
+def test_events_wait_while_messages_come(context):
+    came, group = [], ThrottledCallbackGroup(interval=1e9)
+    node, other = (rclpy.create_node(name, context=context) for name in ('node', 'other'))
+    events = PublisherEventCallbacks(matched=lambda event: came.append(event.current_count))
+    publisher = node.create_publisher(
+        Empty, 'topic', 5, event_callbacks=events, callback_group=group
+    )
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def listen():
+        """The listener, once the publisher has it."""
+        subscription = other.create_subscription(Empty, 'topic', lambda message: None, 5)
+        while not publisher.get_subscription_count():
+            executor.spin_once(timeout_sec=0.01)
+        return subscription
+
+    def spin_until_it_came():
+        while not came:
+            executor.spin_once(timeout_sec=0.01)
+
+    listen()
+    spin_until_it_came()
+    group.message_came()
+    assert group.can_execute(publisher.event_handlers[0])  # the first has nothing before it
+    group.message_came()
+    came.clear()
+    listen()
+    for _ in range(20):
+        executor.spin_once(timeout_sec=0.01)
+    assert not came
+    group.look()
+    spin_until_it_came()
+
+
+def test_the_interval_is_kept(monkeypatch):
+    group = ThrottledCallbackGroup(interval=0.1)
+    event, looked = Event(), []
+    group.add_entity(event)
+    for now in (5.0, 5.05, 5.09, 5.1, 5.15, 5.25):
+        monkeypatch.setattr(
+            'rangeseg_ros.ros.throttled_events.time.monotonic', lambda now=now: now
+        )
+        group.message_came()
+        looked.append(group.can_execute(event))
+    assert looked == [True, False, False, True, False, True]
+
+
+def status(**found):
+    statistics = FrameStatistics()
+    for name, value in found.items():
+        setattr(statistics, name, value)
+    source = SimpleNamespace(
+        last_arrival=time.monotonic(), problem='', pairing='', topic='/depth', publishers=1
+    )
+    source.loss_hint = lambda: 'a larger buffer'
+    return statistics.status('segment_planes', source, 3600.0)
+
+
+def test_ground_and_stairs_are_told():
+    told = {'ground': 'ground 1.20 m below, confidence 0.98', 'stairs': ['up 4 x 0.17 / 0.28 m']}
+    found = status(found=result(**told))
+    values = {value.key: value.value for value in found.values}
+    assert values['ground'] == 'ground 1.20 m below, confidence 0.98'
+    assert values['stairs'] == 'up 4 x 0.17 / 0.28 m'
+    assert found.level == DiagnosticStatus.OK
+
+
+def result(verdict=Verdict(), **worked_out):  # noqa: B008
+    known = {'reason': '', 'sensor': '', 'work_budget': 1.0, 'tilt': '', **worked_out}
+    return SimpleNamespace(planes=[1, 2, 3], verdict=verdict, **known)
+
+
+def test_a_wrong_unit_is_an_error_and_an_enlarged_image_a_warning():
+    for reason, level in (
+        ('millimetres in floats', DiagnosticStatus.ERROR),
+        ('range instead of z', DiagnosticStatus.ERROR),
+        ('enlarged x 4', DiagnosticStatus.WARN),
+    ):
+        found = status(found=result(verdict=Verdict((reason,), ('What it is.',))))
+        assert found.level == level and found.message == 'What it is.'
+        assert {value.key: value.value for value in found.values}['input'] == 'What it is.'
+
+
+def test_lost_messages_are_a_warning_with_their_share_and_what_helps():
+    received, losses = Window(), Losses()
+    received.add(3)
+    losses.lost.add(1)
+    found = status(received=received, losses=losses)
+    assert found.level == DiagnosticStatus.WARN
+    assert found.message == '25% lost on /depth: a larger buffer'

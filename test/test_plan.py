@@ -55,8 +55,7 @@ def record(path, tilt):
         depth = depth.reshape(CAMERA.shape)
         inverse = 1 / depth + random.normal(0, 5e-4, depth.shape)
         depth = np.where(inverse > 1 / 6, 1 / np.maximum(inverse, 1 / 6), 0)
-        camera = {'k': matrix, 'p': np.insert(matrix, (3, 6, 9), 0.0)}
-        recording.add_camera(stamp, CAMERA.width, CAMERA.height, **camera)
+        recording.add_camera(stamp, CAMERA.width, CAMERA.height, k=matrix)
         recording.add_image(stamp, np.round(1000 * depth).astype(np.uint16))
         told, at = tilt * turn, tilt.apply(place)
         for after in (-20_000_000, 20_000_000):

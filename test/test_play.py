@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import RANGESEG
 from recordings import Recording
 
 pytest.importorskip('rclpy')
@@ -21,7 +22,6 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 pytestmark = pytest.mark.ros
 
 PROFILE = Path(__file__).parents[1] / 'params' / 'fastdds_large_images.xml'
-RANGESEG = [sys.executable, '-c', 'from rangeseg_ros.cli.main import main; main()']
 
 
 def record(path, camera, count, period):
@@ -56,7 +56,6 @@ def test_rate_loop_and_clock(tmp_path):
 
 
 def test_no_large_image_is_lost_with_the_profile(tmp_path, monkeypatch):
-    """The counterpart of the test of the node in which, without the profile, images are lost."""
     publisher = """
 import array, time, rclpy
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -78,7 +77,7 @@ time.sleep(0.5)
 """
     monkeypatch.setenv('FASTRTPS_DEFAULT_PROFILES_FILE', os.fspath(PROFILE))
     camera = subprocess.Popen([sys.executable, '-c', publisher])
-    with Bench('-p', 'stall_timeout:=3600.0') as bench, bench.listening('labels'):
+    with Bench(stall_timeout=3600.0) as bench, bench.listening('labels'):
         monkeypatch.delenv('FASTRTPS_DEFAULT_PROFILES_FILE')
         bench.until(lambda: camera.poll() is not None)
         # Images without camera_info are received and go no further.
@@ -88,7 +87,6 @@ time.sleep(0.5)
 
 
 def test_topics_that_ros_refuses_are_left_out(tmp_path, run):
-    pytest.importorskip('rclpy')
     recording = Recording()
     recording.add_camera(1, topic='/a b')
     recording.add_camera(2, topic='/fine')

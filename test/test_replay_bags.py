@@ -1,21 +1,19 @@
-"""The bags that `rangeseg replay` writes, and when it starts a recording again."""
+"""The bags that `rangeseg replay` writes, by whom, and when it starts a recording again."""
 
 import csv
 import os
 import signal
 import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from processes import RANGESEG, wait_for
 from recordings import ROS2, Recording, record
 from replays import DELAY, read, record_walls, replay, results, walls
 from rosbags import rosbag2
 
 from rangeseg_ros.batch.replay import Replay
-from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.io.recordings import BagError
@@ -145,39 +143,33 @@ def test_a_finished_recording_is_not_done_again(done, tmp_path):
     assert len(list(out.glob('*.png'))) == 4
 
 
-def test_a_killed_replay_is_started_again(done, tmp_path):
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGKILL])
+def test_an_interrupted_or_killed_replay_is_started_again(done, tmp_path, number):
     path = record_walls(tmp_path / 'recording', 200)
-    code = 'import sys; from rangeseg_ros.cli.main import main; main()'
-    process = subprocess.Popen(
-        [sys.executable, '-c', code, 'replay', path, '--output', 'out'],
-        cwd=tmp_path,
-        stdout=subprocess.DEVNULL,
-    )
+    words = *RANGESEG, 'replay', path, '--output', 'out'
+    streams = {'stdout': subprocess.DEVNULL, 'stderr': subprocess.PIPE}
+    process = subprocess.Popen(words, cwd=tmp_path, start_new_session=True, **streams)
     try:
-        deadline = time.monotonic() + 120
-        while len(list(tmp_path.glob('out/.*/*_labels.png'))) < 3:
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        wait_for(lambda: len([*tmp_path.glob('out/.*/*_labels.png')]) > 2, process)
+        process.send_signal(number)
+        _, error = process.communicate(timeout=60)
     finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert not (tmp_path / 'out/bag').exists()
+        process.kill()
+    assert process.returncode == (130 if number == signal.SIGINT else -number), error
+    assert b'Traceback' not in error
+    left = [path.name[0] for path in (tmp_path / 'out').iterdir()]
+    assert left == ([] if number == signal.SIGINT else ['.'])
     replay(done / 'recording', tmp_path / 'out')
     assert results(tmp_path / 'out') == results(done / 'plain')
     assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
 
 
 @pytest.mark.slow
-def test_processes_give_the_same_results(tmp_path, monkeypatch):
+def test_processes_give_the_same_results(tmp_path, monkeypatch, run):
     for name in ('a', 'b'):
         replay(record_walls(tmp_path / name, 2), tmp_path / 'local' / name)
     monkeypatch.chdir(tmp_path)
-    arguments = ['replay', 'a', 'b', '--output', 'out', '--jobs', '2']
-    monkeypatch.setattr(sys, 'argv', ['rangeseg', *arguments])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert not end.value.code
+    assert run('replay', 'a', 'b', '--output', 'out', '--jobs', 2)[0] == 0
     assert results(tmp_path / 'out') == results(tmp_path / 'local')
 
 
@@ -230,3 +222,36 @@ def test_doubtful_images_are_counted(tmp_path, run):
     assert code == 0 and '2 frames' in output
     assert all(line.startswith('rangeseg: 2 frames: ') for line in error.splitlines())
     assert 'fills 2 x 2 pixels' in error
+
+
+@pytest.mark.slow
+def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
+    distributed = pytest.importorskip('distributed')
+    names = ['a', 'b', 'c']
+    for name, count in zip(names, (20, 21, 22), strict=True):
+        record_walls(tmp_path / name, count)
+        replay(tmp_path / name, tmp_path / 'local' / name)
+    options = {'n_workers': 2, 'threads_per_worker': 1, 'processes': True}
+    options |= {'dashboard_address': None, 'local_directory': tmp_path / 'dask'}
+    with (
+        distributed.LocalCluster(**options) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        victim = next(iter(client.run(os.getpid).values()))
+        words = *RANGESEG, 'replay', *names, '--output', 'out', '--scheduler'
+        streams = {'stdout': subprocess.PIPE, 'stderr': subprocess.PIPE, 'text': True}
+        words += (cluster.scheduler_address,)
+        command = subprocess.Popen(words, cwd=tmp_path, **streams)
+        try:
+            # Each process has its name on the folder that it has begun.
+            half_way = f'out/*/.rangeseg-{victim}/*_labels.png'
+            wait_for(lambda: len([*tmp_path.glob(half_way)]) > 5, command)
+            os.kill(victim, signal.SIGKILL)
+            output, error = command.communicate(timeout=240)
+        finally:
+            command.kill()
+    assert command.returncode == 0, error
+    assert [f'{count} frames' in output for count in (20, 21, 22)] == [True] * 3
+    for name in names:
+        assert results(tmp_path / 'out' / name) == results(tmp_path / 'local' / name)
+        assert not list((tmp_path / 'out' / name).glob('.*'))

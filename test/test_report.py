@@ -1,19 +1,20 @@
-"""The pages of replay and evaluate: what they say, and what a browser makes of them."""
+"""The pages of replay and evaluate, what a browser makes of them, and pictures."""
 
 import re
-import sys
 from dataclasses import replace
 from html.parser import HTMLParser
+from types import SimpleNamespace
 from urllib.parse import unquote
 
+import cv2
 import numpy as np
 import pytest
 from replays import record_walls, walls
 
 from rangeseg_ros import Camera, Config, RangeImage
 from rangeseg_ros.batch.frame_files import write_frame
-from rangeseg_ros.cli.main import main
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.drawing import colours, grey, overlay
 from rangeseg_ros.report import charts
 from rangeseg_ros.report.page import MAX_PICTURES, Picture, evenly_spaced
 from rangeseg_ros.report.replay import ReplayReport
@@ -122,16 +123,42 @@ def test_bars_break_where_a_plane_is_out_of_sight():
     assert charts.runs(np.arange(10)) == [(0, 9)]
 
 
-def test_each_plane_of_a_chart_has_a_fifth_of_an_inch():
-    def height(count):
-        seen = sightings(*((0, number, 1.0, 2.0) for number in range(count)))
-        picture = charts.id_bars(seen, np.array([0.0]))
-        return float(re.search(r'<svg [^>]*height="([.\d]+)pt"', picture)[1])
-
-    assert height(30) - height(10) == pytest.approx(20 * 0.2 * 72)
+@pytest.fixture
+def times(monkeypatch):
+    """Seconds of frames; charts give their figure."""
+    monkeypatch.setattr(charts, 'svg', lambda figure: figure)
+    return np.arange(10) * 0.5
 
 
-def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch):
+def test_bars_are_as_long_as_planes_are_in_sight(times):
+    seen = sightings(*((frame, number, 1.0, 2.0) for frame in (1, 2, 5) for number in (4, 9)))
+    figure = charts.id_bars(seen, times)
+    (axes,) = figure.axes
+    assert [label.get_text() for label in axes.get_yticklabels()] == ['4', '9']
+    assert figure.get_size_inches().tolist() == [10, 1.2 + 0.2 * 2]
+    for row, bars in enumerate(axes.collections):
+        spans = [path.get_extents().extents.tolist() for path in bars.get_paths()]
+        assert spans == [[0.5, row - 0.4, 1.5, row + 0.4], [2.5, row - 0.4, 3.0, row + 0.4]]
+    (bars,) = charts.id_bars(sightings((0, 4, 1.0, 2.0)), times[:1]).axes[0].collections
+    assert bars.get_paths()[0].get_extents().width == 1
+
+
+def test_drifts_are_told_from_medians_and_break_where_a_plane_is_out_of_sight(times):
+    seen = sightings((0, 5, 1.0, 2.0), (1, 5, 1.0, 2.01), (4, 5, 1.0, 2.03))
+    tilted = 0.0, np.sin(0.02), -np.cos(0.02)
+    seen['normal'][1] = tilted
+    upper, lower = charts.drifts(seen, times).axes
+    for axes, expected in (
+        (upper, [-10, 0, np.nan, 20]),
+        (lower, [0, np.degrees(0.02), np.nan, 0]),
+    ):
+        (line,) = axes.lines
+        np.testing.assert_allclose(line.get_xdata(), [0, 0.5, np.nan, 2])
+        np.testing.assert_allclose(line.get_ydata(), expected, atol=1e-6)
+    assert lower.get_ylim()[0] == 0
+
+
+def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkeypatch, run):
     monkeypatch.chdir(tmp_path)
     names = ['walls', 'torn #2']
     for name in names:
@@ -139,13 +166,9 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     file = next((tmp_path / names[1]).glob('*.mcap'))
     with file.open('r+b') as stream:
         stream.truncate(file.stat().st_size - 100)
-    arguments = ['rangeseg', 'replay', *names, '--output', 'out', '--jobs', '1']
     pages = []
     for _ in range(2):  # the second time, all is found done
-        monkeypatch.setattr(sys, 'argv', arguments)
-        with pytest.raises(SystemExit) as end:
-            main()
-        assert end.value.code == 1
+        assert run('replay', *names, '--output', 'out', '--jobs', 1)[0] == 1
         pages.append((tmp_path / 'out/index.html').read_text(encoding='utf-8'))
     assert pages[0] == pages[1]
     page = Page(tmp_path / 'out/index.html')
@@ -153,3 +176,75 @@ def test_an_overview_leads_to_the_reports_of_several_recordings(tmp_path, monkey
     assert all((tmp_path / 'out' / unquote(link)).exists() for link in page.sources)
     whole, torn = (line for line in page.text.splitlines() if line.startswith(tuple(names)))
     assert whole == 'walls160.5220' and torn.startswith('torn #2') and 'damaged after' in torn
+
+
+def test_colours_can_be_told_apart():
+    palette = colours(range(1, 49))
+    # CIE L*a*b*: 2.3 is a just noticeable difference.
+    lab = cv2.cvtColor(palette[None] / np.float32(255), cv2.COLOR_RGB2LAB)[0]
+    distance = np.linalg.norm(lab[:, None] - lab, axis=2)[np.triu_indices(48, 1)]
+    assert distance.min() > 5 * 2.3
+    assert np.hypot(lab[:, 1], lab[:, 2]).min() > 5 * 2.3  # nor taken for grey
+    np.testing.assert_array_equal(colours([5, 9, 49]), palette[[4, 8, 0]])
+    assert palette[0].argmax() == 2, 'blue'
+
+
+def test_unlabelled_pixels_stay_grey_and_labelled_ones_have_their_colour():
+    inverse = np.full((20, 30), 0.5, np.float32)
+    inverse[:, 25:] = 0
+    labels = np.zeros((20, 30), np.uint16)
+    labels[5:15, 5:15] = 3
+    picture = overlay(inverse, labels)
+    assert picture.shape == (20, 30, 3)
+    assert picture.dtype == np.uint8
+    plain = picture[labels == 0]
+    assert (plain == plain[:, :1]).all()
+    assert not picture[:, 25:].any()
+    inner = picture[6:13, 6:13].reshape(-1, 3)
+    assert (inner == inner[0]).all()
+    assert inner[0].max() > inner[0].min() + 50
+    mixed = 0.45 * grey(inverse)[6, 6] + 0.55 * colours([3])[0].astype(float)
+    np.testing.assert_allclose(inner[0], mixed, atol=0.51)
+    np.testing.assert_array_equal(picture, overlay(inverse, labels))
+
+
+def test_colours_follow_ids_not_labels():
+    inverse = np.full((20, 30), 0.5, np.float32)
+    one = np.ones((20, 30), np.uint16)
+    plane = SimpleNamespace(label=1, id=9)
+    other = SimpleNamespace(label=2, id=9)
+    np.testing.assert_array_equal(
+        overlay(inverse, one, [plane]), overlay(inverse, 2 * one, [other])
+    )
+    assert (overlay(inverse, one, [plane]) != overlay(inverse, one)).any()
+
+
+def test_an_id_is_written_where_its_region_is_widest():
+    labels = np.zeros((240, 320), np.uint16)
+    labels[:220, 20:40] = labels[100:220, 20:140] = 1
+    labels[:, 200:206] = 2
+    planes = [SimpleNamespace(label=1, id=8), SimpleNamespace(label=2, id=8)]
+    picture = overlay(np.full(labels.shape, 0.5, np.float32), labels, planes)
+    white = (picture > 200).all(axis=2)
+    rows, columns = np.nonzero(white)
+    assert (rows.mean(), columns.mean()) == pytest.approx((160.5, 78), abs=1.5)
+    (wide, high), _ = cv2.getTextSize('8', cv2.FONT_HERSHEY_SIMPLEX, 0.8, 1)
+    assert high / 2 < np.ptp(rows) < high and wide / 3 < np.ptp(columns) < wide
+    outline = cv2.dilate(white.astype(np.uint8), np.ones((3, 3), np.uint8)) > white
+    assert picture[outline].max(axis=1).mean() < 80, 'dark around'
+
+
+def test_what_is_near_is_bright_between_the_extremes():
+    found = grey(np.linspace(1, 2, 1001)[None].astype(np.float32))[0]
+    assert found[0] == found[20] == 60 and found[-1] == found[980] == 235
+    assert (np.diff(found.astype(int)) >= 0).all() and found[500] in (147, 148)
+
+
+@pytest.mark.parametrize('shape', [(1, 1), (1, 7), (424, 3)])
+@pytest.mark.parametrize('value', [0.0, 1.0])
+def test_any_size_and_no_measurement(shape, value):
+    inverse = np.full(shape, value, np.float32)
+    assert grey(inverse).shape == shape
+    labels = np.ones(shape, np.uint16)
+    plane = SimpleNamespace(label=1, id=1)
+    assert overlay(inverse, labels, [plane]).shape == (*shape, 3)

@@ -1,4 +1,4 @@
-"""Method normals from depth to planes: noise-free rooms, options, the fast minimiser."""
+"""Method normals from depth to planes: noise-free rooms, options, the fast minimiser, outputs."""
 
 import pickle
 from dataclasses import replace
@@ -9,9 +9,16 @@ import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_normals.directions import directions
-from rangeseg_ros.core.by_normals.labelling import degrees, minimise, minimise_exactly
+from rangeseg_ros.core.by_normals.labelling import (
+    degrees,
+    minimise,
+    minimise_exactly,
+    nearest_directions,
+)
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.drawing import normals_picture
+from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
@@ -171,6 +178,14 @@ def test_noise_free_patches_are_found_to_the_pixel():
     np.testing.assert_array_equal(found[known], minimise_exactly(*arguments)[known])
 
 
+def test_the_first_of_the_nearest_directions_is_taken():
+    normals = np.random.default_rng(1).normal(size=(6, 7, 3)).astype(np.float32)
+    normals[0], normals[1] = 0, np.nan
+    expected = (np.nan_to_num(normals) @ DIRECTIONS.T).argmax(axis=2)
+    found = nearest_directions(normals, DIRECTIONS)
+    np.testing.assert_array_equal(found, expected)
+
+
 @pytest.mark.parametrize('shape', [(1, 1), (1, 30), (7, 9), (8, 16)])
 def test_any_size_of_image(shape):
     normals = np.tile(DIRECTIONS[5].astype(np.float32), (*shape, 1))
@@ -194,3 +209,85 @@ def test_pixels_without_normal_belong_to_their_side_of_a_jump():
     grid.right[:, 34] = 0
     found = minimise(normals, DIRECTIONS, grid, 100.0)
     assert (found[:, :35] == 5).all() and (found[:, 35:] == 40).all()
+
+
+KINECT = kinect_camera(160, 120)
+
+
+@pytest.fixture(scope='module')
+def room():
+    return simulate_kinect(kinect_room(3), KINECT, noise='none')
+
+
+def segmented(room, **options):
+    image = RangeImage.from_depth(room.depth, KINECT)
+    return image, Segmenter(Config(min_pixels=100, **options)).segment(image)
+
+
+@pytest.mark.parametrize('method', ['planes', 'normals'])
+def test_normals_are_those_of_the_surfaces(room, method):
+    image, result = segmented(room, method=method, smoothness=30.0)  # for so small an image
+    normals = result.normals
+    assert normals.dtype == np.float32 and normals.shape == (120, 160, 3)
+    np.testing.assert_array_equal(np.isnan(normals).any(axis=2), result.labels == 0)
+    known = result.labels > 0
+    np.testing.assert_allclose(np.linalg.norm(normals[known], axis=1), 1, atol=1e-6)
+    assert ((normals * image.rays).sum(axis=2)[known] < 0).mean() > 0.99
+    truth = np.full((len(room.planes) + 1, 3), np.nan)
+    for plane in room.planes:
+        truth[plane.label] = plane.normal
+    cosine = (truth[np.where(room.labels <= len(room.planes), room.labels, 0)] * normals).sum(2)
+    angle = np.degrees(np.arccos(np.minimum(cosine[known & np.isfinite(cosine)], 1)))
+    # Of 305 directions, the nearest is at most 4.7 degrees away.
+    assert np.mean(angle < (0.1 if method == 'planes' else 5.0)) > 0.94
+
+
+def test_method_normals_gives_its_directions(room):
+    _, result = segmented(room, method='normals', direction_count=73)
+    known = directions('platonic', 73).astype(np.float32)
+    found = np.unique(result.normals[result.labels > 0], axis=0)
+    assert all((known == normal).all(axis=1).any() for normal in found)
+
+
+def test_edges_lie_on_both_sides_of_jumps():
+    depth = np.full(KINECT.shape, 2.0, np.float32)
+    depth[:, 80:] = 1.5
+    image = RangeImage.from_depth(depth, KINECT)
+    edges = Segmenter(Config()).segment(image).edges
+    assert edges.dtype == bool and np.flatnonzero(edges.any(axis=0)).tolist() == [79, 80]
+    assert edges[:, 79:81].all()
+    assert not Segmenter(Config(jump_edges='none')).segment(image).edges.any()
+
+
+def test_segment_writes_normals_as_red_green_blue(tmp_path, room, run):
+    path = tmp_path / 'a.tiff'
+    cv2.imwrite(str(path), room.depth)
+    (tmp_path / 'camera.yaml').write_text(
+        'image_width: 160\nimage_height: 120\ncamera_matrix: {rows: 3, cols: 3, data: '
+        f'[{KINECT.fx}, 0, {KINECT.cx}, 0, {KINECT.fy}, {KINECT.cy}, 0, 0, 1]}}\n'
+    )
+    segment = 'segment', path, '--camera', tmp_path / 'camera.yaml', '--output'
+    assert run(*segment, tmp_path, '--normals')[0] == run(*segment, tmp_path / 'plain')[0] == 0
+    assert not (tmp_path / 'plain/a_normals.tiff').exists()
+    # OpenCV reads blue, green, red.
+    written = cv2.imread(str(tmp_path / 'a_normals.tiff'), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    image = RangeImage.from_depth(room.depth, KINECT)
+    np.testing.assert_array_equal(written, Segmenter().segment(image).normals)
+
+
+def test_messages_hold_normals_and_edges(room):
+    image, result = segmented(room)
+    made = {}
+    for name in ('normals', 'edges'):
+        made[name] = OUTPUTS[name].message(lambda kind, **fields: fields, None, image, result)
+    assert made['normals']['encoding'] == '32FC3' and made['normals']['step'] == 160 * 12
+    sent = made['normals']['data'].view('<f4').reshape(120, 160, 3)
+    np.testing.assert_array_equal(sent, result.normals)
+    assert made['edges']['encoding'] == 'mono8'
+    np.testing.assert_array_equal(made['edges']['data'].reshape(120, 160) == 255, result.edges)
+
+
+def test_picture_of_normals():
+    normals = np.array([[[0, 0, -1], [1, 0, 0], [0, 1, 0], [np.nan] * 3]], np.float32)
+    expected = [[[128, 128, 255], [255, 128, 128], [128, 0, 128], [0, 0, 0]]]
+    np.testing.assert_array_equal(normals_picture(normals), expected)

@@ -1,4 +1,4 @@
-"""Tasks in many processes: results, failures, workers and parents that die."""
+"""Tasks in many processes, and signals: results, failures, workers and parents that die."""
 
 import os
 import signal
@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from processes import python, wait_for
 
 from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
 
@@ -134,14 +135,6 @@ def test_workers_end_with_their_parent(tmp_path, name):
         parent.kill()
 
 
-def wait_for(condition):
-    end = time.monotonic() + 60
-    while not (found := condition()):
-        assert time.monotonic() < end
-        time.sleep(0.1)
-    return found
-
-
 def descendants(parent):
     """Processes whose parent this is."""
     found = []
@@ -168,3 +161,56 @@ def test_addresses_of_schedulers():
     for address in ('foo', 'xyz://h:1', 'tcp://h', 'tcp://h:0', 'h:99999', ''):
         with pytest.raises(SchedulerError, match='no address'):
             check_scheduler(address)
+
+
+PRELUDE = """
+import ctypes, os, signal, threading
+import click
+from rangeseg_ros.cli import main, options
+def loop():
+    for item in options.progress(range(3), 3, 'item'):
+        print(item, flush=True)
+        BODY
+main.rangeseg = click.Command('rangeseg', callback=loop)
+main.main()
+"""
+LOST = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
+        except KeyboardInterrupt: pass"""
+WRAPPED = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
+        except KeyboardInterrupt as error: raise SystemError('in a kernel') from error"""
+MISTAKEN = """try: os.kill(os.getpid(), signal.SIGINT); sum(range(9))
+        except KeyboardInterrupt: raise ValueError('not a bag')"""
+IN_A_CALLBACK = """ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGINT))()"""
+BESIDE_A_THREAD_THAT_WAITS = """threading.Thread(target=threading.Event().wait).start()
+        os.kill(os.getpid(), signal.SIGINT)"""
+
+
+@pytest.mark.parametrize(
+    ('body', 'name', 'code'),
+    [
+        (LOST, 'SIGINT', 130),
+        (WRAPPED, 'SIGINT', 130),
+        (MISTAKEN, 'SIGTERM', 143),
+        (IN_A_CALLBACK, 'SIGTERM', 143),
+        (LOST, 'SIGHUP', 129),
+        (BESIDE_A_THREAD_THAT_WAITS, 'SIGINT', 130),
+    ],
+)
+def test_a_signal_ends_the_command(body, name, code):
+    body = body.replace('SIGINT', name).replace('KeyboardInterrupt', 'BaseException')
+    done = python(PRELUDE.replace('BODY', body))
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (code, '0\n', '')
+
+
+def test_who_ignores_interrupts_still_does():
+    def ignore():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    code = PRELUDE.replace('BODY', 'os.kill(os.getpid(), signal.SIGINT)')
+    done = python(code, preexec_fn=ignore)
+    assert (done.returncode, done.stdout) == (0, '0\n1\n2\n')
+
+
+def test_other_system_errors_are_shown():
+    done = python(PRELUDE.replace('BODY', "raise SystemError('without a reason')"))
+    assert done.returncode == 1 and 'without a reason' in done.stderr

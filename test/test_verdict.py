@@ -1,4 +1,4 @@
-"""What is doubtful about an image is said, enlarged images are read as what they were."""
+"""What is doubtful about an image is said; enlarged images and disparities are read as such."""
 
 from dataclasses import replace
 
@@ -7,11 +7,19 @@ import numpy as np
 import pytest
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmenter, segment
+from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.enlargement import enlargement, interpolation, replication
-from rangeseg_ros.core.sensing.verdict import filled_share, judge
+from rangeseg_ros.core.sensing.verdict import (
+    _share_of_range,
+    filled_share,
+    improbable_scale,
+    judge,
+)
+from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
+from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 SENSOR_NAMES = ['kinect', 'realsense', 'tof']
 FACTORS = [2, 3, 4, 6, 8]
@@ -153,6 +161,50 @@ def test_filled_holes_are_told_with_their_share(seen, axis):
     assert 0.01 < filled_share(image) <= holes
 
 
+@pytest.mark.parametrize(
+    ('run', 'jump', 'share'), [(6, 1.06, 0.03), (4, 0.5, 0.02), (3, 0.5, 0), (6, 1.04, 0)]
+)
+def test_what_copies_its_neighbour_up_to_a_jump_was_filled(run, jump, share):
+    draw, (height, width) = np.random.default_rng(2), (400, 200)
+    inverse = draw.uniform(0.5, 0.502, (height, width))
+    inverse[:, 101 - run : 101] = inverse[:, 100:101]
+    inverse[:, 101:] *= jump
+    camera = Camera(width, height, 200.0, 200.0, 99.5, 199.5)
+    for turned in (inverse, inverse[:, ::-1]):
+        image = RangeImage(camera.rays, turned.astype(np.float32), camera)
+        assert filled_share(image) == pytest.approx(share)
+
+
+def levels(steps):
+    """Range image of inverse ranges so many steps apart, each of 4 x 4 pixels."""
+    inverse = np.kron(np.cumsum([0.1, *steps])[None], np.ones((4, 4))).astype(np.float32)
+    return RangeImage(np.ones((*inverse.shape, 3), np.float32), inverse)
+
+
+@pytest.mark.parametrize('factor', [5.0, 0.2, 10.0, 0.1, 1000.0, 0.001, 1.0])
+def test_units_are_told_by_the_steps_of_a_kinect(factor):
+    step, told = 1 / (8 * 580 * 0.075) / factor, 0 if factor == 1 else factor
+    for off, count, expected in ((1.04, 40, told), (0.94, 40, 0), (1.0, 20, told), (1.0, 19, 0)):
+        assert improbable_scale(levels([off * step] * count)) == expected
+    # Half of the steps are even within a tenth, or less than half.
+    assert improbable_scale(levels([1.05 * step, step, 0.95 * step, 1.2 * step] * 10)) == told
+    assert (
+        improbable_scale(levels([step, 1.2 * step, 1.2 * step, 0.8 * step, 0.8 * step] * 9)) == 0
+    )
+
+
+def test_planes_tell_their_share_of_the_bend_of_ranges():
+    draw = np.random.default_rng(3)
+    rays = np.column_stack([draw.uniform(-0.5, 0.5, (2, 400)).T, np.ones(400)])
+    theta = np.array([0.1, -0.2, 0.5])
+    for share in (0, 0.5, 1):
+        inverse = (rays @ theta) * (1 + share * (1 / np.linalg.norm(rays, axis=1) - 1))
+        inverse += draw.normal(0, 1e-4, 400)
+        inverse[:20] += 0.1
+        found, variance = _share_of_range(rays, inverse, theta)
+        assert abs(found - share) < 4 * variance**0.5 < 0.02
+
+
 def test_curved_surfaces_keep_their_pixels():
     """In rooms with barrels and balls, seen by Kinects: not in each, but on nothing else."""
     truth = []
@@ -179,3 +231,65 @@ def test_errors_that_an_image_cannot_tell_are_said():
     depth = np.random.default_rng(0).uniform(1, 3, (20, 30)).astype(np.float32)
     result = segment(depth, Camera(30, 20, 26.0, 26.0, 14.5, 9.5))
     assert 'distortion not identifiable' in result.verdict.reasons
+
+
+@pytest.fixture(scope='module')
+def room():
+    return simulate_kinect(kinect_room(731), seed=731, sensor_seed=731)
+
+
+def disparities(frame, levels=None):
+    """As floats, or rounded to so many levels, in whatever unit."""
+    depth = frame.depth.astype(np.float64)
+    values = np.where(depth > 0, 3000 / np.maximum(depth, 1), 0)
+    if levels:
+        values = np.round(values * levels / values.max()) * 10 / levels
+    return RangeImage.from_depth(values.astype(np.float32), frame.camera)
+
+
+@pytest.mark.parametrize('levels', [None, 255])
+def test_disparities_are_found_and_segmented_as_such(room, levels):
+    image = disparities(room, levels)
+    assert shows_disparity(image)
+    result = Segmenter().segment(image)
+    assert result.image is image and result.verdict.invalid
+    assert result.verdict.reasons[0] == 'disparity instead of depth'
+    assert result.ground is None and not result.terrain.any()
+    depth = Segmenter().segment(RangeImage.from_depth(room.depth, room.camera))
+    assert depth.verdict.ok
+    for plane in depth.planes[:3]:
+        own = depth.labels == plane.label
+        same = result.labels == np.bincount(result.labels[own]).argmax()
+        assert (own & same).sum() > 0.9 * (own | same).sum()
+
+
+def test_disparities_of_disparities_are_depths(room):
+    """But for a factor."""
+    image = RangeImage.from_depth(room.depth, room.camera)
+    again = from_disparity(disparities(room)).inverse
+    np.testing.assert_array_equal(again > 0, image.valid)
+    ratio = again[image.valid] / image.inverse[image.valid]
+    np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+
+
+def test_nothing_is_told_from_little():
+    camera = kinect_camera()
+    for depth in (np.zeros(camera.shape, np.uint16), np.full(camera.shape, 2000, np.uint16)):
+        assert not shows_disparity(RangeImage.from_depth(depth, camera))
+
+
+@pytest.mark.parametrize('size', [(160, 120), (320, 240), (640, 480)])
+def test_a_crease_is_no_bend(size):
+    """Along a floor that meets a wall every block beside the other shows the same."""
+    camera = kinect_camera(*size)
+    depth = np.minimum(0.8 / np.maximum(camera.rays[..., 1], 1e-6), 3)
+    assert not shows_disparity(RangeImage.from_depth(depth, camera))
+    # A small image tells too little.
+    assert shows_disparity(RangeImage.from_depth(1 / depth, camera)) == (size[0] > 160)
+
+
+@pytest.mark.parametrize('focal', [1e4, 1e7, 1e12])
+def test_narrow_views_tell_nothing_and_pass(focal):
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+    depth = np.random.default_rng(1).uniform(1, 2, camera.shape)
+    assert not shows_disparity(RangeImage.from_depth(depth, camera))
