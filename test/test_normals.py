@@ -123,9 +123,6 @@ def test_the_platonic_distribution_leaves_no_large_gap():
         ('platonic', 300, '17, 73, 305'),
         ('regular', 24, 'odd square'),
         ('regular', 16, 'odd square'),
-        ('regular', 0, 'positive'),
-        ('spiral', 305, 'spiral'),
-        ('sunflower', 10, 'sunflower'),
     ],
 )
 def test_impossible_counts_are_refused(distribution, count, message):

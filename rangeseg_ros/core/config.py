@@ -254,11 +254,7 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
 
 
 def check_directions(distribution: str, count: int) -> None:
-    """Raise ConfigError if `distribution` cannot give `count` directions."""
-    if distribution not in ('platonic', 'regular'):
-        raise ConfigError(f'unknown distribution of directions {distribution!r}')
-    if count < 1:
-        raise ConfigError(f'parameter direction_count must be positive, not {count}')
+    """Raise ConfigError if `distribution`, a choice of `directions`, cannot give `count`."""
     root, given = math.isqrt(count), f'directions, not {count}'
     if distribution == 'platonic' and count not in PLATONIC_COUNTS:
         counts = ', '.join(map(str, PLATONIC_COUNTS))

@@ -82,7 +82,7 @@ def minimise_exactly(
 
 
 @njit(cache=True, nogil=True)
-def nearest_directions(
+def _nearest_directions(
     normals: NDArray[np.float32], directions: NDArray[np.float32]
 ) -> NDArray[np.int32]:
     """Direction (K, 3) nearest to each normal (h, w, 3), of any length: (h, w) index, else 0."""
@@ -102,7 +102,7 @@ def _nearest(
     normals: NDArray[np.float32], directions: NDArray[np.float32], size: int
 ) -> NDArray[np.int32]:
     """Direction nearest to the mean of each square's normals."""
-    return nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
+    return _nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
 
 
 def _seeds(
