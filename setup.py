@@ -143,7 +143,7 @@ setup(
     install_requires=[
         'click>=8.0',
         'mapbox-earcut>=1.0,<3',
-        # core/runtime/cache.py uses what it keeps to itself.
+        # kernel_cache.py uses what it keeps to itself.
         f'numba=={metadata.version("numba")}' if cpu else 'numba>=0.58.1,<0.69',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',

@@ -16,10 +16,10 @@ from numba import types
 from processes import python
 
 from rangeseg_ros import Config, RangeImage
+from rangeseg_ros import kernel_cache as cache
 from rangeseg_ros.compilation import preparation
 from rangeseg_ros.compilation.preparation import FIRST, KINDS, needs, prepare, rehearse
 from rangeseg_ros.compilation.worker import discover
-from rangeseg_ros.core.runtime import cache
 from rangeseg_ros.core.runtime.kernels import nothing_compiled
 from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -168,7 +168,7 @@ MODULES = {
 }
 CALL = """
 from pathlib import Path
-from rangeseg_ros.core.runtime.cache import drop_outdated
+from rangeseg_ros.kernel_cache import drop_outdated
 drop_outdated(Path('pack'))
 from pack.core.c import h
 from pack.core.d import k

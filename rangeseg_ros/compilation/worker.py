@@ -25,8 +25,8 @@ import cv2
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 
+from rangeseg_ros import kernel_cache as cache
 from rangeseg_ros.compilation.preparation import rehearse
-from rangeseg_ros.core.runtime import cache
 
 _MOST_PROCESSES = 4
 

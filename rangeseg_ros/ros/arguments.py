@@ -13,7 +13,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.utilities import remove_ros_args
 
 from rangeseg_ros.core.options import ConfigError, unknown_parameter
-from rangeseg_ros.core.runtime.cache import writable
+from rangeseg_ros.kernel_cache import writable
 from rangeseg_ros.messages.outputs import MAP_OUTPUTS, OUTPUTS
 from rangeseg_ros.ros.depth_input import input_topics
 from rangeseg_ros.ros.locator import IMU_TOPIC

@@ -18,7 +18,7 @@ import tempfile
 import warnings
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[2]
+PACKAGE = Path(__file__).parent
 # Beside the kernels of the core: the sources that all kernels of the package were compiled from.
 _SOURCES = Path('core', '__pycache__', 'compiled_from.json')
 # The same of wheels with compiled kernels: their processor, and version of numba.
