@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.ground.classes import DROP
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
@@ -147,11 +148,28 @@ def test_truth_ids_persist_while_the_camera_moves():
         assert moved.distance == pytest.approx(plane.distance - turn @ plane.normal @ shift)
 
 
-def test_a_wall_of_a_terrain_is_as_far_as_it_says():
+def test_parts_of_a_terrain_are_where_they_say():
     site = Site('', 0)
     site.wall(3.0)
-    distance, _ = cast([site.pieces[0].solid], (0, 0, 1), [(1, 0, 0), (0, 1, 0)])
-    assert distance.tolist() == [3, np.inf]
+    site.gap(1.0, 0.5)
+    site.table(2.0)
+    wall, *gap = (piece.solid for piece in site.pieces[:4])
+    assert cast([wall], (0, 0, 1), (1, 0, 0))[0] == 3
+
+    def depth(solids, places):
+        return cast(solids, places, np.broadcast_to((0, 0, -1.0), places.shape))[0]
+
+    places = np.array([(x, 0, 2) for x in (0.9, 1.25, 1.6)])
+    np.testing.assert_allclose(depth(gap, places), [2, 3, 2])
+    assert site.pieces[2].terrain == DROP
+    # Legs of 5 cm, half of that from the rim.
+    places = np.stack(np.mgrid[1.5:3.5:401j, -1.5:1.5:601j, 9:9:1j], axis=-1).reshape(-1, 3)
+    parts = [site.pieces[4:5], site.pieces[5:]]
+    tops = [np.isfinite(depth([piece.solid for piece in part], places)) for part in parts]
+    top, legs = ((places[hit].min(axis=0), places[hit].max(axis=0)) for hit in tops)
+    for end, inwards in enumerate((1, -1)):
+        np.testing.assert_allclose(legs[end][:2], top[end][:2] + inwards * 0.025, atol=0.006)
+    assert np.count_nonzero(tops[1]) == pytest.approx(4 * 10 * 10, rel=0.2)
 
 
 def test_pose_looks_where_it_says():
