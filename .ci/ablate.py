@@ -191,16 +191,14 @@ What each mechanism of the core costs, and what switching it off costs: `make ab
 release. The mechanisms are in `.ci/mechanisms.py`; `.ci/ablate.py` says how they are measured.
 {frames}
 
-- *lines*, *constants*: of its modules, or of its functions in them; *ms*: processor time it takes.
-- Other columns: the change when it is switched off, plus or minus the standard error over sensors,
-  kinds of scenes or rooms; of an option, off by default, what is lacking without it. IoU and
-  shares are in thousandths, angles in thousandths of a degree, lengths of tracks in tenths of a
-  frame.
-- IoU, the best of each true region, of sensors by their kind, of simulated rooms, and of those in
-  which 30 % of the pixels are lost (*holes*) or every second row and column (*enlarged*).
-  *curved*: share of what is not planar that is called a plane. In simulated rooms *border*: F
-  measure of borders within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median
-  error of normals.
+- *lines*, *constants*: of its modules or functions; *ms*: processor time it takes. Other columns:
+  the change when it is switched off, plus or minus the standard error over sensors, kinds of
+  scenes or rooms; of an option, off by default, what is lacking without it.
+- IoU in thousandths, of sensors by their kind, of simulated rooms, and of those in which 30 % of
+  the pixels are lost (*holes*) or every second row and column (*enlarged*). *curved*: share of
+  what is not planar that is called a plane. In simulated rooms *border*: F measure of borders
+  within 2 pixels; *faces*: IoU of faces seen in parts; *angle*: median error of normals,
+  thousandths of a degree. Lengths of tracks are in tenths of a frame.
 - *verdict*: earns by a gain above two standard errors in a column, or one over all sensors; harms
   by such a loss; *safety*: the kinds of scenes in which more than 1 % of a hazard is called ground
   without it; *not shown*: all changes are within chance.
