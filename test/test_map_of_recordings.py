@@ -148,12 +148,13 @@ def some_pose(k):
 
 
 def test_poses_become_transforms_at_the_stamps_of_their_images(folders, pack):
-    for k in range(6):
+    for k in range(5):
         np.savetxt(folders[1] / f'frame-{k}.pose.txt', some_pose(k))
     bag, output = pack('--rate', '10')
-    assert output.splitlines()[-2:] == [f'{bag}: 6 images', '6 poses']
+    told = '5 poses, 1 without: no pose for frame-000005.depth.png'
+    assert output.splitlines()[-2:] == [f'{bag}: 6 images', told]
     with RecordedTransforms(bag, timeout=0.0) as transforms:
-        for k in range(6):
+        for k in range(5):
             stamp = 10**9 + k * 10**8
             found = transforms.lookup('world', FRAME, stamp, stamp)
             np.testing.assert_allclose(found.rotation, some_pose(k)[:3, :3], atol=1e-9)

@@ -136,6 +136,19 @@ def test_nav2_reads_the_map(folders):
     assert at(AHEAD + 1, 0.3) == 'unknown'
 
 
+def test_the_picture_shows_the_cells_of_the_map(folders):
+    about = yaml.safe_load((folders / 'level/map.yaml').read_text())
+    shades = cv2.imread(str(folders / 'level' / about['image']), cv2.IMREAD_UNCHANGED)[::-1]
+    picture, side = ET.parse(folders / 'level/plan.svg').getroot(), about['resolution']
+    for name, shade in (('free', 254), ('obstacles', 0)):
+        shown = np.zeros(shades.shape, bool)
+        for rect in picture.find(f'{{*}}g[@id="{name}"]'):
+            x, y, width = (float(rect.get(key)) for key in ('x', 'y', 'width'))
+            column, row = np.rint((np.array([x, -y]) - about['origin'][:2]) / side).astype(int)
+            shown[row - 1, column : column + round(width / side)] = True
+        np.testing.assert_array_equal(shown, shades == shade)
+
+
 def test_other_programs_open_the_files(folders):
     folder = folders / 'level'
     document = ezdxf.readfile(folder / 'plan.dxf')
