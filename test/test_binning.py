@@ -190,3 +190,10 @@ def test_clouds_and_bodies_are_halved(image):
 def test_budgets_are_for_method_planes():
     with pytest.raises(ConfigError, match='work_budget'):
         Config(work_budget=0.95, method='normals')
+
+
+def test_planes_scatter_by_the_noise_of_pixels_and_not_of_bins():
+    depth = 2 + np.random.default_rng(0).normal(0, 0.004, (480, 640))
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    (plane,) = Segmenter().segment(RangeImage.from_depth(depth, camera)).planes
+    assert plane.rms == pytest.approx(0.004, rel=0.03)

@@ -133,7 +133,8 @@ class Segmenter:
             fits = Fits.of(regions, view.image, stated, view.blocks)
             probability = plane_probabilities(fits, config.plane_prior)
         watch.lap('regions')
-        planes = describe_regions(regions, view.whole, fits, probability)
+        pixels = sensor if config.method == 'planes' else stated
+        planes = describe_regions(regions, view.whole, fits, probability, pixels)
         # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
         # or so steep that they have no end.
         kept = np.zeros(len(fits.theta), np.uint16)

@@ -16,7 +16,7 @@ from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import random_variance, systematic_variance
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 
 # A border is taken seriously up to this many times the range of the farthest part of its plane.
 _FAR = 2.0
@@ -167,10 +167,12 @@ def describe_regions(
     image: RangeImage,
     fits: Fits,
     probability: NDArray[np.float64] | None = None,
+    sensor: SensorModel | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given.
+    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given, `sensor`
+    that of pixels, where the image is of their means.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
@@ -178,7 +180,7 @@ def describe_regions(
         return []
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
-    normal, distance, centroid, rms, confidence, farthest = _described(fits)
+    normal, distance, centroid, rms, confidence, farthest = _described(fits, sensor or fits.sensor)
     covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     if image.place.any():
         # From the sensor to the frame of the points.
@@ -203,7 +205,7 @@ def describe_regions(
     return list(map(Plane, *columns))
 
 
-def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
+def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ...]:
     """What regions 0...M have as planes, see `Plane`.
 
     Normal, distance, centroid, rms, confidence, and the inverse range at which the plane ends for
@@ -226,12 +228,18 @@ def _described(fits: Fits) -> tuple[NDArray[np.float64], ...]:
     region = np.repeat(np.arange(len(theta)), np.diff(fits.sums.start))
     level = (theta[region] * cells[:, RAY : RAY + 3]).sum(axis=1) / cells[:, WEIGHT]
     squared = np.where(level > 0, level * level, 1.0)
-    variance = random_variance(fits.sensor, squared) + systematic_variance(fits.sensor, squared)
     pixels = np.bincount(region, cells[:, COUNT], len(theta))
-    expected = np.bincount(region, cells[:, COUNT] * variance / squared, len(theta))
-    expected = expected / np.maximum(pixels, 1) * distance**2
+
+    def across(variance: NDArray[np.float64]) -> NDArray[np.float64]:
+        total = np.bincount(region, cells[:, COUNT] * variance / squared, len(theta))
+        return total / np.maximum(pixels, 1) * distance**2
+
+    random = random_variance(fits.sensor, squared)
+    expected = across(random + systematic_variance(fits.sensor, squared))
+    hidden = across(random_variance(sensor, squared) - random)
     farthest = np.where(pixels > 0, np.inf, 0.0)
     np.minimum.at(farthest, region, level / _FAR)
     explained = np.minimum(1, expected / np.maximum(square, 1e-18))
     confidence = (1 - fits.outlier_share()) * explained
-    return normal, distance, centroid, np.sqrt(np.maximum(square, 0)), confidence, farthest
+    rms = np.sqrt(np.maximum(square, 0) + hidden)
+    return normal, distance, centroid, rms, confidence, farthest
