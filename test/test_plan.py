@@ -140,6 +140,8 @@ def test_the_picture_shows_the_cells_of_the_map(folders):
     about = yaml.safe_load((folders / 'level/map.yaml').read_text())
     shades = cv2.imread(str(folders / 'level' / about['image']), cv2.IMREAD_UNCHANGED)[::-1]
     picture, side = ET.parse(folders / 'level/plan.svg').getroot(), about['resolution']
+    legend = [text.text for text in picture.iterfind('.//{*}g[@id="legend"]/{*}text')]
+    assert legend[1:] == ['to 2 mm', 'to 5 mm', 'to 10 mm', 'to 20 mm', 'more']
     for name, shade in (('free', 254), ('obstacles', 0)):
         shown = np.zeros(shades.shape, bool)
         for rect in picture.find(f'{{*}}g[@id="{name}"]'):
