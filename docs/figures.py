@@ -10,7 +10,7 @@ python docs/figures.py --detection DETECTION.json PICTURE.png: what `rangeseg ev
 of test pieces.
 
 python docs/figures.py --comparison DEPTH CAMERA.yaml PICTURE.png PEAC.png: a frame, and the planes
-of RANSAC, of PEAC as labels of 16 bits, which is built from source, and of this package.
+of RANSAC, of PEAC as labels of 16 bits, which pip does not install, and of this package.
 docs/comparison.png is of the third depth image of ch5/rgbd of
 https://github.com/gaoxiang12/slambook2 (MIT licence), PEAC with windows of 5, support 1000.
 """

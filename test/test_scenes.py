@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rangeseg_ros.core.ground.classes import DROP
 from scipy.spatial.transform import Rotation
 
+from rangeseg_ros.core.ground.cells import DROP
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera

@@ -10,10 +10,10 @@ import pytest
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.labelling import (
+    _nearest_directions,
     degrees,
     minimise,
     minimise_exactly,
-    nearest_directions,
 )
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -182,7 +182,7 @@ def test_the_first_of_the_nearest_directions_is_taken():
     normals = np.random.default_rng(1).normal(size=(6, 7, 3)).astype(np.float32)
     normals[0], normals[1] = 0, np.nan
     expected = (np.nan_to_num(normals) @ DIRECTIONS.T).argmax(axis=2)
-    found = nearest_directions(normals, DIRECTIONS)
+    found = _nearest_directions(normals, DIRECTIONS)
     np.testing.assert_array_equal(found, expected)
 
 

@@ -75,7 +75,7 @@ def command(
     clouds = any(path.suffix.lower() in CLOUDS for path, _ in frames)
     kinds = ('image', 'points') if clouds else ('image',)
     prepare(config, kinds, show, _SHOWN)
-    tilts = []
+    tilted = 0
     for path, scale in options.progress(frames, len(frames), 'image'):
         try:
             image = corrected(read_frame(path, intrinsics, scale), config)
@@ -91,10 +91,10 @@ def command(
         if not result.verdict.ok:
             click.echo(f'rangeseg: {path}: {result.verdict}', err=True)
         if result.tilt:
-            tilts.append((path, result.tilt))
+            tilted += 1
+            if tilted == 1:
+                click.echo(f'rangeseg: {path}: {result.tilt}', err=True)
         if sensor:
             click.echo(f'{path}: {result.sensor}')
-    if tilts:
-        path, worst = max(tilts, key=lambda found: found[1].degrees)
-        others = f' ({len(tilts) - 1} more images like it)' if len(tilts) > 1 else ''
-        click.echo(f'rangeseg: {path}: {worst}{others}', err=True)
+    if tilted > 1:
+        click.echo(f'rangeseg: the stated up is off in {tilted} images', err=True)

@@ -48,12 +48,13 @@ class CalibrationError(ValueError):
 
 
 class Fold(NamedTuple):
-    """A block of frames that is left out, and the field (K, G) of the others, 1/m.
+    """One block of frames, first and last, left out, and the field (K, G) of the others, 1/m.
 
     Root mean square residual of the cells of the block, without and with the field, 1/m, and the
     sum of the weights of these cells.
     """
 
+    frames: tuple[int, int]
     field: NDArray[np.float64]
     before: float
     after: float
@@ -73,6 +74,7 @@ class Calibration(NamedTuple):
 
     distortion: DistortionMap
     views: NDArray[np.intp]
+    folds: list[Fold]
     before: float
     after: float
 
@@ -129,7 +131,7 @@ def calibrate(
     )
     squares = np.square([(fold.before, fold.after) for fold in folds])
     mean = np.sqrt(np.average(squares, axis=0, weights=[fold.weight for fold in folds]))
-    return Calibration(distortion, views, float(mean[0]), float(mean[1]))
+    return Calibration(distortion, views, folds, float(mean[0]), float(mean[1]))
 
 
 def _views(seen: Sightings, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -191,7 +193,8 @@ def _folds(
         before, counts = residuals(test, test.inverse), robust_weights(test, 0.0)
         after = before - residuals(test, (basis[:, ~out] * field[:, test.cell]).sum(axis=0))
         rms = [float(np.sqrt(np.average(part**2, weights=counts))) for part in (before, after)]
-        found.append(Fold(field, rms[0], rms[1], float(counts.sum())))
+        ends = int(test.frame.min()), int(test.frame.max())
+        found.append(Fold(ends, field, rms[0], rms[1], float(counts.sum())))
     return found
 
 
