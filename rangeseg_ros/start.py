@@ -13,6 +13,9 @@ for number, name in enumerate(('stdin', 'stdout', 'stderr')):
         stream = os.open(os.devnull, os.O_RDWR)  # the lowest number that is free: this one
         setattr(sys, name, open(stream, 'w' if number else 'r'))  # noqa: SIM115
 
+# Frames are worked on in parallel already; threads of the linear algebra would spin beside that.
+os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
+
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda number, stack: os._exit(130))
 

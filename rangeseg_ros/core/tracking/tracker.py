@@ -56,7 +56,7 @@ class Tracks(NamedTuple):
     width: NDArray[np.float64]  # half of that of the rectangle around each plane, metres
     reach: NDArray[np.float64]  # half of its diagonal
     unseen: NDArray[np.float64]  # seconds since they were last seen
-    mask: NDArray[np.float32]  # (N, S), in which samples of the label image that was
+    mask: NDArray[np.bool_]  # (N, S), in which samples of the label image that was
 
     @classmethod
     def of(cls, planes: Sequence[Plane], labels: NDArray[np.uint16]) -> Tracks:
@@ -74,13 +74,23 @@ class Tracks(NamedTuple):
             np.maximum(extents.min(axis=1, initial=np.inf) / 2, NARROWEST),
             np.asarray(np.linalg.norm(extents, axis=1)) / 2,
             np.zeros(len(planes)),
-            (coarse == own[:, None]).astype(np.float32),
+            coarse == own[:, None],
         )
 
     @property
-    def size(self) -> NDArray[np.float32]:
+    def size(self) -> NDArray[np.intp]:
         """(N,) number of samples of each plane."""
         return self.mask.sum(axis=1)
+
+    def shared(self, others: Tracks) -> NDArray[np.intp]:
+        """(N, M) samples in common with the planes of one image, which have none in common.
+
+        Counted, as a product of matrices wakes all threads of the linear algebra, which then spin.
+        """
+        count = len(others.id)
+        number = np.arange(1, count + 1) @ others.mask
+        counts = [np.bincount(number[own], minlength=count + 1)[1:] for own in self.mask]
+        return np.array(counts, np.intp).reshape(len(self.id), count)
 
     @property
     def range(self) -> NDArray[np.float64]:
@@ -153,7 +163,7 @@ class Tracker:
         self._stamp, self._shape = stamp, labels.shape
         seen = Tracks.of(planes, labels)
         known = self._tracks or Tracks.of([], labels)
-        shared = known.mask @ seen.mask.T
+        shared = known.shared(seen)
         # Planes that were in sight and have half of their pixels in common.
         sure = 2 * shared > np.maximum(known.size[:, None], seen.size)
         sure &= (known.unseen == 0)[:, None] & _near(known, seen)
@@ -250,7 +260,7 @@ def _camera_motion(
     return rotation, shift
 
 
-def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.float32]) -> NDArray[np.intp]:
+def _assign(known: Tracks, seen: Tracks, shared: NDArray[np.intp]) -> NDArray[np.intp]:
     """(N,) id of the known plane that each plane is, 0 for none."""
     # Here, as it takes as long to import as a frame and is for sequences only.
     from scipy.optimize import linear_sum_assignment
