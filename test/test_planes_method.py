@@ -7,6 +7,7 @@ import pytest
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage, UnitWarning
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
@@ -133,3 +134,16 @@ def test_faces_of_twenty_pixels_are_planes_of_their_own():
     result = segmented(depth, camera)
     assert [int(result.labels[205, left]) > 1 for left in (105, 305, 505)] == [True, True, False]
     assert len(result.planes) == 3
+
+
+@pytest.mark.parametrize('offset', range(4))
+def test_a_board_a_third_larger_than_the_smallest_plane_is_found_wherever_it_is(offset):
+    """Blocks that its rim crosses are not its own."""
+    camera = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+    depth = 2 + np.random.default_rng(0).normal(0, 0.002, camera.shape)
+    board = np.s_[200 + offset : 220 + offset, 300 + offset : 320 + offset]
+    depth[board] -= 0.4
+    labels = segmented(depth, camera).labels
+    label = np.bincount(labels[board].ravel()).argmax()
+    assert label > 0 and (labels[board] == label).mean() > 0.9
+    assert (labels == label).sum() < 1.1 * 400
