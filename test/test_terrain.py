@@ -321,6 +321,19 @@ def test_ground_leads_over_gaps_that_the_robot_crosses(gap, kept):
     assert abs((terrain.classes[beyond] == GROUND).mean() - kept) < 0.03
 
 
+def test_without_a_height_one_ground_in_ten_may_lie_behind_a_step():
+    """Neither an image nor those before it tell; a height that is stated does."""
+    floor = scene(Piece(FLOOR, GROUND))
+    image = RangeImage.from_depth(simulate_terrain(floor, Kinect(), CAMERA).depth, CAMERA)
+    told = []
+    for height in (0.0, HEIGHT):
+        sequence = SequenceSegmenter(Config(sensor_height=height))
+        results = [sequence.segment(image, k * 10**8, floor.up) for k in range(1, 4)]
+        assert all((result.terrain == GROUND).any() for result in results)
+        told.append([result.ground.stand.confidence for result in results])
+    assert max(told[0]) <= 0.9 < 0.99 < min(told[1]), told
+
+
 def test_a_table_alone_is_no_floor():
     table = box((1.2, 1.6, 0.03), np.eye(3), (0.8, 0, 0.7))
     pieces = [(FLAT, GROUND), (table, OBSTACLE, 0.7)]

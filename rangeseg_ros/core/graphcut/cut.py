@@ -12,8 +12,9 @@ is not free, x_q is known, 1 if it has the label alpha and 0 otherwise, and the 
 cost of staying or of switching.
 
 The cut is found by the algorithm of Boykov and Kolmogorov (TPAMI 2004), made for such grids: a
-tree grows from either terminal over edges that are not saturated; where the two meet, flow is
-pushed along the path, and nodes that this cuts off look for another parent in their tree.
+tree grows from the sink over edges that are not saturated; where it meets a node that the source
+feeds, flow is pushed along the path, and nodes that this cuts off look for another parent in their
+tree. The tree of the source need not grow: most nodes stay, at once.
 """
 
 from __future__ import annotations
@@ -73,7 +74,8 @@ def minimum_cut(
     for p in range(count):
         if flow.terminal[p] != 0:
             flow.parent[p], flow.sink[p], flow.depth[p] = _TERMINAL, flow.terminal[p] < 0, 1
-            last = _wait(flow, p, last)
+            if flow.sink[p]:
+                last = _wait(flow, p, last)
     time = 0
     while count > 0 and flow.queued[flow.queue[first]]:
         p = flow.queue[first]
@@ -118,8 +120,7 @@ def minimum_cut(
                 if r < 0 or flow.parent[r] == _FREE or flow.sink[r] != flow.sink[q]:
                     continue
                 opposite = k ^ 2
-                free = flow.residual[q, k] if flow.sink[q] else flow.residual[r, opposite]
-                if free > 0:
+                if flow.sink[q] and flow.residual[q, k] > 0:
                     last = _wait(flow, r, last)
                 if flow.parent[r] == opposite:
                     flow.parent[r] = _ORPHAN

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.ground.estimate import STEPS
 from rangeseg_ros.core.ground.grid import GroundGrid, GroundMemory
 from rangeseg_ros.core.ground.roles import unit
 from rangeseg_ros.core.ground.terrain import Terrain, terrain_of
@@ -58,6 +59,10 @@ class Survey:
         if cells is not None:
             pixels = [cells.enlarged(values, self.image.shape) for values in found[:2]]
             found = found._replace(classes=pixels[0], height=pixels[1])
+        if self.sensor_height <= 0:
+            # Nothing that is stated rules out a step out of view.
+            confidence = min(found.stand.confidence, 1 - STEPS)
+            found = found._replace(stand=found.stand._replace(confidence=confidence))
         if found.stand.found:
             self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found
