@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros import Config, RangeImage
 from rangeseg_ros.core.mapping.adjustment import Adjustment
+from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.mount import mount_of
 from rangeseg_ros.core.mapping.observations import PoseNoise, views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
@@ -47,6 +48,7 @@ class Frame(NamedTuple):
     terrain: np.ndarray
     pose: Transform
     faces: np.ndarray
+    edges: JumpPoints
 
 
 def walked(scene: Scene, seed: int) -> Iterator[Frame]:
@@ -62,7 +64,8 @@ def walked(scene: Scene, seed: int) -> Iterator[Frame]:
         for plane in view.planes:
             number[plane.label] = plane.face
         seen = found.labels, found.planes, found.terrain
-        yield Frame(stamp, image, *seen, pose, number[view.labels])
+        edges = JumpPoints.of(image, found.jumps, found.cells)
+        yield Frame(stamp, image, *seen, pose, number[view.labels], edges)
 
 
 def measure_map(*seeds: str) -> None:
@@ -191,7 +194,8 @@ def second(frames: list[Frame], most: int) -> tuple[float, ...]:
     for frame in frames:
         planes = of_orientations(frame.planes, most)
         seen = views(frame.labels, planes, CONFIG.distortion_length)
-        motions.append(odometry.add(planes, seen, frame.stamp, first.rotation[2]))
+        up = first.rotation[2]
+        motions.append(odometry.add(planes, seen, frame.stamp, up, edges=frame.edges))
     motion = motions[-1]
     truth = motions[0].pose.after(first.inverse()).after(frames[-1].pose)
     turn = Rotation.from_matrix(truth.rotation @ motion.pose.rotation.T).as_rotvec()

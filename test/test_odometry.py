@@ -10,9 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import PlaneOdometry
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.options import ConfigError
+from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -22,7 +25,7 @@ from rangeseg_ros.messages.motion import odometry_message
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
-from rangeseg_ros.simulation.solids import half_space
+from rangeseg_ros.simulation.solids import box, half_space
 
 CAMERA = kinect_camera(160, 120)
 CONFIG = Config()
@@ -99,6 +102,86 @@ def test_what_planes_do_not_hold_is_known_less_and_less(walls):
         assert max(forward, left) < 0.05 and max(roll, pitch, yaw) < np.radians(2)
     error = errors_of(motions[-1], truths[-1])
     assert error @ np.linalg.solve(motions[-1].covariance, error) < 22  # 0.999 of six
+
+
+def test_the_ends_of_a_box_tell_the_motion_along_two_walls():
+    """Sliding up along both, past a box on one of them; without its edges nobody knows."""
+    box_ = box((0.4, 0.5, 0.3), np.eye(3), (2.3, 0.2, 1.0))
+    walls = half_space((-1, 0, 0), (2.5, 0, 0)), half_space((0, -1, 0), (0, 1.0, 0))
+    poses = [Pose.looking((0, 0, 0.9 + 0.01 * k), 10, 0, 0) for k in range(13)]
+    scene, up, ends = Scene((*walls, box_), tuple(poses)), poses[0].rotation[2], []
+    for with_edges in (False, True):
+        odometry = PlaneOdometry()
+        for k in range(0, 13, 2):
+            labels, planes = planes_of(scene, k, 5)
+            image = RangeImage.from_depth(simulate_kinect(scene, CAMERA, frame=k).depth, CAMERA)
+            result = Segmenter().segment(image)
+            edges = JumpPoints.of(image, result.jumps, result.cells) if with_edges else None
+            held = [plane for plane in planes if abs(plane.normal @ up) < 0.5]
+            view = views(labels, held, CONFIG.distortion_length)
+            motion = odometry.add(held, view, 10**9 + k * 10**9 // 30, up, edges=edges)
+        rise, height = motion.pose.shift[2], motion.covariance[2, 2] ** 0.5
+        assert abs(rise - 0.12) < 3 * height
+        ends.append((abs(rise - 0.12), height))
+    assert ends[0][1] > 0.05 > 0.02 > max(ends[1])
+
+
+def outline_of(turn, shift, random):
+    """Points on edges of three directions, as cameras with errors see them."""
+    corner = np.array([[0.3, -0.2, 2.0], [-0.5, 0.3, 2.5], [0.2, 0.4, 3.0]])
+    along = np.linspace(0, 0.6, 200)[:, None]
+    lines = [corner[k] + along * np.roll([1.0, 0.3, 0.1], k) for k in range(3)]
+    points = (np.concatenate(lines) - shift) @ turn
+    return JumpPoints(points + random.normal(0, 0.002, points.shape), 0.004)
+
+
+def test_points_at_jump_edges_tell_a_known_motion_as_well_as_is_said():
+    random, values, shifts = np.random.default_rng(0), [], []
+    prior = np.diag(np.repeat([0.03, 0.05, 1e-9, 1e-9], 3) ** 2)
+    for _ in range(30):
+        before, pose = Transform.identity(), Transform.identity()
+        turn, shift = random.normal(0, 0.02, 3), random.normal(0, 0.03, 3)
+        true = pose.by(np.concatenate([turn, shift]))
+        last, now = (outline_of(*each, random) for each in (before, true))
+        design, told = now.motion(last, before, pose, prior)
+        information = design.T @ design + np.linalg.inv(prior)
+        error = np.linalg.solve(information, design.T @ told)[:6] - np.concatenate([turn, shift])
+        shifts.append(np.linalg.norm(error[3:]))
+        values.append(error @ np.linalg.solve(np.linalg.inv(information)[:6, :6], error) / 6)
+    # Independent points, which these are, tell more than is said of points along an edge.
+    assert 0.005 < np.mean(values) < 1 and np.median(shifts) < 0.01
+
+
+def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
+    points = np.array([0.0, 0.0, 2.0]) + np.linspace(-0.5, 0.5, 100)[:, None] * [1.0, 0, 0]
+    edge, pose = JumpPoints(points, 0.004), Transform.identity()
+    prior = np.eye(12) * 0.01
+    design, _ = edge.motion(edge, pose, pose, prior)
+    across = np.abs(design[:, 3:6]).max(axis=0)
+    assert across[1] > 10 and across[0] < 1e-6 * across[1] > across[2]
+    # What both poses err by alike is not seen.
+    turned = pose.by(np.array([0.3, -0.2, 0.5, 1.0, 2.0, 3.0]))
+    design, _ = edge.motion(edge, turned, turned, prior)
+    np.testing.assert_allclose(design[:, :6], -design[:, 6:], atol=1e-6)
+    few = JumpPoints(points[:15], 0.004)
+    assert not few.motion(edge, pose, pose, prior)[0].size
+    assert not edge.motion(JumpPoints.none(), pose, pose, prior)[0].size
+
+
+def test_jump_points_are_on_the_near_side():
+    inverse = np.full((40, 60), 0.5, np.float32)
+    inverse[10:30, 20:40] = 1.0
+    inverse[:, 50:] = 0  # not measured
+    camera = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
+    image = replace(RangeImage.from_depth(1 / np.maximum(inverse, 0.1), camera), inverse=inverse)
+    right = np.abs(np.diff(inverse, axis=1)) > 0.2
+    below = np.abs(np.diff(inverse, axis=0)) > 0.2
+    found = JumpPoints.of(image, (right, below), None)
+    assert len(found.points) == 2 * (20 + 20) - 4
+    np.testing.assert_allclose(found.points[:, 2], 1.0)
+    rows = found.points[:, 1] * 50 + 19.5
+    assert rows.min() == pytest.approx(10) and rows.max() == pytest.approx(29)
+    assert found.width == pytest.approx(1 / 50, rel=0.1)
 
 
 def test_other_planes_under_known_ids_do_not_make_it_jump():

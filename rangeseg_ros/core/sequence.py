@@ -13,6 +13,7 @@ from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.grid import GroundMemory
 from rangeseg_ros.core.ground.roles import roles, unit
 from rangeseg_ros.core.ground.survey import Survey
+from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.observations import views
 from rangeseg_ros.core.mapping.odometry import Motion, PlaneOdometry
@@ -134,7 +135,10 @@ class SequenceSegmenter:
         if config.odometry:
             towards = unit((config.up_x, config.up_y, config.up_z)) if up is None else up
             seen = views(result.labels, planes, config.distortion_length)
-            found = self._odometry.add(planes, seen, stamp, towards, image.axes)
+            edges = None
+            if result.jumps is not None:
+                edges = JumpPoints.of(image, result.jumps, result.cells)
+            found = self._odometry.add(planes, seen, stamp, towards, image.axes, edges)
             self.motion = found.of_origin(image.place)
             if not config.fixed_frame:
                 if not found.held and len(self.map):

@@ -8,6 +8,7 @@ state has the errors of
 * the velocity in the camera's axes, turning and going: an Ornstein-Uhlenbeck process (Uhlenbeck
   and Ornstein, "On the theory of the Brownian motion", 1930). Where planes hold the camera it is
   measured, and where they do not, it makes the covariance of the pose grow without bound;
+* the pose of the frame before, which the points at jump edges tell the motion from;
 * each plane, as the sensor shows it: x of `plane_errors`. The error that lasts is a part of the
   landmark, which changes as much as the plane comes to be seen by other pixels.
 
@@ -32,6 +33,7 @@ from scipy.linalg import block_diag
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
+from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
     Observations,
@@ -49,8 +51,10 @@ from rangeseg_ros.core.tracking.tracker import NOMINAL, PERSISTENCE
 # of how it errs, as small regions are seldom what they seem.
 _PLANES = 8
 _ROUNDS = 4
-# Errors of the pose and of the velocity come first in the state, then three of each plane.
-_CAMERA = 12
+# Errors of the pose, of the velocity and of the pose before come first in the state, then three of
+# each plane.
+_CAMERA = 18
+_POSES = np.r_[:6, 12:18]
 
 
 class Motion(NamedTuple):
@@ -103,7 +107,8 @@ class PlaneOdometry:
         self._id = np.zeros(0, np.int64)
         self._planes = PlaneSet.of([])
         self._view = np.zeros((0, 0))
-        self._covariance = np.diag(np.concatenate([np.zeros(6), self._spread**2]))
+        self._edges, self._before = JumpPoints.none(), Transform.identity()
+        self._covariance = np.diag(np.concatenate([np.zeros(6), self._spread**2, np.zeros(6)]))
 
     @property
     def _spread(self) -> NDArray[np.float64]:
@@ -117,12 +122,14 @@ class PlaneOdometry:
         stamp: int,
         up: ArrayLike,
         axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        edges: JumpPoints | None = None,
     ) -> Motion:
         """Take in the planes of the next frame, tracked, with their `views`.
 
         When stamps, nanoseconds, do not tell, as much time as is common has passed. Of the first
         frame, `up` (3,) counts, and the `axes` (3, 3) that are right, down and forward in the
-        image, both in the frame of the image as the planes are.
+        image, both in the frame of the image as the planes are. `edges` are the ends of what is in
+        sight.
         """
         pose = self._pose or Transform(level(np.array(up, float), np.array(axes)), np.zeros(3))
         if self._pose:
@@ -137,6 +144,7 @@ class PlaneOdometry:
         if len(self._id):
             order = {number: m for m, number in enumerate(ids.tolist())}
             pose = self._update(pose, seen.where([order[own] for own in self._id.tolist()]))
+        pose = self._align(pose, edges or JumpPoints.none())
         held, new = len(self._id), ~np.isin(ids, self._id)
         self._append(pose, seen.where(new), ids[new])
         self._pose = pose
@@ -164,18 +172,19 @@ class PlaneOdometry:
         change[3:6, :3] = -reach * turn @ cross_matrix(going)
         # From the velocity to the pose: the turn is in the camera's axes, the shift is not.
         outwards = block_diag(np.eye(3), turn)
-        change[:6, 6:_CAMERA] = reach * outwards
-        change[6:_CAMERA, 6:_CAMERA] *= kept
+        change[:6, 6:12] = reach * outwards
+        change[6:12, 6:12] *= kept
+        change[12:_CAMERA] = np.eye(6, len(change))
         # Of the path and the velocity, for unit variance; the axes are alike, so that no rotation
         # counts.
         path = PERSISTENCE**2 * (2 * part - 3 + 4 * kept - kept**2)
         both, speed = PERSISTENCE * (1 - kept) ** 2 * outwards, 1 - kept**2
         variance = np.diag(self._spread**2)
         self._covariance = change @ self._covariance @ change.T
-        self._covariance[:_CAMERA, :_CAMERA] += np.block(
+        self._covariance[:12, :12] += np.block(
             [[path * variance, both @ variance], [variance @ both.T, speed * variance]]
         )
-        self._velocity = kept * self._velocity
+        self._velocity, self._before = kept * self._velocity, pose
         return Transform(turn @ twist, shift + reach * turn @ going)
 
     def _update(self, pose: Transform, seen: Observations) -> Transform:
@@ -203,16 +212,38 @@ class PlaneOdometry:
                 # What the state leaves of the gaps.
                 value = mahalanobis(gap - (flat @ step).reshape(-1, 3), noise)
                 weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(value, 1e-12)))
-            left = np.eye(len(gain)) - gain @ flat
-            covariance = left @ self._covariance @ left.T + gain @ error @ gain.T
-            self._covariance = (covariance + covariance.T) / 2
-            turn, shift = pose
-            pose = Transform(turn @ rotation_by(step[:3]), shift + step[3:6])
-            self._velocity = self._velocity + step[6:_CAMERA]
-            self._planes = self._planes.without(step[_CAMERA:].reshape(-1, 3))
+            pose = self._corrected(pose, step, gain, flat, error)
             fits[fits] = value < GATE
         self._keep(fits)
         return pose
+
+    def _align(self, pose: Transform, edges: JumpPoints) -> Transform:
+        """Take in where the edges of the frame before are now."""
+        last, self._edges = self._edges, edges
+        prior = self._covariance[np.ix_(_POSES, _POSES)]
+        told, values = edges.motion(last, self._before, pose, prior)
+        design, noise = np.zeros((len(values), len(self._covariance))), np.eye(len(values))
+        design[:, _POSES] = told
+        expected = design @ self._covariance
+        gain = np.linalg.solve(expected @ design.T + noise, expected).T
+        return self._corrected(pose, gain @ values, gain, design, noise)
+
+    def _corrected(
+        self,
+        pose: Transform,
+        step: NDArray[np.float64],
+        gain: NDArray[np.float64],
+        design: NDArray[np.float64],
+        noise: NDArray[np.float64],
+    ) -> Transform:
+        """The pose without the errors `step` that measurements show; in place the rest."""
+        left = np.eye(len(gain)) - gain @ design
+        covariance = left @ self._covariance @ left.T + gain @ noise @ gain.T
+        self._covariance = (covariance + covariance.T) / 2
+        self._velocity = self._velocity + step[6:12]
+        self._before = self._before.by(step[12:_CAMERA])
+        self._planes = self._planes.without(step[_CAMERA:].reshape(-1, 3))
+        return pose.by(step[:6])
 
     def _append(self, pose: Transform, seen: Observations, ids: NDArray[np.int64]) -> None:
         """Planes seen for the first time: x = -(what the pose errs by) - v."""
@@ -237,7 +268,7 @@ class PlaneOdometry:
 
 
 def _by_camera(planes: PlaneSet, pose: Transform) -> NDArray[np.float64]:
-    """(N, 3, 12) derivatives of planes (N,) that a camera sees by its pose and its velocity."""
+    """(N, 3, 18) derivatives of planes (N,) that a camera sees by its pose; 0 by the rest."""
     design = np.zeros((len(planes.normal), 3, _CAMERA))
     design[:, :, :6] = planes.by_motion(np.zeros(3))
     # The shift is in the fixed frame.

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.rotations import rotation_matrix
+from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
 
 CACHE_TIME = 10 * 10**9
 """Nanoseconds that the past of a frame is kept, as by default in tf2."""
@@ -76,6 +76,14 @@ class Transform(NamedTuple):
     def after(self, first: Transform) -> Transform:
         """This motion after `first`."""
         return Transform(self.rotation @ first.rotation, self.rotation @ first.shift + self.shift)
+
+    def apply(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (N, 3) in the other frame."""
+        return points @ self.rotation.T + self.shift
+
+    def by(self, error: NDArray[np.float64]) -> Transform:
+        """This motion, off by a turn in its own axes, radians, and a shift, metres, (6,)."""
+        return Transform(self.rotation @ rotation_by(error[:3]), self.shift + error[3:])
 
 
 class _Sample(NamedTuple):
