@@ -83,7 +83,7 @@ class Config:
     )
     noise_regions: str = option(
         'identify',
-        'regions of few pixels for their perimeter: leave, or mark as no plane (identify)',
+        'method normals: regions of few pixels for their perimeter: leave, or mark as no plane',
         choices=('leave', 'identify'),
     )
     min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)

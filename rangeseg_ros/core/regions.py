@@ -35,11 +35,9 @@ def plane_regions(
     `min_pixels`. What becomes of small and thin ones is told by `noise_regions`, see `Config`.
     """
     components = connected_components(labels, grid, valid)
-    (upper, upper_rim), (lower, lower_rim) = map_halves(
-        _measure, len(components), components, int(components.max()) + 1
-    )
-    area, perimeter = upper + lower, upper_rim + lower_rim
+    area = np.bincount(components.ravel())
     if noise_regions != 'leave':
+        perimeter = sum(map_halves(_perimeters, len(components), components, len(area)))
         area = np.where(_thin(area, perimeter, labels.shape), 0, area)
     area[0] = 0
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
@@ -87,21 +85,19 @@ def connected_components(
 
 
 @njit(cache=True, nogil=True)
-def _measure(
+def _perimeters(
     first: int, after: int, regions: NDArray[np.int32], count: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pixels of each region in some rows, and of those at another one or the image's border."""
-    height, width = regions.shape
-    area, perimeter = np.zeros(count, np.int64), np.zeros(count, np.int64)
+) -> NDArray[np.int64]:
+    """Pixels (count,) of each region in some rows, at another one or the image's border."""
+    (height, width), perimeter = regions.shape, np.zeros(count, np.int64)
     for i in range(first, after):
         for j in range(width):
             here = regions[i, j]
-            area[here] += 1
             inner = 0 < i < height - 1 and 0 < j < width - 1
             inner = inner and here == regions[i, j - 1] == regions[i, j + 1]
             inner = inner and here == regions[i - 1, j] == regions[i + 1, j]
             perimeter[here] += not inner
-    return area, perimeter
+    return perimeter
 
 
 def _thin(

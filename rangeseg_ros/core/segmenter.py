@@ -122,7 +122,8 @@ class Segmenter:
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
             found = labelling.labels
-            regions = plane_regions(found, found > 0, view.grid, config.noise_regions, view.least)
+            # Labels of planes are smooth: hardly any of their regions is thin.
+            regions = plane_regions(found, found > 0, view.grid, 'leave', view.least)
             regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
