@@ -122,8 +122,6 @@ MECHANISMS = (
     Mechanism('enlarged images found',
               'sensing/enlargement.py',
               {'segmenter.enlargement': _returning(None)}),
-    Mechanism('weights by distance', 'sensing/grid.py:weights', {'weighting': 'distance'},
-              option=True),
     # Regions.
     Mechanism('patches as wide as the distortion',
               'by_planes/patches.py',

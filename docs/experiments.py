@@ -44,8 +44,6 @@ POSTPROCESSING = {
 WEIGHTS = {
     '4-connectivity': {'jump_edges': 'none'},
     'jump edge disconnection': {},
-    'distance weighting': {'jump_edges': 'none', 'weighting': 'distance'},
-    'both': {'weighting': 'distance'},
 }
 LAMBDAS = tuple(float(value) for value in range(20, 151, 10))
 # Without post-processing the best lambda lies far higher (thesis 6.5).

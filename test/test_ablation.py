@@ -96,12 +96,12 @@ def test_borders_match_within_two_pixels(frames):
 def test_the_page_has_a_row_for_each_mechanism(ablate, frame, monkeypatch, tmp_path):
     monkeypatch.setattr(ablate, 'simulated_frames', lambda *_: iter([frame]))
     page = tmp_path / 'ledger.md'
-    ablate.main(['--only', '^(curved regions told|weights by distance)$', '--output', str(page)])
+    ablate.main(['--only', '^(curved regions told|method normals)$', '--output', str(page)])
     rows = [line for line in page.read_text().splitlines() if line.startswith('| ')]
     assert [row.split(' | ')[0] for row in rows] == [
         '| mechanism',
         '| ---',
         '| with all',
-        '| weights by distance (an option)',
         '| curved regions told',
+        '| method normals (an option)',
     ]

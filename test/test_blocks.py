@@ -7,7 +7,7 @@ from rangeseg_ros.core.by_planes.patches import Nodes
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import Grid, View, weights
+from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import CHI2, COUNT, RATIO, SIZE, fit, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -20,9 +20,7 @@ def grid(height, width, seed=0):
     rays[..., 0] = (np.arange(width) - width / 2) / 50
     rays[..., 1] = ((np.arange(height) - height / 2) / 50)[:, None]
     inverse = rays @ np.array([0.1, -0.05, 0.5]) + random.normal(0, 0.002, (height, width))
-    edges = Grid(
-        np.ones((height, width - 1), np.float32), np.ones((height - 1, width), np.float32)
-    )
+    edges = Grid(np.ones((height, width - 1), bool), np.ones((height - 1, width), bool))
     return inverse.astype(np.float32), rays, edges
 
 
@@ -96,8 +94,8 @@ def test_blocks_of_too_few_measurements_are_left_out(missing, kept):
 def test_blocks_touch_where_an_edge_joins_them(shape):
     height, width = shape
     random = np.random.default_rng(sum(shape))
-    horizontal = random.integers(0, 2, (height, width - 1)).astype(np.float32)
-    vertical = random.integers(0, 2, (height - 1, width)).astype(np.float32)
+    horizontal = random.random((height, width - 1)) < 0.5
+    vertical = random.random((height - 1, width)) < 0.5
     inverse, rays, _ = grid(height, width)
     nodes = nodes_of(inverse, rays, Grid(horizontal, vertical))
     right, below = nodes.right, nodes.below
@@ -202,29 +200,16 @@ def image_of(depth):
 
 
 def test_measurements_are_linked_but_across_jumps():
-    horizontal, vertical = weights(image_of([[1, 1, 0], [1, 1, 1]]))
-    assert horizontal.dtype == vertical.dtype == np.float32
+    horizontal, vertical = grid_of(image_of([[1, 1, 0], [1, 1, 1]]))
+    assert horizontal.dtype == vertical.dtype == np.bool_
     assert (horizontal.tolist(), vertical.tolist()) == ([[1, 0], [1, 1]], [[1, 1, 0]])
     jumps = np.array([[True, False], [False, False]]), np.array([[False, False, True]])
-    horizontal, vertical = weights(image_of(np.ones((2, 3))), jumps)
+    horizontal, vertical = grid_of(image_of(np.ones((2, 3))), jumps)
     assert (horizontal.tolist(), vertical.tolist()) == ([[0, 1], [1, 1]], [[1, 1, 0]])
 
 
-def test_distance_weights_fall_with_the_distance_about_the_median():
-    image = image_of([[1.0, 1.0, 1.0, 1.5], [1.0, 1.0, 1.0, 1.5]])
-    horizontal, vertical = weights(image, weighting='distance')
-    points = image.points
-    across = np.linalg.norm(np.diff(points, axis=1), axis=2)
-    down = np.linalg.norm(np.diff(points, axis=0), axis=2)
-    median = np.median(np.concatenate([across.ravel(), down.ravel()]))
-    np.testing.assert_allclose(horizontal, 2 * median / (median + across), rtol=1e-5)
-    np.testing.assert_allclose(vertical, 2 * median / (median + down), rtol=1e-5)
-    assert horizontal[0, 2] < 0.5 < horizontal[0, 0]
-
-
-@pytest.mark.parametrize('weighting', ['uniform', 'distance'])
 @pytest.mark.parametrize('shape', [(1, 1), (1, 4), (3, 2)])
-def test_shadow_is_disconnected_and_small_images_pass(shape, weighting):
-    horizontal, vertical = weights(image_of(np.zeros(shape)), None, weighting)
+def test_shadow_is_disconnected_and_small_images_pass(shape):
+    horizontal, vertical = grid_of(image_of(np.zeros(shape)))
     assert horizontal.shape == (shape[0], shape[1] - 1) and not horizontal.any()
     assert vertical.shape == (shape[0] - 1, shape[1]) and not vertical.any()

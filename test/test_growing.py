@@ -9,7 +9,7 @@ from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import View, weights
+from rangeseg_ros.core.sensing.grid import View, grid_of
 from rangeseg_ros.core.sensing.jump_edges import plane_deviation
 from rangeseg_ros.core.sensing.moments import fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -32,7 +32,7 @@ def grown(inverse, noise=NOISE, seed=0, least=1, **sensor):
     """Surfaces of the blocks of an image with white noise, and their moments."""
     inverse = inverse + np.random.default_rng(seed).normal(0, noise, inverse.shape)
     image = RangeImage(CAMERA.rays, inverse.astype(np.float32), CAMERA)
-    edges = weights(image, plane_deviation(image, 0.0065))
+    edges = grid_of(image, plane_deviation(image, 0.0065))
     model = SensorModel.from_config(Config(pixel_noise=0.0, **sensor))
     area = image.pixel_area
     view = View(image, image, Blocks.of(image), edges, model, least, area, True)

@@ -10,7 +10,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.grid import weights
+from rangeseg_ros.core.sensing.grid import grid_of
 from rangeseg_ros.core.sensing.jump_edges import bridge_edges, jump_edges, plane_deviation, sobel
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.solids import box, cast, half_space
@@ -226,7 +226,7 @@ def mixed(found, front, valid):
 
 def flooded(image, config):
     """Numbers (H, W) of what the links connect, whatever the normals."""
-    grid = weights(image, jump_edges(image, config.jump_edges, config.edge_step))
+    grid = grid_of(image, jump_edges(image, config.jump_edges, config.edge_step))
     return parts([links == 0 for links in grid])
 
 

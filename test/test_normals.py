@@ -80,7 +80,7 @@ def test_thesis_form_is_the_cross_product_of_the_four_neighbours():
 
 def test_tangents_do_not_cross_disconnected_edges():
     image = plane_image((0, 0, -1), 1.0)
-    horizontal, vertical = np.ones((30, 39), np.float32), np.ones((29, 40), np.float32)
+    horizontal, vertical = np.ones((30, 39), bool), np.ones((29, 40), bool)
     horizontal[12, 20] = 0  # between the pixels 20 and 21 of row 12
     config = Config(method='normals', normal_baseline=3)
     found = np.isfinite(observed_normals(image, Grid(horizontal, vertical), config)[..., 0])

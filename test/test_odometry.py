@@ -116,7 +116,7 @@ def test_the_ends_of_a_box_tell_the_motion_along_two_walls():
             labels, planes = planes_of(scene, k, 5)
             image = RangeImage.from_depth(simulate_kinect(scene, CAMERA, frame=k).depth, CAMERA)
             result = Segmenter().segment(image)
-            edges = JumpPoints.of(image, result.jumps, result.cells) if with_edges else None
+            edges = JumpPoints.of(image, result.jumps if with_edges else None, result.cells)
             held = [plane for plane in planes if abs(plane.normal @ up) < 0.5]
             view = views(labels, held, CONFIG.distortion_length)
             motion = odometry.add(held, view, 10**9 + k * 10**9 // 30, up, edges=edges)
@@ -165,7 +165,7 @@ def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():
     np.testing.assert_allclose(design[:, :6], -design[:, 6:], atol=1e-6)
     few = JumpPoints(points[:15], 0.004)
     assert not few.motion(edge, pose, pose, prior)[0].size
-    assert not edge.motion(JumpPoints.none(), pose, pose, prior)[0].size
+    assert not edge.motion(JumpPoints.of(None, None, None), pose, pose, prior)[0].size
 
 
 def test_jump_points_are_on_the_near_side():

@@ -14,7 +14,7 @@ from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, fronts, link_costs, minimise
 from rangeseg_ros.core.sensing.blocks import Blocks
-from rangeseg_ros.core.sensing.grid import Grid, View, weights
+from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -40,9 +40,9 @@ def random_case(seed, height, width, count=3):
     inverse = (theta[nearest] * rays).sum(axis=2) + random.normal(0, 4 * NOISE, (height, width))
     inverse[random.random((height, width)) < 0.1] = 0
     image = RangeImage(rays, inverse.astype(np.float32))
-    edges = weights(image)
+    edges = grid_of(image)
     for edge in edges:
-        edge *= random.choice([0.0, 0.5, 1.0], edge.shape, p=[0.2, 0.3, 0.5]).astype(np.float32)
+        edge &= random.random(edge.shape) < 0.8
     # Half of chi-squared, one to four variances granted.
     half_precision = 0.5 / np.concatenate([[1.0], random.uniform(1, 4, count)])
     box = np.array([[0, 0, 0, 0]] + count * [[0, 0, -(-height // BLOCK), -(-width // BLOCK)]])
@@ -147,7 +147,7 @@ def test_the_less_new_each_pixel_tells_the_more_unlike_labels_cost():
     image = RangeImage(np.ones((5, 6, 3), np.float32), np.ones((5, 6), np.float32))
     white = SENSOR._replace(correlation=0.0)
     links, of_white = (
-        Problem.of(image, sensor, weights(image), LAMBDA).links for sensor in (SENSOR, white)
+        Problem.of(image, sensor, grid_of(image), LAMBDA).links for sensor in (SENSOR, white)
     )
     assert SENSOR.patch > 2 and white.patch == 1
     np.testing.assert_allclose(links, SENSOR.patch * of_white, rtol=1e-6)
@@ -210,7 +210,7 @@ def small_room(seed=900):
     frame = simulate_kinect(kinect_room(seed), kinect_camera(160, 120), seed=seed)
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config(pixel_noise=0.0))
-    edges = weights(image)
+    edges = grid_of(image)
     view = View(image, image, Blocks.of(image), edges, sensor, 1, image.pixel_area, True)
     nodes = Nodes.of(view)
     found = join_surfaces(*find_patches(nodes, sensor), nodes, view, LAMBDA)

@@ -10,7 +10,7 @@ from rangeseg_ros.core.sensing.grid import Grid
 
 
 def uncut(shape):
-    return Grid(np.ones((shape[0], shape[1] - 1)), np.ones((shape[0] - 1, shape[1])))
+    return Grid(np.ones((shape[0], shape[1] - 1), bool), np.ones((shape[0] - 1, shape[1]), bool))
 
 
 @pytest.mark.parametrize('seed', range(10))
@@ -18,11 +18,10 @@ def test_components_of_random_images(seed):
     random = np.random.default_rng(seed)
     h, w = random.integers(1, 25, 2)
     labels = random.integers(0, 3, (h, w))
-    horizontal = (random.random((h, w - 1)) < 0.8).astype(float)
-    vertical = (random.random((h - 1, w)) < 0.8).astype(float)
+    horizontal, vertical = random.random((h, w - 1)) < 0.8, random.random((h - 1, w)) < 0.8
     index = np.arange(h * w).reshape(h, w)
-    right = (horizontal > 0) & (labels[:, 1:] == labels[:, :-1])
-    below = (vertical > 0) & (labels[1:] == labels[:-1])
+    right = horizontal & (labels[:, 1:] == labels[:, :-1])
+    below = vertical & (labels[1:] == labels[:-1])
     i = np.concatenate([index[:, :-1][right], index[:-1][below]])
     j = np.concatenate([index[:, 1:][right], index[1:][below]])
     count, expected = graph_components(coo_array((np.ones(len(i)), (i, j)), (h * w, h * w)))

@@ -74,7 +74,6 @@ def test_every_face_of_a_noise_free_room_is_found(seed):
         {'directions': 'regular', 'direction_count': 225},
         {'jump_edges': 'sobel'},
         {'jump_edges': 'none'},
-        {'weighting': 'distance'},
         {'exact': True, 'direction_count': 73},
         {'noise_regions': 'leave'},
         {'dithering': 0.001},
@@ -155,8 +154,7 @@ def problem(seed, height=75, width=101, noise=0.15):
 
 
 def connected(height, width):
-    right, below = np.ones((height, width - 1)), np.ones((height - 1, width))
-    return Grid(right.astype(np.float32), below.astype(np.float32))
+    return Grid(np.ones((height, width - 1), bool), np.ones((height - 1, width), bool))
 
 
 def test_energy_is_close_to_that_of_the_full_expansion():

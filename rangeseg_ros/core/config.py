@@ -55,11 +55,6 @@ class Config:
         choices=('plane', 'sobel', 'none'),
     )
     edge_step: float = option(0.0, 'smallest jump, 1/m; 0 follows the noise', 0.0, 10.0)
-    weighting: str = option(
-        'uniform',
-        'neighbourhood weights: all alike (uniform) or more for closer points (distance)',
-        choices=('uniform', 'distance'),
-    )
     smoothness: float = option(
         130.0, 'method normals: lambda of eq. 5.3, against degrees; thesis: 55', 0.0, 10000.0
     )

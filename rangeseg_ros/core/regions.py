@@ -37,8 +37,8 @@ def plane_regions(
     components = connected_components(labels, grid, valid)
     area = np.bincount(components.ravel())
     if noise_regions != 'leave':
-        perimeter = sum(map_halves(_perimeters, len(components), components, len(area)))
-        area = np.where(_thin(area, perimeter, labels.shape), 0, area)
+        upper, lower = map_halves(_perimeters, len(components), components, len(area))
+        area = np.where(_thin(area, upper + lower, labels.shape), 0, area)
     area[0] = 0
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
 
@@ -62,9 +62,9 @@ def connected_components(
             if not valid[i, j]:
                 continue
             here = labels[i, j]
-            if j > 0 and right[i, j - 1] > 0 and labels[i, j - 1] == here:
+            if j > 0 and right[i, j - 1] and labels[i, j - 1] == here:
                 found[i, j] = found[i, j - 1]
-            if i > 0 and below[i - 1, j] > 0 and labels[i - 1, j] == here:
+            if i > 0 and below[i - 1, j] and labels[i - 1, j] == here:
                 a, b = found[i, j], found[i - 1, j]
                 if a == 0:
                     found[i, j] = b

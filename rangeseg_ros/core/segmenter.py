@@ -27,7 +27,7 @@ from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.disparity import from_disparity, shows_disparity
 from rangeseg_ros.core.sensing.enlargement import Cells, enlargement
-from rangeseg_ros.core.sensing.grid import GridEdges, View, weights
+from rangeseg_ros.core.sensing.grid import GridEdges, View, grid_of
 from rangeseg_ros.core.sensing.jump_edges import jump_edges
 from rangeseg_ros.core.sensing.range_image import RangeImage, RangeImageError
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -197,7 +197,7 @@ def _preprocessed(
     # Planes are fitted to what was measured; where they end is found with small holes bridged.
     whole = bridge_holes(image, steps.windows, steps.slopes)
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
-    grid = weights(whole, jumps, config.weighting)
+    grid = grid_of(whole, jumps)
     watch.lap('edges')
     view = View(image, whole, blocks, grid, sensor, least, bins.area, identified)
     return view, sensor.of_pixels(side, excess), jumps

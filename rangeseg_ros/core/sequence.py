@@ -135,9 +135,7 @@ class SequenceSegmenter:
         if config.odometry:
             towards = unit((config.up_x, config.up_y, config.up_z)) if up is None else up
             seen = views(result.labels, planes, config.distortion_length)
-            edges = None
-            if result.jumps is not None:
-                edges = JumpPoints.of(image, result.jumps, result.cells)
+            edges = JumpPoints.of(image, result.jumps, result.cells)
             found = self._odometry.add(planes, seen, stamp, towards, image.axes, edges)
             self.motion = found.of_origin(image.place)
             if not config.fixed_frame:

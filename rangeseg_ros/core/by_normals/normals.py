@@ -27,7 +27,7 @@ def observed_normals(image: RangeImage, grid: Grid, config: Config) -> NDArray[n
     normals = cross_product(image, config.normal_baseline)
     if config.jump_edges == 'plane':
         reach = config.normal_baseline
-        broken = _within(grid.right <= 0, reach) | _within(grid.below.T <= 0, reach).T
+        broken = _within(~grid.right, reach) | _within(~grid.below.T, reach).T
         normals[broken] = np.nan
     return normals
 

@@ -73,7 +73,7 @@ class Nodes(NamedTuple):
         moments[..., RATIO] = count * weight * systematic_variance(sensor, blocks.squared)
         moments[..., SLOPE] = count * tilt
         # Blocks touch where an edge joins a pixel of one and a pixel of the other.
-        across, down = view.grid.right[:, 1::NODE] > 0, view.grid.below[1::NODE] > 0
+        across, down = view.grid.right[:, 1::NODE], view.grid.below[1::NODE]
         right, below = across[::NODE].copy(), down[:, ::NODE].copy()
         right[: len(across) // NODE] |= across[1::NODE]
         below[:, : down.shape[1] // NODE] |= down[:, 1::NODE]
@@ -83,8 +83,8 @@ class Nodes(NamedTuple):
 def _crossed(view: View) -> NDArray[np.bool_]:
     """Whether a jump parts two measured pixels of a whole block."""
     valid, grid = view.whole.valid, view.grid
-    across = valid[:, :-1:NODE] & valid[:, 1::NODE] & (grid.right[:, ::NODE] == 0)
-    down = valid[:-1:NODE] & valid[1::NODE] & (grid.below[::NODE] == 0)
+    across = valid[:, :-1:NODE] & valid[:, 1::NODE] & ~grid.right[:, ::NODE]
+    down = valid[:-1:NODE] & valid[1::NODE] & ~grid.below[::NODE]
     crossed: NDArray[np.bool_] = across[:-1:NODE] | across[1::NODE]
     return crossed | down[:, :-1:NODE] | down[:, 1::NODE]
 

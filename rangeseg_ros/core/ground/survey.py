@@ -59,10 +59,9 @@ class Survey:
         if cells is not None:
             pixels = [cells.enlarged(values, self.image.shape) for values in found[:2]]
             found = found._replace(classes=pixels[0], height=pixels[1])
-        if self.sensor_height <= 0:
+        if found.stand.found and self.sensor_height <= 0:
             # Nothing that is stated rules out a step out of view.
-            confidence = min(found.stand.confidence, 1 - STEPS)
-            found = found._replace(stand=found.stand._replace(confidence=confidence))
+            found = found._replace(stand=found.stand._replace(confidence=1 - STEPS))
         if found.stand.found:
             self.memory.keep_height(found.stand.height(self.up), self.stamp)
         return found

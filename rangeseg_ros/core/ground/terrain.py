@@ -24,7 +24,7 @@ from rangeseg_ros.core.ground.cells import (
     classify,
     ground_field,
 )
-from rangeseg_ros.core.ground.estimate import HIGHEST, STEPS, Continuation, Stand, continued
+from rangeseg_ros.core.ground.estimate import HIGHEST, Continuation, Stand, continued
 from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
@@ -145,9 +145,7 @@ def _upright(
         return _without_ground(image, cells, seen, stand, known, config)
     a, b, c = seen.plane
     lean = np.array([b, c]) @ cells.axes[1:]
-    # No image tells alone whether a step is out of view.
-    confidence = seen.confidence if height_sd > 0 else 1 - STEPS
-    stand = Stand(-(up - lean) / (height - a), confidence)
+    stand = Stand(-(up - lean) / (height - a), seen.confidence)
     return _with_ground(image, cells, reached, stand, config, turned)
 
 

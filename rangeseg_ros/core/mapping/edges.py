@@ -40,20 +40,17 @@ class JumpPoints(NamedTuple):
     width: float
 
     @classmethod
-    def none(cls) -> JumpPoints:
-        """Those of an image without edges."""
-        return cls(np.zeros((0, 3)), 0.0)
-
-    @classmethod
-    def of(cls, image: RangeImage, jumps: GridEdges, cells: Cells | None) -> JumpPoints:
+    def of(cls, image: RangeImage, jumps: GridEdges | None, cells: Cells | None) -> JumpPoints:
         """Those of an image, by its `jumps` between pixels, or between the `cells` of these."""
+        if jumps is None:
+            return cls(np.zeros((0, 3)), 0.0)
         image = cells.reduced(image) if cells else image
         inverse, near = image.inverse, np.zeros(image.shape, np.bool_)
         # The same arrays with columns, then rows, for their last axis.
         for jump, y, mark in ((jumps[0], inverse, near), (jumps[1].T, inverse.T, near.T)):
-            jump = jump & (y[:, 1:] > 0) & (y[:, :-1] > 0)
-            mark[:, :-1] |= jump & (y[:, :-1] > y[:, 1:])
-            mark[:, 1:] |= jump & (y[:, :-1] < y[:, 1:])
+            before, after = y[:, :-1], y[:, 1:]
+            mark[:, :-1] |= jump & (before > after) & (after > 0)
+            mark[:, 1:] |= jump & (after > before) & (before > 0)
         points = image.rays[near].astype(np.float64) / inverse[near][:, None]
         return cls(points, image.pixel_area**0.5)
 

@@ -55,6 +55,7 @@ _ROUNDS = 4
 # each plane.
 _CAMERA = 18
 _POSES = np.r_[:6, 12:18]
+_NO_EDGES = JumpPoints(np.zeros((0, 3)), 0.0)
 
 
 class Motion(NamedTuple):
@@ -107,7 +108,7 @@ class PlaneOdometry:
         self._id = np.zeros(0, np.int64)
         self._planes = PlaneSet.of([])
         self._view = np.zeros((0, 0))
-        self._edges, self._before = JumpPoints.none(), Transform.identity()
+        self._edges, self._before = _NO_EDGES, Transform.identity()
         self._covariance = np.diag(np.concatenate([np.zeros(6), self._spread**2, np.zeros(6)]))
 
     @property
@@ -122,7 +123,7 @@ class PlaneOdometry:
         stamp: int,
         up: ArrayLike,
         axes: ArrayLike = ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-        edges: JumpPoints | None = None,
+        edges: JumpPoints = _NO_EDGES,
     ) -> Motion:
         """Take in the planes of the next frame, tracked, with their `views`.
 
@@ -144,7 +145,7 @@ class PlaneOdometry:
         if len(self._id):
             order = {number: m for m, number in enumerate(ids.tolist())}
             pose = self._update(pose, seen.where([order[own] for own in self._id.tolist()]))
-        pose = self._align(pose, edges or JumpPoints.none())
+        pose = self._align(pose, edges)
         held, new = len(self._id), ~np.isin(ids, self._id)
         self._append(pose, seen.where(new), ids[new])
         self._pose = pose

@@ -1,4 +1,4 @@
-"""The 4-connected grid of pixels, its neighbourhood weights u (eq. 5.1, thesis 5.5), and the view.
+"""The 4-connected grid of pixels (thesis 5.5), and the view.
 
 A `View` is a range image with what is known of it before planes are looked for.
 """
@@ -19,13 +19,13 @@ GridEdges = tuple[NDArray[np.bool_], NDArray[np.bool_]]
 
 
 class Grid(NamedTuple):
-    """Weights of the edges from each pixel to its right (H, W-1) and lower (H-1, W) neighbour.
+    """Edges from each pixel to its right (H, W-1) and lower (H-1, W) neighbour: u of eq. 5.1.
 
-    0 where disconnected.
+    False where disconnected.
     """
 
-    right: NDArray[np.float32]
-    below: NDArray[np.float32]
+    right: NDArray[np.bool_]
+    below: NDArray[np.bool_]
 
 
 class View(NamedTuple):
@@ -46,22 +46,11 @@ class View(NamedTuple):
     identified: bool
 
 
-def weights(image: RangeImage, jumps: GridEdges | None = None, weighting: str = 'uniform') -> Grid:
-    """Weights of the edges between neighbouring pixels.
+def grid_of(image: RangeImage, jumps: GridEdges | None = None) -> Grid:
+    """The grid of an image, with the edges that cross `jumps` disconnected (5.5.2).
 
-    Pixels without measurement are disconnected (thesis 6.7), and edges that cross a jump (5.5.2).
-    The others have 1 ('uniform'), or more the closer the points lie in space ('distance', 5.5.4):
-    2 m / (m + d) with the distance d of the points and its median m over the image.
+    Pixels without measurement are disconnected as well (thesis 6.7).
     """
     valid = image.valid
-    connected = [valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]]
-    if jumps is not None:
-        connected = [edges & ~jump for edges, jump in zip(connected, jumps, strict=True)]
-    found = [edges.astype(np.float32) for edges in connected]
-    if weighting == 'distance':
-        apart = [np.linalg.norm(np.diff(image.points, axis=axis), axis=2) for axis in (1, 0)]
-        known = np.concatenate([lengths[np.isfinite(lengths)] for lengths in apart])
-        median = np.median(known) if known.size else np.float32(1)
-        for edges, lengths, weight in zip(connected, apart, found, strict=True):
-            weight[edges] = 2 * median / (median + lengths[edges])
-    return Grid(*found)
+    right, below = valid[:, 1:] & valid[:, :-1], valid[1:] & valid[:-1]
+    return Grid(right & ~jumps[0], below & ~jumps[1]) if jumps else Grid(right, below)
