@@ -94,7 +94,7 @@ class Problem:
     def energy(self, labels):
         """As the package works it out."""
         data = np.take_along_axis(self.unary, labels[None].astype(int), 0)[0]
-        return energy(data, labels, self.grid, 3.0)
+        return energy(data, labels, link_costs(self.grid, 3.0))
 
     def labelling(self):
         labels = self.start.astype(np.int32)

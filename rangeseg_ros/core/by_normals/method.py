@@ -12,7 +12,7 @@ from rangeseg_ros.core.by_normals.directions import directions
 from rangeseg_ros.core.by_normals.labelling import data_costs, minimise, minimise_exactly
 from rangeseg_ros.core.by_normals.normals import observed_normals
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.graphcut.expansion import energy
+from rangeseg_ros.core.graphcut.expansion import energy, link_costs
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -33,7 +33,7 @@ class Labelling(NamedTuple):
     def energy(self) -> float:
         """Value of eq. 5.3."""
         data = data_costs(self.labels, 1, self.observed, self.directions)
-        return energy(data, self.labels, self.grid, self.smoothness)
+        return energy(data, self.labels, link_costs(self.grid, self.smoothness))
 
 
 def segment(

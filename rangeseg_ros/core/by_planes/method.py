@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
-from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, energy
+from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces, unite_regions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.graphcut.expansion import energy
 from rangeseg_ros.core.regions import drop_regions
 from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.grid import View
@@ -29,7 +30,8 @@ class Labelling(NamedTuple):
 
     def energy(self) -> float:
         """Value of eq. 5.3."""
-        return energy(self.labels.ravel(), self.problem, self.models)
+        data = costs(self.labels.ravel(), self.problem, self.models)
+        return energy(data.reshape(self.labels.shape), self.labels, self.problem.links)
 
     def normals(self) -> None:
         """None: regions have planes, and these their normals."""

@@ -87,15 +87,6 @@ class Models(NamedTuple):
         return cls(theta, 0.5 / granted, Shifts.none(len(theta)))
 
 
-def energy(labels: NDArray[np.int32], problem: Problem, models: Models) -> float:
-    """Value of eq. 5.3 for labels (n,): data costs and the costs of the edges between unlike."""
-    below = problem.links[1, : -problem.width]
-    right = problem.links[0, :-1]  # 0 from the end of one row to the next
-    unlike = right[labels[1:] != labels[:-1]].sum(dtype=np.float64)
-    unlike += below[labels[problem.width :] != labels[: -problem.width]].sum(dtype=np.float64)
-    return float(costs(labels, problem, models).sum(dtype=np.float64) + unlike)
-
-
 @njit(cache=True)
 def data_cost(label: int, p: int, problem: Problem, models: Models) -> float:
     """What a label costs a measured pixel.

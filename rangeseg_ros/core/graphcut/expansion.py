@@ -45,13 +45,13 @@ class GridLabelling(NamedTuple):
 
 
 def energy(
-    data: NDArray[np.floating], labels: NDArray[np.integer], grid: Grid, smoothness: float
+    data: NDArray[np.floating], labels: NDArray[np.integer], links: NDArray[np.float32]
 ) -> float:
-    """Value of E for labels (H, W) of data costs (H, W), lambda = `smoothness`."""
-    across = grid.right[labels[:, 1:] != labels[:, :-1]]
-    down = grid.below[labels[1:] != labels[:-1]]
-    boundary = across.sum(dtype=float) + down.sum(dtype=float)
-    return float(data.sum(dtype=float) + smoothness * boundary)
+    """Value of E for labels (H, W) of data costs (H, W), with `link_costs` of the grid."""
+    right, below = links.reshape(2, *labels.shape)
+    border = right[:, :-1][labels[:, 1:] != labels[:, :-1]].sum(dtype=float)
+    border += below[:-1][labels[1:] != labels[:-1]].sum(dtype=float)
+    return float(data.sum(dtype=float) + border)
 
 
 def link_costs(grid: Grid, smoothness: float) -> NDArray[np.float32]:

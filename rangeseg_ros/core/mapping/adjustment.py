@@ -76,11 +76,6 @@ class Adjustment:
 
     `noise` is that of the poses that are told or, where their errors add up as those of an
     odometry do, of their changes from frame to frame.
-
-    Examples
-    --------
-    >>> adjustment.add(plane_map.sighting)
-    >>> solution = adjustment.solve(plane_map.planes, plane_map.successors)
     """
 
     def __init__(self, noise: PoseNoise, odometry: bool = False) -> None:

@@ -60,12 +60,6 @@ class PlaneMap:
         What the last frame shows of it.
     successors : dict of int
         Ids of planes that turned out to be another one -> the id of that one.
-
-    Examples
-    --------
-    >>> plane_map = PlaneMap(config)
-    >>> plane_map.add(result.labels, result.planes, image, pose, stamp)
-    >>> plane_map.planes
     """
 
     def __init__(self, config: Config | None = None) -> None:

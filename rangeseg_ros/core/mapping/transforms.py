@@ -106,11 +106,6 @@ class TransformBuffer:
     after the last one it is not known. Static transforms hold at any time. As in tf2 a second
     sample of the same stamp is ignored. A sample that is `CACHE_TIME` older than the last one is
     of a time that began anew, as of a looped recording: the past of its frame is forgotten.
-
-    Examples
-    --------
-    >>> buffer.insert('odom', 'base_link', stamp, rotation, shift)
-    >>> buffer.lookup('odom', 'camera', stamp)
     """
 
     def __init__(self) -> None:
