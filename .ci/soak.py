@@ -1,6 +1,6 @@
 """The node for as long as is asked for at 30 Hz: memory over time, and where every frame went.
 
-    .venv/bin/python .ci/soak.py --minutes 60 --output soak.json
+    .venv/bin/python .ci/soak.py --minutes 60 --size 320 240 --output soak.json
 
 Not a test: it takes its time and all of a computer. Listeners of every output come and go.
 """
@@ -43,12 +43,14 @@ def main():
     """Publish, look every half minute, and write what is seen."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--minutes', type=float, default=60)
+    parser.add_argument('--size', type=int, nargs=2, default=(640, 480), help='of the images')
     parser.add_argument('--output', type=Path)
     arguments = parser.parse_args()
-    camera, draw, report = kinect_camera(640, 480), random.Random(0), []
+    camera, draw, report = kinect_camera(*arguments.size), random.Random(0), []
     room = kinect_room(0, FRAMES)
     depths = [simulate_kinect(room, camera, frame=k, seed=k).depth for k in range(FRAMES)]
     begin, sent = time.monotonic(), 0
+    due = begin
     with Bench(camera=camera) as bench, bench.listening('labels'), bench.camera_on():
         while (minutes := (time.monotonic() - begin) / 60) < arguments.minutes:
             with ExitStack() as stack:
@@ -57,7 +59,8 @@ def main():
                 while time.monotonic() < until:
                     bench.send(bench.image(depths[sent % FRAMES]))
                     sent += 1
-                    bench.spin(1 / RATE)
+                    due = max(due + 1 / RATE, time.monotonic() - 1)
+                    bench.spin(max(due - time.monotonic(), 0))
                 values = values_of(bench.received['diagnostics'][-1].status[0])
             counts = {name: values[name] for name in values if name.startswith(('frames', 'mess'))}
             report.append({'minutes': minutes, 'sent': sent, **state(bench.process.pid), **counts})
