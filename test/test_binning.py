@@ -107,6 +107,9 @@ def test_the_model_of_bins_is_that_of_their_means(correlation, white):
     # What means lose of correlated noise, 6 % here, counts as new as well.
     assert white <= again.white + 1e-9 and again.white < white + 0.06
     assert again.correlation == correlation
+    # Noise that hangs together over less than a pixel is new in each.
+    narrow = pixels._replace(correlation=0.01, white=0.0).binned(2)
+    assert narrow.noise == pytest.approx(pixels.noise / 2)
 
 
 def test_borders_are_those_of_pixels():

@@ -63,6 +63,8 @@ def test_what_has_left_the_view_is_remembered_where_it_was():
     assert at(grid, 1.4, -0.3, grid.height) == pytest.approx(GROUND_IN_MAP, abs=0.02)
     assert grid.origin[2] == pytest.approx(GROUND_IN_MAP, abs=0.02)
     assert at(grid, 1.4, -0.3, grid.age) > 0.3
+    assert np.isposinf(grid.age[np.isnan(grid.height) & (grid.classes == UNKNOWN)]).any()
+    assert (grid.age >= 0).all()
     # Lethal is what lies beyond the edge, as long as rays cross the ground there.
     beyond = {at(grid, EDGE + 0.1 + 0.05 * k, 0.05 * n) for k in range(6) for n in range(-8, 8)}
     assert GROUND not in beyond and DROP in beyond

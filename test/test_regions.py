@@ -5,7 +5,12 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import connected_components, drop_regions, plane_regions
+from rangeseg_ros.core.regions import (
+    _perimeters,
+    connected_components,
+    drop_regions,
+    plane_regions,
+)
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -63,6 +68,15 @@ def test_noise_regions_are_left_or_marked(noise_regions, line, speck):
     assert found[20, 35] in (1, 2)
     assert (found[20, 20] > 0) == (line > 0)
     assert (found[10, 10] > 0) == (speck > 0)
+
+
+def test_the_perimeter_is_what_lies_at_another_region_or_the_border_of_the_image():
+    regions = np.zeros((9, 12), np.int32)
+    regions[2:7, 3:9] = 1
+    regions[4, 5] = 2
+    upper, lower = (_perimeters(*rows, regions, 3) for rows in ((0, 4), (4, 9)))
+    # Of region 1, its rim and the four around the hole.
+    assert (upper + lower).tolist() == [2 * 12 + 2 * 7 + 2 * (5 + 6), 2 * 6 + 2 * 3 + 4, 1]
 
 
 def test_small_regions_and_shadow_are_no_plane():
