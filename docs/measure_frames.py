@@ -1,6 +1,7 @@
 """Measure what docs/frames.md says.
 
 python docs/measure_frames.py map SEED...         walks through simulated rooms, against the truth
+python docs/measure_frames.py lies SEED...        poses that drift or jump
 python docs/measure_frames.py odometry SEED...    the same, without poses
 python docs/measure_frames.py mount COUNT SEED    cameras in simulated rooms
 python docs/measure_frames.py hour FRAMES         a walk along a corridor, 10 frames a second
@@ -120,6 +121,46 @@ def measure_map(*seeds: str) -> None:
         )
         print(f'{name}: NEES {nees.mean():.2f} in the mean, {np.median(nees):.2f} in the median')
     print('walls are thick by (mm): poses as told, true, solved', np.median(poses, axis=0))
+
+
+def measure_lies(*seeds: str) -> None:
+    """Poses that drift by 1 %, or jump by 7 or 36 cm in the middle: found, and after solving."""
+    rows: dict[str, list] = {'true': [], 'drift': [], '7 cm': [], '36 cm': []}
+    for seed in map(int, seeds):
+        scene, random = kinect_room(seed, FRAMES * STEP, walk), np.random.default_rng(seed)
+        frames = list(walked(scene, seed))
+        noise = random.normal(0, [[np.radians(0.3)] * 3 + [0.005] * 3], (len(frames), 6))
+        aside = random.normal(size=3)
+        aside /= np.linalg.norm(aside)
+        for lie, into in rows.items():
+            plane_map, adjustment = PlaneMap(CONFIG), Adjustment(PoseNoise(0.005, np.radians(0.3)))
+            way, place, told = 0.0, frames[0].pose.shift, []
+            for k, frame in enumerate(frames):
+                way += float(np.linalg.norm(frame.pose.shift - place))
+                place = frame.pose.shift
+                off = {'drift': 0.01 * way, '7 cm': 0.07 * (k > 60), '36 cm': 0.36 * (k > 60)}
+                told.append(frame.pose.by(noise[k] + [0, 0, 0, *off.get(lie, 0.0) * aside]))
+                plane_map.add(frame.labels, frame.planes, frame.image, told[-1], frame.stamp)
+                adjustment.add(plane_map.sighting)
+            solution = adjustment.solve(plane_map.planes, plane_map.successors)
+            jumps = [1e3 * np.linalg.norm(jump.error[3:]) for _, jump in plane_map.jumps]
+            before, after = (
+                1e3 * np.sqrt(np.mean([best_fit(frames, each) ** 2]))
+                for each in (told, solution.poses)
+            )
+            drift = 100 * np.linalg.norm(solution.drift) * solution.drifts
+            into.append((len(jumps), sum(jumps), drift, before, after))
+    print('jumps found, mm in all, drift found (%), poses before and after solving (mm): medians')
+    for lie, each in rows.items():
+        print(f'{lie}:', np.round(np.median(each, axis=0), 1), 'jumps', [int(r[0]) for r in each])
+
+
+def best_fit(frames: list[Frame], poses: list[Transform]) -> float:
+    """Root mean square distance of the places from the true ones, metres, after alignment."""
+    true = np.array([frame.pose.shift for frame in frames])
+    told = np.array([pose.shift for pose in poses])
+    _, left = Rotation.align_vectors(true - true.mean(axis=0), told - told.mean(axis=0))
+    return float(left / len(true) ** 0.5)
 
 
 def thickness(walls: list, poses) -> float:

@@ -130,6 +130,7 @@ def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> N
     for k in range(first, after):
         own = start[k], start[k + 1]
         add_common_errors(cells, own, own, result[k])
+        result[k] += result[k].T.copy()
     return result
 
 
@@ -139,13 +140,15 @@ def add_common_errors(
 ) -> None:
     """Add the sum over pairs of pixels, of the means of cells, to `result` (3, 3).
 
-    `one` and `other` are the first cell of either pixel and the one after the last.
+    `one` and `other` are the first cell of either pixel and the one after the last. Where they are
+    the same, half of the sum, which is it but for the transpose.
     """
+    same = one[0] == other[0]
     variance = 2 * cells.width**2
     place, count, ray = cells.place, cells.pixels, cells.ray
     for i in range(*one):
         x = y = z = 0.0
-        for j in range(*other):
+        for j in range(i if same else other[0], other[1]):
             down = variance + place[i, 2] + place[j, 2]
             across = variance + place[i, 3] + place[j, 3]
             lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
@@ -156,6 +159,7 @@ def add_common_errors(
             if lag == 0:
                 # A pixel agrees with itself.
                 alike = max(alike, 1 / min(count[i], count[j]))
+            alike /= 1 + (same and i == j)
             x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
         for p in range(3):
             result[p, 0] += ray[i, p] * x

@@ -2,8 +2,7 @@
 
 Where planes leave a motion open, the ends of what is in sight close it. Each point of the frame
 before is looked for among those of the next one (iterated closest points; Besl and McKay, TPAMI
-1992). A point on an edge tells of the motion across that edge, at a right angle to the ray, as the
-points of an edge look alike and depth errs most there.
+1992). It tells of the motion across its edge and the ray: along an edge its points look alike.
 """
 
 from __future__ import annotations
@@ -21,13 +20,11 @@ from rangeseg_ros.core.significance import chi2_quantile
 
 # Points that tell the direction of an edge.
 _NEIGHBOURS = 8
-# Points that err as one, as those along an edge do: with it, errors are as large as they are
-# stated (NEES 1.2) in simulated rooms.
+# Points that err as one, as those along an edge do: so NEES is 1.2 in simulated rooms.
 _TOGETHER = 32
 _ROUNDS = 4
 _GATE = chi2_quantile(1)
-# Standard deviation over the median absolute value, of Gaussian errors.
-_DEVIATION = 1.4826
+_DEVIATION = 1.4826  # of Gaussian errors, over their median absolute value
 
 
 class JumpPoints(NamedTuple):
