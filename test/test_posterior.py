@@ -78,7 +78,7 @@ def test_what_a_quadratic_explains_is_what_least_squares_explain():
         ).sum()
         for count in (3, 6)
     )
-    found = _explained(terms.T @ terms, terms.T @ residual)
+    found = _explained(np.vstack([terms.T @ terms, terms.T @ residual]))
     np.testing.assert_allclose(found, (flat, whole - flat), rtol=1e-6)
 
 

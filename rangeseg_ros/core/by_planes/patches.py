@@ -194,9 +194,9 @@ def _quads(
     rows, columns = smooth.shape
     parent = np.arange(rows * columns)
     theta, total = np.zeros(3), np.zeros(SIZE)
-    whole, side, found = smooth.copy(), 1, True
+    whole, side, found = smooth, 1, True
     while found:
-        merged, found = np.zeros_like(whole), False
+        merged, found = np.zeros((rows, columns), np.bool_), False
         for i in range(0, rows - 2 * side + 1, 2 * side):
             for j in range(0, columns - 2 * side + 1, 2 * side):
                 u, v = i + side, j + side

@@ -100,7 +100,7 @@ def _residuals(
     explains of them, and of what the other terms of a quadratic add; mean standard deviation
     across the plane, metres, and mean ratio of the variances of distortion and noise.
     """
-    normal, right = np.zeros((6, 6)), np.zeros(6)
+    system = np.zeros((7, 6))
     size = square = scale = ratio = 0.0
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
     half = max(box[2] - box[0], box[3] - box[1]) / 2
@@ -118,27 +118,26 @@ def _residuals(
         u = (cell[PLACE + 1] / count - (box[1] + box[3]) / 2) / half
         terms = 1.0, u, v, u * u, u * v, v * v
         for a in range(6):
-            right[a] += count * terms[a] * mean
+            system[6, a] += count * terms[a] * mean
             for b in range(a + 1):
-                normal[a, b] += count * terms[a] * terms[b]
+                system[a, b] += count * terms[a] * terms[b]
         size += count
         square += max(squares_left(cell, theta), 0.0) * unit
         # An error of the inverse leaves the plane by distance / inverse times as much.
         scale += count * np.sqrt(variance) / (slope * abs(level))
         ratio += count * systematic_variance(sensor, level**2) / variance
-    linear, bend = _explained(normal, right)
+    linear, bend = _explained(system)
     return size, square, linear, bend, scale / size, ratio / size
 
 
 @njit(cache=True)
-def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> tuple[float, float]:
+def _explained(root: NDArray[np.float64]) -> tuple[float, float]:
     """Sums of squares that the linear terms of a fit explain, and that its quadratic ones add.
 
-    With the normal equations A = L L^T (Cholesky), b^T A^-1 b is |L^-1 b|^2, and the first terms
-    have the first rows to themselves. Below L, as a row more, stands L^-1 b.
+    Of the normal equations A = L L^T (Cholesky) with b below, where b^T A^-1 b is |L^-1 b|^2, and
+    the first terms have the first rows to themselves. L takes the place of A, L^-1 b that of b.
     """
-    ridge = 1e-9 * max(normal[0, 0], 1.0)
-    root = np.vstack((normal, right.reshape(1, -1)))
+    ridge, linear, bend = 1e-9 * max(root[0, 0], 1.0), 0.0, 0.0
     for a in range(7):
         for b in range(min(a + 1, 6)):
             for c in range(b):
@@ -147,16 +146,18 @@ def _explained(normal: NDArray[np.float64], right: NDArray[np.float64]) -> tuple
                 root[a, a] = np.sqrt(max(root[a, a], 0.0) + ridge)
             else:
                 root[a, b] /= root[b, b]
-    return (root[6, :3] ** 2).sum(), (root[6, 3:] ** 2).sum()
+    for a in range(3):
+        linear, bend = linear + root[6, a] ** 2, bend + root[6, 3 + a] ** 2
+    return linear, bend
 
 
 @njit(cache=True)
 def _area(total: NDArray[np.float64]) -> float:
     """Area of the rectangle whose points have the same covariance, square metres."""
-    count, scatter = total[COUNT], total[SCATTER : SCATTER + 6] / total[COUNT]
-    x, y, z = total[POINT] / count, total[POINT + 1] / count, total[POINT + 2] / count
-    a, b, c = scatter[0] - x * x, scatter[1] - x * y, scatter[2] - x * z
-    d, e, f = scatter[3] - y * y, scatter[4] - y * z, scatter[5] - z * z
+    n, s = total[COUNT], SCATTER
+    x, y, z = total[POINT] / n, total[POINT + 1] / n, total[POINT + 2] / n
+    a, b, c = total[s] / n - x * x, total[s + 1] / n - x * y, total[s + 2] / n - x * z
+    d, e, f = total[s + 3] / n - y * y, total[s + 4] / n - y * z, total[s + 5] / n - z * z
     aa, _, _, dd, _, ff, _ = cofactors(a, b, c, d, e, f)
     # The product of the two larger eigenvalues: there is hardly a third one.
     return 12 * np.sqrt(max(aa + dd + ff, 0.0))

@@ -78,7 +78,8 @@ def theta_covariances(
             cells = Cells.of(sums, level, field)
             own += (_within(cells) * mean)[:, None] * centred
             upper, lower = map_halves(_between, len(theta), sums.start, cells)
-            middle += upper + lower
+            half = upper + lower
+            middle += half + half.transpose(0, 2, 1)
     total = sum_by_label(regions_of(sums.start), own, len(theta))
     middle += total[:, _FULL].reshape(-1, 3, 3)
     return sandwiches(inverse, middle)
@@ -125,12 +126,11 @@ def _within(cells: Cells) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
-    """Sums over pairs of cells (M + 1, 3, 3), of regions from the first to before the second."""
+    """Half the sums over pairs of cells (M + 1, 3, 3), of regions first...after."""
     result = np.zeros((len(start) - 1, 3, 3))
     for k in range(first, after):
         own = start[k], start[k + 1]
         add_common_errors(cells, own, own, result[k])
-        result[k] += result[k].T.copy()
     return result
 
 

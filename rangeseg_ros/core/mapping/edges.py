@@ -22,8 +22,7 @@ from rangeseg_ros.core.significance import chi2_quantile
 _NEIGHBOURS = 8
 # Points that err as one, as those along an edge do: so NEES is 1.2 in simulated rooms.
 _TOGETHER = 32
-_ROUNDS = 4
-_GATE = chi2_quantile(1)
+_ROUNDS, _GATE = 4, chi2_quantile(1)
 _DEVIATION = 1.4826  # of Gaussian errors, over their median absolute value
 
 
