@@ -206,7 +206,8 @@ def test_figures_of_given_frames(frames, tmp_path, run):
     for stage in (*figures['stages'].values(), figures['total']):
         assert 0 <= stage['median_ms'] <= stage['p95_ms']
     assert figures['total']['p95_ms'] >= max(s['median_ms'] for s in figures['stages'].values())
-    assert figures['cpu_ms'] > 0
+    # One thread, and what those of libraries spin beside it.
+    assert 0 < figures['cpu_ms'] < 4 * figures['total']['p95_ms']
     # Python with NumPy, SciPy and OpenCV alone takes more than 50 MB.
     assert 50 < figures['peak_memory_mb'] < 1000
     for name in ('labels', 'total', 'peak memory'):
