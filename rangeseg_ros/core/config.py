@@ -154,7 +154,7 @@ class Config:
     )
     map_planes: int = option(1000, 'planes of the map at most, those seen last', 1, 100000)
     odometry: bool = option(
-        False, "the camera's own motion from planes: ~/odometry and, without fixed_frame, the map"
+        False, 'own motion from planes and edges: ~/odometry and, without fixed_frame, the map'
     )
     odometry_frame: str = option(
         'odom', "frame of ~/odometry: x forward and z up, at the camera's first place"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 
@@ -78,13 +79,17 @@ def all_pieces() -> Iterator[tuple[str, float, float]]:
                 yield kind, size, distance
 
 
-def piece_scene(kind: str, size: float, distance: float, mount: float, seed: int) -> Terrain:
+def piece_scene(
+    kind: str, size: float, distance: float, mount: float, seed: int, random: Any = None
+) -> Terrain:
     """A test piece, seen from `mount` metres above the ground by a camera aimed 1.5 m ahead.
 
-    The same seed gives the same place across the view, direction and errors of what is stated.
+    The same seed gives the same place across the view, direction and errors of what is stated, or
+    a `random` generator that has `uniform` does.
     The `kind` of the scene is that of the piece with its size and distance.
     """
     site = Site(f'{kind} {size:g} {distance:g}', seed)
+    site.random = random or site.random
     site.height, site.roll = mount, site.random.uniform(-2, 2)
     site.pitch = float(np.degrees(np.arctan2(mount, 1.5))) + site.random.uniform(-3, 3)
     PIECES[kind](site, distance + site.random.uniform(-0.1, 0.1), size)
