@@ -25,6 +25,8 @@ from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
 
 # Nothing but the folder given may be written to, neither by us nor by numba, which both try with

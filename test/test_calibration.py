@@ -303,6 +303,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_command_writes_map_parameters_and_report(folder, tmp_path, run):
     output, params = tmp_path / 'map.tiff', tmp_path / 'sensor.yaml'
     camera = ['--camera', folder / 'camera.yaml', '--jobs', 1]
@@ -329,6 +330,7 @@ def test_command_writes_map_parameters_and_report(folder, tmp_path, run):
     assert read_distortion(output).offset == pytest.approx(distortion.offset, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_bags_of_clouds_give_the_map_that_images_give(tmp_path, run):
     images = [image for _, image in frames(22, true_map(0.004), noise=0.0006)]
     store = message_types(Stores.ROS2_JAZZY)
@@ -360,6 +362,7 @@ def test_bags_of_clouds_give_the_map_that_images_give(tmp_path, run):
     assert rms(1 / corrected.points[..., 2] - (1 / points[..., 2] - one.offset)) < 1e-5
 
 
+@pytest.mark.slow
 def test_interrupted_run_goes_on_where_it_was(folder, tmp_path, monkeypatch, run):
     output = tmp_path / 'map.tiff'
     arguments = [folder / 'depth', '--camera', folder / 'camera.yaml', '--output', output]

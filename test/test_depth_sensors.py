@@ -62,6 +62,7 @@ REAL = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('name', REAL)
 def test_residuals_by_block_size_are_like_those_of_real_frames(name):
     found = []

@@ -92,6 +92,7 @@ def run(words):
     return done.output
 
 
+@pytest.mark.slow
 def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
     pyplot.switch_backend('agg')
     monkeypatch.chdir(tmp_path)
@@ -109,6 +110,7 @@ def test_the_tutorial_can_be_followed(tmp_path, monkeypatch):
         assert Path(name).is_file(), name
 
 
+@pytest.mark.slow
 def test_recipes_for_data_run(tmp_path, monkeypatch, seen):
     """Each command of docs/your-data.md, on files of the kind it is for."""
     monkeypatch.chdir(tmp_path)

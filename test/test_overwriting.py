@@ -16,6 +16,8 @@ from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
 
+pytestmark = pytest.mark.slow
+
 
 def write(path, text='new'):
     with replacing(path) as partial:

@@ -285,6 +285,7 @@ def test_parameters_changed_while_running_keep_the_map():
     assert len(sequence.map) == 0 and sequence.map.begun_anew == 'its frame has changed'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', ['returns', 'goes on'])
 def test_memory_is_bounded_however_long_one_walks(kind):
     camera, random = kinect_camera(80, 60), np.random.default_rng(0)

@@ -19,6 +19,8 @@ from rangeseg_ros.io.images import read_labels
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.messages.clouds import planes_from_message
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def done(tmp_path_factory):
@@ -164,7 +166,6 @@ def test_an_interrupted_or_killed_replay_is_started_again(done, tmp_path, number
     assert not [path for path in (tmp_path / 'out').iterdir() if path.name.startswith('.')]
 
 
-@pytest.mark.slow
 def test_processes_give_the_same_results(tmp_path, monkeypatch, run):
     for name in ('a', 'b'):
         replay(record_walls(tmp_path / name, 2), tmp_path / 'local' / name)
@@ -224,7 +225,6 @@ def test_doubtful_images_are_counted(tmp_path, run):
     assert 'fills 2 x 2 pixels' in error
 
 
-@pytest.mark.slow
 def test_the_recording_of_a_lost_worker_is_done_by_another(tmp_path):
     distributed = pytest.importorskip('distributed')
     names = ['a', 'b', 'c']

@@ -14,6 +14,8 @@ from processes import python, wait_for
 
 from rangeseg_ros.tasks import Failure, SchedulerError, attempt_all, check_scheduler, run_all
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Square:

@@ -91,6 +91,7 @@ def test_clouds_and_their_own_body_are_reduced_as_well(seen):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('factor', (*FACTORS, 16))
 def test_linear_enlargement_is_found(seen, factor):
     depth = seen.depth[:240, :320].astype(np.float32) / 1000
