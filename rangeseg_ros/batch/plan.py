@@ -189,7 +189,7 @@ class PlanTask:
                     if pose:
                         image = corrected(frame.range_image(), config)
                         points = points_within(image, sensor, self.resolution) - image.place
-                        yield points @ pose.rotation.T + pose.shift
+                        yield pose.apply(points)
             # What comes after the damage has no poses.
             except DamagedBagError:
                 pass
