@@ -7,9 +7,8 @@ angles between the normals of its pixels and its direction, in degrees. A pixel 
 Squares are expanded first, then the pixels near the borders of their labels. A square stands for
 its largest part that no jump edge cuts. Its data cost and its links to other squares are the sums
 of those of the part's pixels, so that its energy is theirs. Squares begin with the direction
-nearest to their mean normal, pixels with the label of their square. Each label is expanded as far
-as it gains (thesis 4.8), from its borders on and, as squares hide narrow surfaces, from smaller
-squares that would lower the energy alone.
+nearest to their mean normal, pixels with the label of their square. Each label is expanded from
+its borders, as far as it gains (thesis 4.8).
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from rangeseg_ros.core.graphcut.expansion import (
     beyond,
     expand,
     fronts,
-    group_sites,
     link_costs,
 )
 from rangeseg_ros.core.regions import connected_components
@@ -50,12 +48,10 @@ def minimise(
     links, inside = link_costs(grid, smoothness).reshape(2, height, width), _largest_parts(grid)
     known = np.where(inside[..., None], normals, np.float32(np.nan))
     squares = _nearest(known, directions, _SIZE)
-    nowhere = np.full(squares.shape, -1, np.int32)
     for _ in range(2):
-        _expand(squares, nowhere, _SIZE, _between_squares(links, inside), known, directions)
+        _expand(squares, _SIZE, _between_squares(links, inside), known, directions)
     labels = _enlarged(squares, _SIZE, (height, width))
-    seeds = _seeds(labels, normals, directions, smoothness)
-    _expand(labels, seeds, 1, links, normals, directions)
+    _expand(labels, 1, links, normals, directions)
     return labels
 
 
@@ -105,21 +101,6 @@ def _nearest(
     return _nearest_directions(_per_square(np.add, np.nan_to_num(normals), size), directions)
 
 
-def _seeds(
-    labels: NDArray[np.int32],
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    smoothness: float,
-) -> NDArray[np.int32]:
-    """Labels (H, W) of smaller squares that gain more by them than their border costs, else -1."""
-    size = _SIZE // 2
-    found = _nearest(normals, directions, size)
-    gain = _per_square(np.add, data_costs(labels, 1, normals, directions), size)
-    gain -= data_costs(found, size, normals, directions)
-    found[gain <= 4 * size * smoothness] = -1
-    return _enlarged(found, size, labels.shape)
-
-
 def _largest_parts(grid: Grid) -> NDArray[np.bool_]:
     """Pixels (H, W) in the largest connected part of their square."""
     shape = len(grid.right), grid.below.shape[1]
@@ -155,40 +136,30 @@ def _enlarged(squares: NDArray[Any], size: int, shape: tuple[int, ...]) -> NDArr
 
 def _expand(
     labels: NDArray[np.int32],
-    seeds: NDArray[np.int32],
     size: int,
     links: NDArray[np.float32],
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> None:
-    """Expand the labels (h, w) of sites of `size` x `size` pixels; in place.
-
-    `seeds` (h, w) are labels that sites may begin with, -1 for none.
-    """
+    """Expand the labels (h, w) of sites of `size` x `size` pixels; in place."""
     height, width = labels.shape
     data = data_costs(labels, size, normals, directions)
     labelling = GridLabelling.of(labels.ravel(), data.ravel(), links.reshape(2, -1), width)
-    run_halves(_expand_rows, height, labelling, seeds.ravel(), size, normals, directions)
+    run_halves(_expand_rows, height, labelling, size, normals, directions)
 
 
 @njit(cache=True, nogil=True)
 def _expand_rows(
     rows: tuple[int, int],
     labelling: GridLabelling,
-    seeds: NDArray[np.int32],
     size: int,
     normals: NDArray[np.float32],
     directions: NDArray[np.float32],
 ) -> None:
-    """Expand every label in some rows from its borders and seeds, as far as it gains; in place."""
-    count = len(directions)
-    start, sites = fronts(labelling, count, rows)
-    first = rows[0] * labelling.width
-    found = first + np.flatnonzero(seeds[first : rows[1] * labelling.width] >= 0)
-    begin, grown = group_sites(seeds[found], found.astype(np.int32), count)
-    for alpha in range(count):
-        border = sites[start[alpha] : start[alpha + 1]]
-        front = np.concatenate((border, grown[begin[alpha] : begin[alpha + 1]]))
+    """Expand every label in some rows from its borders, as far as it gains; in place."""
+    start, sites = fronts(labelling, len(directions), rows)
+    for alpha in range(len(directions)):
+        front = sites[start[alpha] : start[alpha + 1]]
         while len(front) > 0:
             near = band(alpha, front, _SIZE, labelling, rows)
             costs = label_costs(alpha, near, size, normals, directions)
