@@ -84,7 +84,7 @@ def _near_height_zero(_: Any) -> Any:
     return near
 
 
-_DISTORTION = 'fitting/noise.py:_over_scales,_ratio,_sum_of_four'
+_DISTORTION = 'fitting/noise.py:_over_scales,_ratio'
 _CORRELATION = 'fitting/noise.py:_random'
 _NOISE = ('noise', 'error_law')
 _NORMALS = ('method', 'labelling', 'normals', 'directions')

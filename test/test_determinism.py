@@ -172,22 +172,6 @@ def test_strips_are_worked_on_at_the_same_time(threads):
 
 
 @pytest.mark.parametrize('threads', [2], indirect=True)
-def test_a_thread_that_is_done_takes_more_strips(threads):
-    """The caller's first one takes as long as all others together."""
-    begun, others_are_done = [], threading.Event()
-
-    def kernel(first, after):
-        if first == 0:
-            assert others_are_done.wait(20)
-            return
-        begun.append(first)
-        if after == 1000 and len(begun) > 1:
-            others_are_done.set()
-
-    run_rows(kernel, 1000)
-
-
-@pytest.mark.parametrize('threads', [2], indirect=True)
 def test_frames_with_a_core_each_have_no_helpers(threads):
     def worker():
         """Who does a task: another thread, given the time to begin it."""

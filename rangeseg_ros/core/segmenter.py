@@ -90,15 +90,17 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
+        cells = submit(enlargement, image)
         if shows_disparity(image):
-            result = self._undone(from_disparity(image))
+            depth = from_disparity(image)
+            result = self._undone(depth, enlargement(depth))
             # Heights in no unit are no ground to drive on.
             return replace(result, image=image, disparity=True, survey=None)
-        return self._undone(image)
+        return self._undone(image, cells.result())
 
-    def _undone(self, image: RangeImage) -> Segmentation:
-        """Segment an image, of which a measurement fills several pixels or one."""
-        config, cells = self.config, enlargement(image)
+    def _undone(self, image: RangeImage, cells: Cells | None) -> Segmentation:
+        """Segment an image, of which a measurement fills several pixels, `cells`, or one."""
+        config = self.config
         if cells is None:
             result = self._find_planes(image)
             return replace(result, survey=Survey.of(image, result.sensor, config))
@@ -134,15 +136,20 @@ class Segmenter:
             fits = Fits.of(regions, view.image, stated, view.blocks)
             probability = plane_probabilities(fits, config.plane_prior)
         watch.lap('regions')
-        pixels = sensor if config.method == 'planes' else stated
-        planes = describe_regions(regions, view.whole, fits, probability, pixels)
         # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
         # or so steep that they have no end.
-        kept = np.zeros(len(fits.theta), np.uint16)
-        kept[[plane.label for plane in planes]] = [plane.label for plane in planes]
-        labels = relabel(regions, kept) * view.image.valid
+        known = fits.farthest() > 0
+        labels = relabel(regions, (known * np.arange(len(known))).astype(np.uint16))
+        labels, cells = labels * view.image.valid, None
+        if isinstance(labelling, by_planes.Labelling) and side > 1:
+            given = labels, labelling.labels, labelling.models, image, side, sensor
+            pixels = submit(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
+            planes = describe_regions(regions, view.whole, fits, probability, sensor, pixels)
+            labels, cells = pixels.result(), Cells(side, 0, 0)
+        else:
+            planes = describe_regions(regions, view.whole, fits, probability)
         watch.lap('planes')
-        result = Segmentation(
+        return Segmentation(
             labels,
             planes,
             watch.laps,
@@ -152,17 +159,11 @@ class Segmenter:
             jumps,
             upright=(config.role_tolerance, config.role_area, config.ground_slope),
             work_budget=config.work_budget,
-            image=view.image,
+            image=image,
+            cells=cells,
             curved_regions=curved,
             identified=view.identified,
         )
-        if side == 1 or isinstance(labelling, by_normals.Labelling):
-            return result
-        surfaces, models = labelling.labels, labelling.models
-        prior = config.plane_smoothness * sensor.patch
-        labels = with_sharp_borders(labels, surfaces, models, image, side, sensor, prior)
-        watch.lap('borders')
-        return result.of_pixels(labels, image, Cells(side, 0, 0))
 
 
 def _preprocessed(

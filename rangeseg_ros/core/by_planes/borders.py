@@ -14,6 +14,7 @@ from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
 from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 
@@ -37,7 +38,8 @@ def with_sharp_borders(
     """
     height, width = image.shape
     labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
-    given = regions, surfaces, models, image.inverse, image.rays, sensor, prior, side, labels
+    pixels = image.inverse, image.rays, image.pinhole
+    given = regions, surfaces, models, *pixels, sensor, prior, side, labels
     # Rows of bins in turn: those that change at the same time do not touch.
     for odd in (0, 1):
         run_rows(_settle, (len(regions) + 1 - odd) // 2, odd, *given)
@@ -54,6 +56,7 @@ def _settle(
     models: Models,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
+    pinhole: bool,
     sensor: SensorModel,
     prior: float,
     side: int,
@@ -62,8 +65,13 @@ def _settle(
     """Give pixels of bins in every second row the label of the lowest cost, in place."""
     (rows, columns), (height, width) = regions.shape, labels.shape
     names, planes = np.empty(_LABELS, np.uint16), np.empty(_LABELS, np.intp)
+    nearer, near = np.empty(_LABELS), np.empty(4, np.uint16)
     for i in range(2 * first + odd, 2 * after + odd - 1, 2):
+        above, below = regions[max(i - 1, 0)], regions[min(i + 1, rows - 1)]
         for j in range(columns):
+            here, left, right = regions[i, j], max(j - 1, 0), min(j + 1, columns - 1)
+            if here == above[j] == below[j] == regions[i, left] == regions[i, right]:
+                continue
             count = 0
             for u, v in ((i, j), (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)):
                 if not (0 <= u < rows and 0 <= v < columns) or count == _LABELS:
@@ -73,26 +81,29 @@ def _settle(
                     c += 1
                 if c == count:
                     names[c], count = regions[u, v], count + 1
-                    planes[c] = surfaces[u, v] if regions[u, v] > 0 else 0
-            if count == 1:
-                continue
+                    label = int(np.intp(surfaces[u, v])) if regions[u, v] > 0 else 0
+                    planes[c] = label
+                    nearer[c] = 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
             for k in range(side * side):
                 u, v = i * side + k // side, j * side + k % side
                 if u >= height or v >= width or inverse[u, v] == 0:
                     continue
+                others = 0
+                for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
+                    if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
+                        near[others], others = labels[a, b], others + 1
                 y, least = np.float64(inverse[u, v]), np.inf
-                variance = random_variance(sensor, y * y)
+                ray = ray_of(rays, pinhole, u, v)
+                weight = 1 / random_variance(sensor, y * y)
                 for c in range(count):
-                    name, label, cost, level = names[c], planes[c], NO_PLANE, 0.0
+                    name, label, cost = names[c], planes[c], NO_PLANE
                     if label > 0:
-                        for a in range(3):
-                            level += models.theta[label, a] * rays[u, v, a]
-                        level *= 1 + shift_at(models.shifts, label, i // NODE, j // NODE)
-                        square = (y - level) ** 2 / variance
+                        level = models.theta[label, 0] * ray[0] + models.theta[label, 1] * ray[1]
+                        level += models.theta[label, 2] * ray[2]
+                        square = weight * (y - nearer[c] * level) ** 2
                         cost = min(models.half_precision[label] * square, CAP)
-                    for a, b in ((u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)):
-                        if 0 <= a < height and 0 <= b < width and inverse[a, b] > 0:
-                            cost += prior * (labels[a, b] != name)
+                    for other in near[:others]:
+                        cost += prior * (other != name)
                     if cost < least:
                         best, least = name, cost
                 labels[u, v] = best

@@ -165,17 +165,19 @@ def _apart(
     `strips` h and h + 1 are those along their border.
     """
     extra = common_residual(moments, a, b) - residual[a] - residual[b]
-    own = (common_residual(strips, h, h) + common_residual(strips, h + 1, h + 1)) / 2
-    crease = common_residual(strips, h, h + 1) - own
     pixels = moments[a, COUNT] + moments[b, COUNT]
-    # What bends evenly over the parts bends by the square of a length over a strip.
-    near = expected.bend * (strips[h, COUNT] + strips[h + 1, COUNT]) / pixels
-    fits = _misfit(extra, moments, a, b, expected.bend, expected)
-    fits = max(fits, _misfit(crease, strips, h, h + 1, near, expected))
     ratio = (moments[a, RATIO] + moments[b, RATIO]) / pixels
     granted = 1 + ratio * distortion_share(pixels, expected.smooth)
     change = (0.5 * extra / granted - expected.border * length) / expected.patch
-    return min(fits, 1 + change / _PLANE)
+    costs, fits = 1 + change / _PLANE, _misfit(extra, moments, a, b, expected.bend, expected)
+    if fits >= min(costs, 1):
+        # However well the patches along the border fit.
+        return costs
+    own = (common_residual(strips, h, h) + common_residual(strips, h + 1, h + 1)) / 2
+    crease = common_residual(strips, h, h + 1) - own
+    # What bends evenly over the parts bends by the square of a length over a strip.
+    near = expected.bend * (strips[h, COUNT] + strips[h + 1, COUNT]) / pixels
+    return min(max(fits, _misfit(crease, strips, h, h + 1, near, expected)), costs)
 
 
 @njit(cache=True)

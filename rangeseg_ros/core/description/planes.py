@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, triangles
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.region_sums import POINT, RAY, SCATTER, WEIGHT
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, regions_of
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
-from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.regions import region_sizes
+from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -168,11 +169,13 @@ def describe_regions(
     fits: Fits,
     probability: NDArray[np.float64] | None = None,
     sensor: SensorModel | None = None,
+    pixels: Task[NDArray[np.uint16]] | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given, `sensor`
-    that of pixels, where the image is of their means.
+    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given. Where the
+    image is of means of pixels, `sensor` is that of the pixels, and `pixels` what finds their
+    labels, which may go on meanwhile.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
@@ -180,7 +183,7 @@ def describe_regions(
         return []
     theta_covariance = fits.covariances()
     surfaces = submit(common_surfaces, fits, theta_covariance)
-    normal, distance, centroid, rms, confidence, farthest = _described(fits, sensor or fits.sensor)
+    normal, distance, centroid, rms, confidence = _described(fits, sensor or fits.sensor)
     covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
     if image.place.any():
         # From the sensor to the frame of the points.
@@ -189,6 +192,7 @@ def describe_regions(
         distance, covariance = distance - normal @ image.place, shift @ covariance @ shift.T
         centroid = centroid + image.place
 
+    farthest = fits.farthest() / _FAR
     found = np.flatnonzero(farthest > 0)
     known, outlines = found.tolist(), []
     for k, box, far in zip(known, fits.boxes()[found].tolist(), farthest[found], strict=True):
@@ -196,7 +200,8 @@ def describe_regions(
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    numbers = surfaces.result(), distance, fits.pixels, rms, confidence, probability
+    counts = region_sizes(pixels.result(), len(theta)) if pixels else fits.pixels
+    numbers = surfaces.result(), distance, counts, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]
     place, right = image.place, image.axes[:, 0].copy()
@@ -208,8 +213,7 @@ def describe_regions(
 def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ...]:
     """What regions 0...M have as planes, see `Plane`.
 
-    Normal, distance, centroid, rms, confidence, and the inverse range at which the plane ends for
-    its outline: 0 where there is no plane.
+    Normal, distance, centroid, rms, confidence.
     """
     theta, total, cells = fits.theta, fits.total, fits.sums.cells
     slope = np.sqrt((theta * theta).sum(axis=1))
@@ -225,8 +229,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     square += distance * (2 * offset + distance)
     centroid -= (offset + distance)[:, None] * normal
     # What the errors of the sensor make of it: n . p + d changes by d / y times the error of y.
-    region = np.repeat(np.arange(len(theta)), np.diff(fits.sums.start))
-    level = (theta[region] * cells[:, RAY : RAY + 3]).sum(axis=1) / cells[:, WEIGHT]
+    region, level = regions_of(fits.sums.start), fits.level
     squared = np.where(level > 0, level * level, 1.0)
     pixels = np.bincount(region, cells[:, COUNT], len(theta))
 
@@ -237,9 +240,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     random = random_variance(fits.sensor, squared)
     expected = across(random + systematic_variance(fits.sensor, squared))
     hidden = across(random_variance(sensor, squared) - random)
-    farthest = np.where(pixels > 0, np.inf, 0.0)
-    np.minimum.at(farthest, region, level / _FAR)
     explained = np.minimum(1, expected / np.maximum(square, 1e-18))
     confidence = (1 - fits.outlier_share()) * explained
     rms = np.sqrt(np.maximum(square, 0) + hidden)
-    return normal, distance, centroid, rms, confidence, farthest
+    return normal, distance, centroid, rms, confidence

@@ -11,7 +11,6 @@ from rangeseg_ros.core.fitting.uncertainty import (
     Cells,
     add_common_errors,
     distortion_field,
-    levels,
 )
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.significance import chi2_quantile
@@ -38,7 +37,7 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     """
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
-    cells = Cells.of(fits.sums, levels(fits.sums, fits.theta), distortion_field(fits.sensor))
+    cells = Cells.of(fits.sums, fits.level, distortion_field(fits.sensor))
     start, inverses = fits.sums.start, fits.inverses()
     return _surfaces(order, start, fits.theta, inverses, covariance, cells)
 

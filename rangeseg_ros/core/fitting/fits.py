@@ -7,8 +7,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
-from rangeseg_ros.core.fitting.uncertainty import theta_covariances
+from rangeseg_ros.core.fitting.region_sums import (
+    POINT,
+    SCATTER,
+    RegionSums,
+    fit_sums,
+    regions_of,
+    sum_regions,
+)
+from rangeseg_ros.core.fitting.uncertainty import levels, theta_covariances
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -22,12 +29,14 @@ class Fits(NamedTuple):
     """Planes theta . ray = inverse range (M + 1, 3) of regions; zeros where there is none.
 
     `sums` are over the pixels that were fitted, `total` (M + 1, 29) the same of whole regions.
+    `level` (N,) is the inverse range of the planes at the middles of their cells.
     """
 
     sums: RegionSums
     total: NDArray[np.float64]
     theta: NDArray[np.float64]
     sensor: SensorModel
+    level: NDArray[np.float64]
 
     @classmethod
     def of(
@@ -49,13 +58,13 @@ class Fits(NamedTuple):
         theta = fit_sums(total)
         if image.camera is None:
             theta = _total_least_squares(total, theta)
-        return cls(sums, total, theta, sensor)
+        return cls(sums, total, theta, sensor, levels(sums, theta))
 
     def without(self, dropped: NDArray[np.bool_]) -> Fits:
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
-        kept = ~dropped
-        sums = self.sums.without(dropped)
-        return Fits(sums, self.total[kept], self.theta[kept], self.sensor)
+        kept, sums = ~dropped, self.sums.without(dropped)
+        level = self.level[kept[regions_of(self.sums.start)]]
+        return Fits(sums, self.total[kept], self.theta[kept], self.sensor, level)
 
     @property
     def pixels(self) -> NDArray[np.intp]:
@@ -65,6 +74,12 @@ class Fits(NamedTuple):
     def boxes(self) -> NDArray[np.intp]:
         """First row and column of each region, and the ones after its last, (M + 1, 4)."""
         return self.sums.box
+
+    def farthest(self) -> NDArray[np.float64]:
+        """Least inverse range (M + 1,) of planes in their regions; 0 or less where none ends."""
+        least = np.where(np.diff(self.sums.start) > 0, np.inf, 0.0)
+        np.minimum.at(least, regions_of(self.sums.start), self.level)
+        return least
 
     def outlier_share(self) -> NDArray[np.float64]:
         """Share of the pixels (M + 1,) beyond four standard deviations of the sensor's errors."""
@@ -80,7 +95,7 @@ class Fits(NamedTuple):
 
     def covariances(self) -> NDArray[np.float64]:
         """Covariances of theta, (M + 1, 3, 3)."""
-        return theta_covariances(self.sums, self.theta, self.inverses(), self.sensor)
+        return theta_covariances(self.sums, self.level, self.inverses(), self.sensor)
 
 
 def _total_least_squares(

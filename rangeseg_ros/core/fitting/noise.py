@@ -8,13 +8,12 @@ distortion make of them is in docs/method.md.
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, quantile
-from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
+from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, sum_of_four
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, correlated_residuals
@@ -124,14 +123,14 @@ def _over_scales(
     between, filled, distortion, most = 1.0, 1.0, Law(0.0, 0.0), 0.0
     side, larger = 2 * BLOCK, coarse
     while True:
-        whole = _sum_of_four(flat) == 4
+        whole = sum_of_four(flat) == 4
         used = np.flatnonzero(whole)
         if len(used) < SAMPLES:
             break
         used = _some(used, _ENOUGH)
         strata = Strata.of(larger, used)
-        level = _sum_of_four(level) / 4
-        excess = np.maximum(larger.residual - _sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
+        level = sum_of_four(level) / 4
+        excess = np.maximum(larger.residual - sum_of_four(blocks.residual), 0) / (9 * _MEDIAN)
         within.append(_ratio(larger, level, used, strata))
         pixels = _median(larger.moments[..., COUNT], used) / 4
         if side == 2 * BLOCK:
@@ -170,14 +169,6 @@ def _ratio(
     ratio = blocks.residual / (level * freedom)
     shown = quantile(ratio.ravel()[strata.blocks], _QUANTILE).mean()
     return float(shown) / _share(_median(freedom, used))
-
-
-def _sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
-    """Sums over 2 x 2 of values (rows, columns), of fewer at the border."""
-    result = values.astype(float)
-    for axis in (1, 0):
-        result = np.add.reduceat(result, np.arange(0, values.shape[axis], 2), axis=axis)
-    return result
 
 
 @cache

@@ -14,7 +14,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, regions_of
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
@@ -57,30 +56,29 @@ def distortion_field(sensor: SensorModel) -> Field:
 
 
 def theta_covariances(
-    sums: RegionSums, theta: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
+    sums: RegionSums, level: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
-    """Covariances (M + 1, 3, 3) of planes theta . ray = inverse range (M + 1, 3) of regions.
+    """Covariances (M + 1, 3, 3) of planes theta . ray = inverse range of regions.
 
-    `inverse` (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
+    `level` (N,) are the inverse ranges of cells on them, see `levels`, and `inverse`
+    (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
     """
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
     variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
-    level = levels(sums, theta)
     weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
     mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
     centred = scatter - ray[:, _ROW] * ray[:, _COLUMN] / weight[:, None]
     # Squares of the same scale as the rays: variance times weight.
     white = (1 - smooth) * random_variance(sensor, level**2) * mean
     own = white[:, None] * scatter
-    middle = np.zeros((len(theta), 3, 3))
+    middle = np.zeros((len(inverse), 3, 3))
     for field in ((sensor.correlation, *variances), distortion_field(sensor)):
         if field[1] + field[2] > 0:
             cells = Cells.of(sums, level, field)
             own += (_within(cells) * mean)[:, None] * centred
-            upper, lower = map_halves(_between, len(theta), sums.start, cells)
-            half = upper + lower
+            half = _between(sums.start, cells)
             middle += half + half.transpose(0, 2, 1)
-    total = sum_by_label(regions_of(sums.start), own, len(theta))
+    total = sum_by_label(regions_of(sums.start), own, len(inverse))
     middle += total[:, _FULL].reshape(-1, 3, 3)
     return sandwiches(inverse, middle)
 
@@ -125,10 +123,10 @@ def _within(cells: Cells) -> NDArray[np.float64]:
 
 
 @njit(cache=True, nogil=True)
-def _between(first: int, after: int, start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
-    """Half the sums over pairs of cells (M + 1, 3, 3), of regions first...after."""
+def _between(start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
+    """Half the sums over pairs of cells (M + 1, 3, 3) of regions."""
     result = np.zeros((len(start) - 1, 3, 3))
-    for k in range(first, after):
+    for k in range(len(result)):
         own = start[k], start[k + 1]
         add_common_errors(cells, own, own, result[k])
     return result

@@ -23,9 +23,8 @@ T = TypeVar('T')
 
 # More would wait for the memory.
 _MAX_THREADS = 4
-# Rows that are worth the handing over, and strips for each thread: who is done first, as its rows
-# are the easier ones or as it was awake sooner, takes one more.
-_ROWS, _STRIPS = 16, 2
+# Rows that are worth the handing over.
+_ROWS = 16
 # Rows on either side of the middle of the image that are looked at again.
 _SEAM = 8
 
@@ -91,8 +90,7 @@ def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
 
     What one strip writes no other may touch.
     """
-    threads = _threads()
-    count = max(min(_STRIPS * threads, rows // _ROWS), 1) if threads > 1 else 1
+    count = max(min(_threads(), rows // _ROWS), 1)
     bounds = [rows * part // count for part in range(count + 1)]
     others = [Task(kernel, *strip, *arguments) for strip in pairwise(bounds[1:])]
     kernel(0, bounds[1], *arguments)

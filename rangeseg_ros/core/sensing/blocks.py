@@ -54,7 +54,8 @@ class Blocks(NamedTuple):
         """Every 2 x 2 of them as one: blocks of `size` pixels of these rays (H, W, 3)."""
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
-        _sum_blocks(self.moments, rays, size, blocks)
+        blocks.moments[:] = sum_of_four(self.moments)
+        _fit_planes(0, len(blocks.moments), rays, size, blocks)
         return blocks
 
     @classmethod
@@ -63,24 +64,20 @@ class Blocks(NamedTuple):
         return cls(moments, *(np.empty((rows, columns)) for _ in range(3)))
 
 
+def sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Sums over 2 x 2 of values (rows, columns, ...), of fewer at the border."""
+    rows, columns, *rest = values.shape
+    result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, *rest))
+    for i, j in np.ndindex(2, 2):
+        part = values[i::2, j::2]
+        result[: len(part), : part.shape[1]] += part
+    return result
+
+
 def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
     """Values of the blocks, or one for all, for the pixels (H, W) of each."""
     blocks = np.broadcast_to(values, [-(-length // BLOCK) for length in shape])
     return blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=0)[: shape[0], : shape[1]]
-
-
-@njit(cache=True, nogil=True)
-def _sum_blocks(
-    parts: NDArray[np.float64], rays: NDArray[np.float32], size: int, blocks: Blocks
-) -> None:
-    """Fill in blocks of 2 x 2 that have these moments."""
-    moments = blocks.moments
-    moments[:] = 0
-    for i in range(parts.shape[0]):
-        for j in range(parts.shape[1]):
-            for k in range(COUNT + 1):
-                moments[i // 2, j // 2, k] += parts[i, j, k]
-    _fit_planes(int(np.intp(0)), len(moments), rays, size, blocks)
 
 
 @njit(cache=True, nogil=True)
@@ -160,8 +157,8 @@ def _change(
             farthest, change = last - first, 0.0
             begin, end = (i + di * first, j + dj * first), (i + di * last, j + dj * last)
             for k in range(3):
-                step = rays[end[0], end[1], k] - rays[begin[0], begin[1], k]
-                change += theta[k] * step / farthest
+                change += theta[k] * (rays[end[0], end[1], k] - rays[begin[0], begin[1], k])
+            change /= farthest
         if farthest == size - 1:
             break
     return change

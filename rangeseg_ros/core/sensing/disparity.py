@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
+from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.verdict import ODDS, SPREAD
 from rangeseg_ros.core.significance import CLEARLY
 
 # Pixels of VGA along the side of a block, wide enough to show the bend, and those that tell it.
 _SIDE, _SAMPLES = 48, 8
+# Of the squares of what rays differ by, beside rounding.
+_PRECISE = np.finfo(np.float64).eps ** 0.5
 
 
 def shows_disparity(image: RangeImage) -> bool:
@@ -25,15 +29,16 @@ def shows_disparity(image: RangeImage) -> bool:
     """
     if image.camera is None:
         return False
-    inverse, rays = _blocks(image)
-    if not len(inverse):
+    inverse = _blocks(image.inverse[..., None], image.inverse.size)
+    known = (inverse > 0).all(axis=(1, 2))
+    if not known.any():
         return False
-    square = rays.transpose(0, 2, 1) @ rays
-    # Rays of a very narrow view are all but one: rounding alone would make it singular.
-    square += (
-        np.finfo(np.float64).eps * np.trace(square, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    )
-    fit = np.linalg.inv(square) @ rays.transpose(0, 2, 1)
+    fits = _fits.get(image.camera)
+    if fits is None:
+        rays = _blocks(image.rays, image.inverse.size)
+        # Rays of a very narrow view are all but one.
+        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=_PRECISE)
+    inverse, rays, fit = inverse[known], fits[0][known], fits[1][known]
     # Behind the camera where no plane fits.
     level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))
     both = np.concatenate([inverse, 1 / level], axis=2)
@@ -61,14 +66,15 @@ def from_disparity(image: RangeImage) -> RangeImage:
     return replace(image, inverse=(np.median(known) ** 2 * values).astype(np.float32))
 
 
-def _blocks(image: RangeImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Inverse depths (N, S, 1) and rays (N, S, 3) of samples of blocks measured throughout."""
-    step = max(round(_SIDE / _SAMPLES * (image.inverse.size / VGA) ** 0.5), 1)
-    inverse, rays = image.inverse[::step, ::step], image.rays[::step, ::step]
-    some = np.concatenate([inverse[..., None], rays], axis=2)
-    rows, columns = (length // _SAMPLES for length in some.shape[:2])
-    some = some[: rows * _SAMPLES, : columns * _SAMPLES].astype(np.float64)
-    blocks = some.reshape(rows, _SAMPLES, columns, _SAMPLES, 4).transpose(0, 2, 1, 3, 4)
-    blocks = blocks.reshape(rows * columns, _SAMPLES**2, 4)
-    blocks = blocks[(blocks[:, :, 0] > 0).all(axis=1)]
-    return blocks[..., :1], blocks[..., 1:]
+# Rays of blocks (N, S, 3), and what makes of inverse depths along them the planes (N, 3, S) of
+# least squares; of a camera, as long as it lives.
+_fits: WeakKeyDictionary[Camera, tuple[NDArray[np.float64], ...]] = WeakKeyDictionary()
+
+
+def _blocks(values: NDArray[np.float32], pixels: int) -> NDArray[np.float64]:
+    """Samples (N, S, K) of the values (H, W, K) of so many pixels, in blocks."""
+    step = max(round(_SIDE / _SAMPLES * (pixels / VGA) ** 0.5), 1)
+    some = values[::step, ::step].astype(np.float64)
+    n, (rows, columns) = _SAMPLES, (length // _SAMPLES for length in some.shape[:2])
+    blocks = some[: rows * n, : columns * n].reshape(rows, n, columns, n, some.shape[2])
+    return blocks.transpose(0, 2, 1, 3, 4).reshape(rows * columns, n * n, some.shape[2])

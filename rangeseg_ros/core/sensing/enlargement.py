@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -17,6 +17,7 @@ SIGNIFICANT = 5.0
 """Standard errors that a statistic of an image must differ by, not to be chance in any image."""
 # Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
+_TYPICAL = 1000  # differences that tell how large they are
 _LARGEST = 16  # enlargement that is looked for
 _PERIODS = np.arange(2, _LARGEST + 1)
 
@@ -113,7 +114,7 @@ def interpolation(image: RangeImage) -> Cells | None:
     """
     amplitude = np.full(len(_PERIODS), np.inf)
     for lines in (image.inverse, image.inverse.T):
-        some = lines[:: max(len(lines) // _FEW, 1)].astype(np.float64)
+        some = np.ascontiguousarray(lines[:: max(len(lines) // _FEW, 1)])
         with np.errstate(divide='ignore', invalid='ignore'):
             distance = 1 / some
             second = np.diff(distance, 2)
@@ -129,7 +130,7 @@ def interpolation(image: RangeImage) -> Cells | None:
 
 
 def _spectrum(
-    differences: NDArray[np.float64], distance: NDArray[np.float64], periods: slice
+    differences: NDArray[Any], distance: NDArray[Any], periods: slice
 ) -> NDArray[np.float64]:
     """Amplitude of the size of differences along lines at each period, in standard errors."""
     size = np.abs(differences)
@@ -141,8 +142,9 @@ def _spectrum(
     if not len(changes) or len(columns) < 2 * _LARGEST:
         return np.zeros(len(waves))
     # Edges of objects are no part of it.
-    size = np.where(known, np.minimum(size, 2 * np.median(changes)), 0)
-    means = size.sum(axis=0)[columns] / known.sum(axis=0)[columns]
+    typical = np.median(changes[:: max(len(changes) // _TYPICAL, 1)])
+    size = np.where(known, np.minimum(size, 2 * typical), 0)
+    means = size.sum(axis=0, dtype=float)[columns] / known.sum(axis=0)[columns]
     spread = means.std() * len(columns) ** 0.5
     sums = np.abs((waves * (means - means.mean())).sum(axis=1))
     return sums / max(spread, 1e-300)

@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.grid import GridEdges
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -55,14 +54,14 @@ def plane_deviation(
     means = _framed(total / np.maximum(count, 1))
     jumps = np.empty((height, width - 1), np.bool_), np.empty((height - 1, width), np.bool_)
     for down, result in enumerate(jumps):
-        run_rows(_find_deviations, len(result), means, step, down, result)
+        _find_deviations(means, step, bool(down), result)
     total, count = _window_sums(image, 2 * _WINDOW + 1)
     nearer = image.inverse * count > total
     # 1 for candidates below the mean, 2 for those above.
     sides = pixels_beside(jumps).view(np.uint8) << nearer
     pixels = _framed(image.inverse)
     for down, result in enumerate(jumps):
-        run_rows(_find_crossings, len(result), pixels, sides, lone, clear, down, result)
+        _find_crossings(pixels, sides, lone, clear, bool(down), result)
     return jumps
 
 
@@ -88,15 +87,13 @@ def _framed(values: NDArray[Any]) -> NDArray[Any]:
 
 @njit(cache=True, nogil=True)
 def _find_deviations(
-    first: int,
-    after: int,
     means: NDArray[np.float32],
     limits: NDArray[np.float32],
     down: bool,
     result: NDArray[np.bool_],
 ) -> None:
     """Whether the windows on either side of boundaries deviate from those beyond."""
-    for i in range(first, after):
+    for i in range(len(result)):
         a, b = _shifted(means, i, -4, down), _shifted(means, i, -1, down)
         c, d = _shifted(means, i, 2, down), _shifted(means, i, 5, down)
         row = limits[i // BLOCK]
@@ -106,8 +103,6 @@ def _find_deviations(
 
 @njit(cache=True, nogil=True)
 def _find_crossings(
-    first: int,
-    after: int,
     pixels: NDArray[np.float32],
     sides: NDArray[np.uint8],
     limits: NDArray[np.float32],
@@ -116,7 +111,7 @@ def _find_crossings(
     result: NDArray[np.bool_],
 ) -> None:
     """Jumps between pixels, see `plane_deviation`."""
-    for i in range(first, after):
+    for i in range(len(result)):
         a, b = _shifted(pixels, i, -1, down), _shifted(pixels, i, 0, down)
         c, d = _shifted(pixels, i, 1, down), _shifted(pixels, i, 2, down)
         one, other = sides[i], sides[i + 1] if down else sides[i, 1:]

@@ -93,10 +93,10 @@ def plane_of(sums: tuple[float, ...]) -> tuple[float, float, float, float]:
     """
     a, b, c, d, e, f, p, q, r, square = sums
     aa, bb, cc, dd, ee, ff, determinant = cofactors(a, b, c, d, e, f)
-    known = determinant > 1e-13 * a * d * f
-    x = (aa * p + bb * q + cc * r) / determinant if known else 0.0
-    y = (bb * p + dd * q + ee * r) / determinant if known else 0.0
-    z = (cc * p + ee * q + ff * r) / determinant if known else 0.0
+    scale = 1 / determinant if determinant > 1e-13 * a * d * f else 0.0
+    x = scale * (aa * p + bb * q + cc * r)
+    y = scale * (bb * p + dd * q + ee * r)
+    z = scale * (cc * p + ee * q + ff * r)
     # Not square - x p - y q - z r: what the plane is off by, as pixels lie in nearly one
     # direction, counts there at once, here by its square.
     left = square - 2 * (x * p + y * q + z * r)
