@@ -13,7 +13,7 @@ from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import BASELINE as KINECT_BASELINE
 from rangeseg_ros.simulation.sensors.kinect import NOISES, QUANTUM, kinect_camera
 from rangeseg_ros.simulation.sensors.sensor import resize, slopes, unseen_from_the_right
-from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense
+from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense, distortion
 from rangeseg_ros.simulation.solids import box, half_space
 
 
@@ -106,6 +106,18 @@ def test_nothing_is_measured_where_nothing_is(name):
 def test_ideal_is_exact():
     frame = simulate(in_camera_frame(wall(2.5)), SENSORS['ideal'](0))
     assert frame.depth.dtype == np.float32 and (frame.depth == np.float32(2.5)).all()
+
+
+def test_the_distortion_of_stereo_is_a_bowl_of_either_sign():
+    """As deep along rows as along columns, with half to all of 3 mm at a metre."""
+    v, u = (axis.ravel() for axis in np.mgrid[-1:1:30j, -1:1:40j])
+    terms = np.stack([v**2, u**2, v, u, np.ones(len(v))], axis=1)
+    fields = np.stack([distortion((30, 40), seed).ravel() for seed in range(40)], axis=1)
+    down, across, *slopes, _ = np.linalg.lstsq(terms, fields, rcond=None)[0]
+    for depth in (down, across):
+        assert np.abs(depth).mean() == pytest.approx(0.75 * 0.003, rel=0.2)
+    assert ((down > 0) == (across > 0)).mean() > 0.9 and 10 < (down > 0).sum() < 30
+    assert np.abs(slopes).mean() < 0.001
 
 
 def test_stereo_takes_disparities_of_steps():

@@ -90,6 +90,20 @@ def test_outline_and_area_agree_and_run_counter_clockwise():
     assert outer + sum(holes) == pytest.approx(plane.area, rel=0.25 * 1060 / 39000)
 
 
+def test_an_outline_ends_before_the_horizon():
+    """At twice the range of the cells of pixels that are farthest."""
+    camera = Camera(80, 64, 60.0, 60.0, 39.5, 31.9)
+    labels = np.zeros(camera.shape, np.uint16)
+    labels[32:] = 1
+    image = RangeImage(camera.rays, np.maximum(camera.rays[..., 1], 0).astype(np.float32), camera)
+    (plane,) = fit_planes(labels, image, KINECT)
+    x, y, z = plane.hull.T
+    np.testing.assert_allclose(y, 1, atol=1e-6)
+    # Cells are 8 x 8 pixels; rows 32 to 39 are 3.6 below the horizon in the mean.
+    assert z.max() == pytest.approx(2 * 60 / 3.6, rel=1e-3)
+    assert (np.abs(60 * x / z).round(3) == 40).all() and len(z) == 4
+
+
 def test_extents_of_a_turned_rectangle():
     # 1.2 m by 0.5 m on an oblique plane, its long side turned by 30 degrees in it.
     across = np.cross(NORMAL, [0, 1, 0])

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.ground.points import drops, outlines, unseen
+from rangeseg_ros.core.ground.reach import reach
 from rangeseg_ros.core.ground.terrain import terrain_of
 from rangeseg_ros.core.segmentation import STATED
 from rangeseg_ros.core.sequence import SequenceSegmenter
@@ -242,6 +243,18 @@ def test_a_view_without_floor_has_no_ground():
         _, result, frame = found(scene(wall, Piece(FLOOR, GROUND), pitch=0), height)
         assert (result.terrain != GROUND).mean() > 0.999
         assert (result.terrain == OBSTACLE)[frame.depth > 0].mean() > 0.99
+
+
+def test_a_chain_goes_on_a_while_after_what_is_off_the_ground():
+    """Rows of 2 cm: one 30 mm high, and from then on 16, within half a step but on the same."""
+    rows, columns = np.indices((30, 9))
+    height = np.select([rows < 10, rows < 11], [0.0, 0.03], 0.016)
+    place = np.stack([height, 0.5 + 0.02 * rows, 0.02 * (columns - 4)])[:, ::-1]
+    config = Config(robot_radius=0.1, ground_gap=0.1, ground_slope=30.0)
+    reached = reach(place, np.full(rows.shape, 4e-6), config, False)[::-1]
+    assert reached[:9].all() and not reached[9:13].any()
+    # 16 mm and what is left of 14 more after 6 cm are within 25, half a step.
+    assert reached[13:].all()
 
 
 SEEN = np.degrees(np.arctan2(240, Kinect(0).camera.fy))  # below the middle of the image
