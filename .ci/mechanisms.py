@@ -157,9 +157,8 @@ MECHANISMS = (
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),
     # Planes.
-    Mechanism('outliers left out of fits', 'fitting/region_sums.py:_inner_planes',
-              {'fitting.region_sums._inner_planes':
-               lambda _: lambda inside, moments, count: np.zeros((count, 3))}),
+    Mechanism('outliers left out of fits', 'fitting/region_sums.py:fit_sums',
+              {'fitting.region_sums.fit_sums': lambda _: lambda total: np.zeros((len(total), 3))}),
     Mechanism('parts of a surface found', 'fitting/coplanar.py',
               {'description.planes.common_surfaces':
                lambda _: lambda fits, covariance: np.arange(len(fits.theta))}),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
-from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts, least_contact
+from rangeseg_ros.core.by_planes.region_graph import absorb, find_contacts
 from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -185,7 +185,7 @@ def test_contacts_stay_those_of_the_grid(seed):
     below = rng.random((shape[0] - 1, shape[1])) < 0.8
     contacts = find_contacts(part, right, below, count)
     strips = rng.random((len(contacts.target), 2))
-    told = [as_matrix(contacts, strips[:, k]) for k in range(2)]
+    told, apart = [as_matrix(contacts, strips[:, k]) for k in range(2)], contacts.length.copy()
     for _ in range(15):
         found = borders(part, right, below, count)
         length = as_matrix(contacts, contacts.length.repeat(2))
@@ -195,25 +195,11 @@ def test_contacts_stay_those_of_the_grid(seed):
             assert np.array_equal(np.isnan(told[k]), found == 0)
         a, b = (int(k) for k in rng.choice(np.argwhere(found > 0)))
         part[part == b] = a
-        absorb(contacts, strips, a, b)
+        absorb(contacts, strips, apart, a, b)
+        assert np.array_equal(np.isinf(apart), contacts.length == 0)
         for matrix in told:
             for way in (matrix, matrix.T):
                 both = np.nansum(way[[a, b]], 0)
                 both[[a, b]] = 0
                 way[a] = np.where(both > 0, both, np.nan)
             matrix[b] = matrix[:, b] = np.nan
-
-
-@pytest.mark.parametrize('seed', range(4))
-def test_the_least_contact_is_that_of_a_later_part(seed):
-    rng = np.random.default_rng(seed)
-    part = rng.integers(0, 9, (6, 7), np.int32)
-    right, below = np.ones((6, 6), np.bool_), np.ones((5, 7), np.bool_)
-    contacts = find_contacts(part, right, below, 9)
-    values = rng.random(len(contacts.length))
-    told = as_matrix(contacts, values.repeat(2))
-    for a in range(9):
-        later = np.where(np.isnan(told[a, a + 1 :]), np.inf, told[a, a + 1 :])
-        h, least = least_contact(contacts, values, a, np.inf)
-        assert least == pytest.approx(later.min(initial=np.inf))
-        assert h == -1 or contacts.target[h] == a + 1 + later.argmin()

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered
+from rangeseg_ros.core.by_planes.region_graph import find_roots, renumbered, singles
 from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.grid import View
@@ -123,11 +123,13 @@ def _patches(
         smooth[a] = residual[a] < _ROUGH * blocks[a, COUNT]
     root = find_roots(_quads(blocks, residual, smooth.reshape(shape), right, below, largest))
     # Close together, as those that are left fit into the cache.
-    kept = np.flatnonzero(smooth & (root == np.arange(len(root))))
+    kept, count = np.empty(len(root), np.intp), 0
     number = np.zeros(len(root), np.uint32)
-    for k in range(len(kept)):
-        number[kept[k]] = k
-    chains = _chains(number[root], smooth.reshape(shape), right, below, len(kept))
+    for a in range(len(root)):
+        if smooth[a] and root[a] == a:
+            kept[count], number[a], count = a, count, count + 1
+    kept = kept[:count]
+    chains = _chains(number[root], smooth.reshape(shape), right, below, count)
     grown = _grow(blocks[kept], residual[kept], chains, largest, agreement)
     for a in range(len(root)):
         if smooth[a]:
@@ -192,7 +194,7 @@ def _quads(
     the parent of each block.
     """
     rows, columns = smooth.shape
-    parent = np.arange(rows * columns)
+    parent = singles(rows * columns)
     theta, total = np.zeros(3), np.zeros(SIZE)
     whole, side, found = smooth, 1, True
     while found:
@@ -217,7 +219,8 @@ def _quads(
                 if total[COUNT] <= largest and together - apart < _CLEAR:
                     merged[i, j] = found = True
                     residual[a] = together
-                    moments[a] = total
+                    for entry in range(SIZE):
+                        moments[a, entry] = total[entry]
                     # What has been merged before follows its own parent.
                     parent[b] = parent[c] = parent[d] = a
         whole, side = merged, 2 * side
@@ -239,12 +242,13 @@ def _grow(
     merged patches join in constant time.
     """
     count, (head, tail, link, target) = len(moments), chains
-    parent = np.arange(count).astype(np.uint32)
+    parent = np.empty(count, np.uint32)
     # Those as flat wait in one chain, the first of which has waited longest.
     first, last = np.full(_LEVELS, _NONE), np.full(_LEVELS, _NONE)
     after = np.full(count, _NONE)
-    for a in parent:
-        _wait(a, residual[a] / moments[a, COUNT], first, last, after)
+    for k in range(count):
+        parent[k] = k
+        _wait(parent[k], residual[k] / moments[k, COUNT], first, last, after)
     seen = np.full(count, _NONE)
     turn, level = np.uint32(0), 0
     while level < _LEVELS:

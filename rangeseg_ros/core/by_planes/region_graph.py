@@ -62,17 +62,20 @@ def find_contacts(
 
 
 @njit(cache=True, nogil=True)
-def absorb(contacts: Contacts, strips: NDArray[np.float64], a: int, b: int) -> None:
+def absorb(
+    contacts: Contacts, strips: NDArray[np.float64], apart: NDArray[np.float64], a: int, b: int
+) -> None:
     """Let part a take the contacts of part b over, in place; where both touch a third, add up.
 
-    Added are the lengths, and the `strips` (2E, N) of the half-edges.
+    Added are the lengths, and the `strips` (2E, N) of the half-edges; of contacts that end `apart`
+    (E,) becomes infinite.
     """
     head, link, target, length, place = contacts
     kept, h = -1, head[a]
     while h >= 0:
         following, c = link[h], target[h]
         if c == b:
-            length[h // 2] = 0
+            length[h // 2], apart[h // 2] = 0, np.inf
         elif length[h // 2] > 0:
             place[c] = h
             link[h], kept = kept, h
@@ -86,7 +89,7 @@ def absorb(contacts: Contacts, strips: NDArray[np.float64], a: int, b: int) -> N
                 strips[other, k] += strips[h, k]
                 strips[other ^ 1, k] += strips[h ^ 1, k]
             length[other // 2] += length[e]
-            length[e] = 0
+            length[e], apart[e] = 0, np.inf
         elif length[e] > 0:
             target[h ^ 1] = a
             link[h], kept = kept, h
@@ -98,23 +101,13 @@ def absorb(contacts: Contacts, strips: NDArray[np.float64], a: int, b: int) -> N
         h = link[h]
 
 
-@njit(cache=True, nogil=True)
-def least_contact(
-    contacts: Contacts, values: NDArray[np.float64], a: int, most: float
-) -> tuple[int, float]:
-    """The contact of part a with a later one of which `values` (E,) are least, and this.
-
-    As a half-edge, -1 where no value is below `most`; of equal ones that to the first part.
-    """
-    best, least = -1, most
-    h = contacts.head[a]
-    while h >= 0:
-        b, value = contacts.target[h], values[h // 2]
-        first = value < least or (value == least and best >= 0 and b < contacts.target[best])
-        if b > a and contacts.length[h // 2] > 0 and first:
-            best, least = h, value
-        h = contacts.link[h]
-    return best, least
+@njit(cache=True)
+def singles(count: int) -> NDArray[np.intp]:
+    """Parents of nodes that are roots: their own numbers. `np.arange` compiles for a second."""
+    parent = np.empty(count, np.intp)
+    for a in range(count):
+        parent[a] = a
+    return parent
 
 
 @njit(cache=True)
@@ -134,6 +127,12 @@ def renumbered(
     root: NDArray[np.intp], moments: NDArray[np.float64], least: float
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """Number the clusters of at least so many pixels 1...K, the rest 0; their moments."""
-    kept = np.bincount(root, moments[:, COUNT], len(root)) >= least
-    labels = (np.cumsum(kept.astype(np.int32)) * kept)[root].astype(np.int32)
-    return labels, sum_by_label(labels, moments, int(kept.sum()) + 1)
+    pixels, number, count = np.zeros(len(root)), np.zeros(len(root), np.int32), 0
+    for a in range(len(root)):
+        pixels[root[a]] += moments[a, COUNT]
+    for a in range(len(root)):
+        if pixels[a] >= least:
+            count += 1
+            number[a] = count
+    labels = number[root]
+    return labels, sum_by_label(labels, moments, count + 1)

@@ -21,8 +21,8 @@ from rangeseg_ros.core.by_planes.region_graph import (
     absorb,
     find_contacts,
     find_roots,
-    least_contact,
     renumbered,
+    singles,
 )
 from rangeseg_ros.core.regions import by_falling_size, relabel
 from rangeseg_ros.core.sensing.grid import View
@@ -111,16 +111,14 @@ def _agglomerate(
     Returns the root (P + 1,) of each.
     """
     contacts = find_contacts(labels, right, below, len(moments))
-    moments, parent = moments.copy(), np.arange(len(moments))
+    moments, parent = moments.copy(), singles(len(moments))
     residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
     # Of half-edges: moments of the patches along the border. Of contacts: how far two parts are
-    # from one surface, 1 being too far. Of each part: the nearest later one, and how far that is.
-    strips, apart = np.zeros((2 * len(length), SIZE)), np.zeros(len(length))
-    nearest, least = np.full(len(moments), -1), np.full(len(moments), np.inf)
+    # from one surface, 1 being too far.
+    strips, apart = np.zeros((2 * len(length), SIZE)), np.full(len(length) + 1, np.inf)
     for e in range(len(length)):
-        one, other = int(np.intp(target[2 * e])), int(np.intp(target[2 * e + 1]))
-        a, b = min(one, other), max(one, other)
+        a, b = _ends(target, e)
         for h in range(2 * e, 2 * e + 2):
             part = target[h ^ 1]
             # The side of a square patch borders on one other, or on several in part.
@@ -128,25 +126,29 @@ def _agglomerate(
             for k in range(SIZE):
                 strips[h, k] = weight * moments[part, k]
         apart[e] = _apart(moments, residual, a, b, strips, 2 * e, length[e], expected)
-    for a in range(len(moments)):
-        nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
     while True:
-        a = int(least.argmin())
-        if not least[a] < 1:
+        e = int(apart.argmin())
+        if not apart[e] < 1:
             break
-        b = int(np.intp(target[nearest[a]]))
+        a, b = _ends(target, e)
         residual[a] = common_residual(moments, a, b)
-        parent[b], least[b] = a, np.inf
-        moments[a] += moments[b]
-        absorb(contacts, strips, a, b)
+        parent[b] = a
+        for k in range(SIZE):
+            moments[a, k] += moments[b, k]
+        absorb(contacts, strips, apart, a, b)
         h = contacts.head[a]
         while h >= 0:
             c, e = int(np.intp(target[h])), h // 2
             apart[e] = _apart(moments, residual, a, c, strips, 2 * e, length[e], expected)
-            nearest[c], least[c] = least_contact(contacts, apart, c, 1.0)
             h = contacts.link[h]
-        nearest[a], least[a] = least_contact(contacts, apart, a, 1.0)
     return find_roots(parent)
+
+
+@njit(cache=True)
+def _ends(target: NDArray[np.int32], e: int) -> tuple[int, int]:
+    """The parts of a contact, the earlier one first."""
+    one, other = int(np.intp(target[2 * e])), int(np.intp(target[2 * e + 1]))
+    return min(one, other), max(one, other)
 
 
 @njit(cache=True)

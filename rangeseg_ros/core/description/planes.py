@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, triangles
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, regions_of
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
 from rangeseg_ros.core.regions import region_sizes
 from rangeseg_ros.core.runtime.threads import Task, submit
@@ -229,7 +229,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     square += distance * (2 * offset + distance)
     centroid -= (offset + distance)[:, None] * normal
     # What the errors of the sensor make of it: n . p + d changes by d / y times the error of y.
-    region, level = regions_of(fits.sums.start), fits.level
+    region, level = fits.sums.owners, fits.level
     squared = np.where(level > 0, level * level, 1.0)
     pixels = np.bincount(region, cells[:, COUNT], len(theta))
 

@@ -197,20 +197,25 @@ def _rectangle(
     The corners are those of `Outline.corners`; holes run the other way round. Square metres of a
     pixel, extents (2,), centre (3,), and directions of length, width and normal as columns (3, 3).
     """
-    places, rays = corners[:, :2], corners[:, 2:]
-    level = rays[:, 0] * theta[0] + rays[:, 1] * theta[1] + rays[:, 2] * theta[2]
-    points = rays / level.reshape(-1, 1)
-    normal = -theta / np.sqrt((theta * theta).sum())
-    count = len(points)
-    across = np.zeros(3)
-    across[np.argmin(np.abs(normal))] = 1.0
-    first = np.cross(normal, across)
-    first /= np.sqrt((first * first).sum())
-    second = np.cross(normal, first)
-    # Around the first corner, so that the products keep their digits.
-    away = points - points[0]
-    x = first[0] * away[:, 0] + first[1] * away[:, 1] + first[2] * away[:, 2]
-    y = second[0] * away[:, 0] + second[1] * away[:, 1] + second[2] * away[:, 2]
+    # Numbers and loops: expressions of arrays take seconds to compile.
+    count, size = len(corners), np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
+    p, q, r = -theta[0] / size, -theta[1] / size, -theta[2] / size
+    # Two directions across the normal, see `plane_errors.tangents`.
+    sign = 1.0 if r >= 0 else -1.0
+    m = -1 / (sign + r)
+    first = 1 + sign * p * p * m, sign * p * q * m, -sign * p
+    second = p * q * m, sign + q * q * m, -q
+    x, y, origin = np.empty(count), np.empty(count), np.empty(3)
+    for k in range(count):
+        a, b, c = corners[k, 2], corners[k, 3], corners[k, 4]
+        level = a * theta[0] + b * theta[1] + c * theta[2]
+        a, b, c = a / level, b / level, c / level
+        if k == 0:
+            origin[0], origin[1], origin[2] = a, b, c
+        # Around the first corner, so that the products keep their digits.
+        a, b, c = a - origin[0], b - origin[1], c - origin[2]
+        x[k] = first[0] * a + first[1] * b + first[2] * c
+        y[k] = second[0] * a + second[1] * b + second[2] * c
     # Green's theorem: twice the areas, six times the first, 12 and 24 times the second moments.
     area = inside = mx = my = xx = xy = yy = 0.0
     start = 0
@@ -218,7 +223,7 @@ def _rectangle(
         if ring[k] != ring[start]:
             start = k
         n = k + 1 if k + 1 < count and ring[k + 1] == ring[k] else start
-        inside += places[k, 0] * places[n, 1] - places[n, 0] * places[k, 1]
+        inside += corners[k, 0] * corners[n, 1] - corners[n, 0] * corners[k, 1]
         cross = x[k] * y[n] - x[n] * y[k]
         area += cross
         mx += (x[k] + x[n]) * cross
@@ -231,15 +236,22 @@ def _rectangle(
         mx, my = mx / (3 * area), my / (3 * area)
         sxx, syy = xx / (6 * area) - mx * mx, yy / (6 * area) - my * my
         turn = 0.5 * np.arctan2(2 * (xy / (12 * area) - mx * my), sxx - syy)
-    cosine, sine = np.cos(turn), np.sin(turn)
-    if cosine * (first * right).sum() + sine * (second * right).sum() < 0:
+    cosine, sine, ahead, aside = np.cos(turn), np.sin(turn), 0.0, 0.0
+    for a in range(3):
+        ahead, aside = ahead + first[a] * right[a], aside + second[a] * right[a]
+    if cosine * ahead + sine * aside < 0:
         cosine, sine = -cosine, -sine
-    along, up = cosine * x + sine * y, cosine * y - sine * x
-    frame = np.empty((3, 3))
-    frame[:, 0], frame[:, 1] = cosine * first + sine * second, cosine * second - sine * first
-    frame[:, 2] = normal
-    middle = (along.min() + along.max()) / 2, (up.min() + up.max()) / 2
-    centre = points[0] + middle[0] * frame[:, 0] + middle[1] * frame[:, 1]
-    extents = np.array([along.max() - along.min(), up.max() - up.min()])
+    left = low = np.inf
+    most = high = -np.inf
+    for k in range(count):
+        along, up = cosine * x[k] + sine * y[k], cosine * y[k] - sine * x[k]
+        left, most, low, high = min(left, along), max(most, along), min(low, up), max(high, up)
+    frame, centre = np.empty((3, 3)), np.empty(3)
+    for a in range(3):
+        one, other = first[a], second[a]
+        frame[a, 0], frame[a, 1] = cosine * one + sine * other, cosine * other - sine * one
+        frame[a, 2] = (p, q, r)[a]
+        centre[a] = origin[a] + (left + most) / 2 * frame[a, 0] + (low + high) / 2 * frame[a, 1]
+    extents = np.array([most - left, high - low])
     footprint = abs(area / inside) if inside != 0 else 0.0
     return footprint, extents, centre, frame

@@ -7,14 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import (
-    POINT,
-    SCATTER,
-    RegionSums,
-    fit_sums,
-    regions_of,
-    sum_regions,
-)
+from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
 from rangeseg_ros.core.fitting.uncertainty import levels, theta_covariances
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
@@ -63,7 +56,7 @@ class Fits(NamedTuple):
     def without(self, dropped: NDArray[np.bool_]) -> Fits:
         """Those of regions that are not `dropped` (M + 1,), never 0, numbered anew."""
         kept, sums = ~dropped, self.sums.without(dropped)
-        level = self.level[kept[regions_of(self.sums.start)]]
+        level = self.level[kept[self.sums.owners]]
         return Fits(sums, self.total[kept], self.theta[kept], self.sensor, level)
 
     @property
@@ -78,7 +71,7 @@ class Fits(NamedTuple):
     def farthest(self) -> NDArray[np.float64]:
         """Least inverse range (M + 1,) of planes in their regions; 0 or less where none ends."""
         least = np.where(np.diff(self.sums.start) > 0, np.inf, 0.0)
-        np.minimum.at(least, regions_of(self.sums.start), self.level)
+        np.minimum.at(least, self.sums.owners, self.level)
         return least
 
     def outlier_share(self) -> NDArray[np.float64]:

@@ -67,6 +67,11 @@ class RegionSums(NamedTuple):
     pixels: NDArray[np.intp]  # (M + 1,), number of measured pixels
     outliers: NDArray[np.intp]  # (M + 1,), and of those that were left out
 
+    @property
+    def owners(self) -> NDArray[np.intp]:
+        """Region (N,) of each cell."""
+        return regions_of(self.start)
+
     def without(self, dropped: NDArray[np.bool_]) -> RegionSums:
         """Those of regions that are not `dropped` (M + 1,), numbered anew."""
         kept, length = ~dropped, np.diff(self.start)
@@ -89,7 +94,8 @@ def sum_regions(
     inside = _labels_of_blocks(labels)
     axis = image.camera.axes[:, 2].copy() if image.camera is not None else np.zeros(3)
     pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
-    planes = _inner_planes(inside, blocks.moments, len(layout.box))
+    moments = blocks.moments.reshape(inside.size, -1)
+    planes = fit_sums(sum_by_label(inside.ravel(), moments, len(layout.box)))
     given = *pixels, axis, blocks, sensor, layout, planes
     upper, lower = map_halves(_accumulate, len(inside), *given)
     cells, outside = upper + lower
@@ -150,14 +156,6 @@ def _labels_of_blocks(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
                     unlike |= labels[i, j] ^ label
             result[bi, bj] = label if unlike == 0 else -1
     return result
-
-
-def _inner_planes(
-    inside: NDArray[np.int32], moments: NDArray[np.float64], count: int
-) -> NDArray[np.float64]:
-    """Planes (count, 3) of the blocks that regions fill; zeros where these do not tell one."""
-    flat = moments.reshape(-1, moments.shape[2])
-    return fit_sums(sum_by_label(inside.ravel(), flat, count))
 
 
 @njit(cache=True, inline='always')

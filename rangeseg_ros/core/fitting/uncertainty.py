@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums, regions_of
+from rangeseg_ros.core.fitting.region_sums import PLACE, RAY, WEIGHT, RegionSums
 from rangeseg_ros.core.sensing.moments import COUNT, sum_by_label
 from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, random_variance
 
@@ -78,14 +78,14 @@ def theta_covariances(
             own += (_within(cells) * mean)[:, None] * centred
             half = _between(sums.start, cells)
             middle += half + half.transpose(0, 2, 1)
-    total = sum_by_label(regions_of(sums.start), own, len(inverse))
+    total = sum_by_label(sums.owners, own, len(inverse))
     middle += total[:, _FULL].reshape(-1, 3, 3)
     return sandwiches(inverse, middle)
 
 
 def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse ranges (N,) of the planes of regions at the middles of their cells."""
-    plane, rays = theta[regions_of(sums.start)], sums.cells[:, RAY : RAY + 3]
+    plane, rays = theta[sums.owners], sums.cells[:, RAY : RAY + 3]
     total: NDArray[np.float64] = (plane * rays).sum(axis=1)
     return total / sums.cells[:, WEIGHT]
 

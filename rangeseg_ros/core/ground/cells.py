@@ -224,7 +224,8 @@ def _fitted(sums: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.flo
                 for m in range(max(j - 1, 0), min(j + 2, columns)):
                     g += sums[0, k, m]
                     s += sums[1, k, m]
-            theta[i, j] = p
+            for n in range(3):
+                theta[i, j, n] = p[n]
             total = g + _PRIOR * s
             # What the ground is off the prior plane.
             x = g[6] - g[0] * p[0] - g[1] * p[1] - g[2] * p[2]

@@ -153,7 +153,7 @@ def _spread(
             if not leads and n < columns:
                 continue
             off[c] = apart
-            seen[c] = h, x, y, variance[i, c]
+            seen[c, 0], seen[c, 1], seen[c, 2], seen[c, 3] = h, x, y, variance[i, c]
             if not leads:
                 continue
             reached[i, c] = True
@@ -163,4 +163,4 @@ def _spread(
                 kept = weight[c] * np.exp(-way / length)
             weight[c] = kept + 1 / variance[i, c]
             mean[c] += (h - mean[c]) / (variance[i, c] * weight[c])
-            last[c] = h, x, y
+            last[c, 0], last[c, 1], last[c, 2] = h, x, y

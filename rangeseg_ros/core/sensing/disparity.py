@@ -16,8 +16,6 @@ from rangeseg_ros.core.significance import CLEARLY
 
 # Pixels of VGA along the side of a block, wide enough to show the bend, and those that tell it.
 _SIDE, _SAMPLES = 48, 8
-# Of the squares of what rays differ by, beside rounding.
-_PRECISE = np.finfo(np.float64).eps ** 0.5
 
 
 def shows_disparity(image: RangeImage) -> bool:
@@ -36,8 +34,8 @@ def shows_disparity(image: RangeImage) -> bool:
     fits = _fits.get(image.camera)
     if fits is None:
         rays = _blocks(image.rays, image.inverse.size)
-        # Rays of a very narrow view are all but one.
-        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=_PRECISE)
+        # Rays of a very narrow view are all but one: by more than rounding of squares.
+        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=1.5e-8)
     inverse, rays, fit = inverse[known], fits[0][known], fits[1][known]
     # Behind the camera where no plane fits.
     level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))

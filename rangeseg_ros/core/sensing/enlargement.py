@@ -17,7 +17,6 @@ SIGNIFICANT = 5.0
 """Standard errors that a statistic of an image must differ by, not to be chance in any image."""
 # Rows or columns, and those whose spectrum is looked at, that stand for an image.
 _LINES, _FEW = 60, 24
-_TYPICAL = 1000  # differences that tell how large they are
 _LARGEST = 16  # enlargement that is looked for
 _PERIODS = np.arange(2, _LARGEST + 1)
 
@@ -142,7 +141,7 @@ def _spectrum(
     if not len(changes) or len(columns) < 2 * _LARGEST:
         return np.zeros(len(waves))
     # Edges of objects are no part of it.
-    typical = np.median(changes[:: max(len(changes) // _TYPICAL, 1)])
+    typical = np.median(changes[::_FEW])
     size = np.where(known, np.minimum(size, 2 * typical), 0)
     means = size.sum(axis=0, dtype=float)[columns] / known.sum(axis=0)[columns]
     spread = means.std() * len(columns) ** 0.5
