@@ -9,7 +9,7 @@ from clouds import cloud_of
 from planes_of_labels import fit_planes
 
 from rangeseg_ros.core.fitting.region_sums import POINT, sum_regions
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, roots, squares
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -382,7 +382,7 @@ def test_no_variance_becomes_negative_where_a_covariance_is_magnified(rank):
     root = random.normal(size=(50, 3, rank)) * 10.0 ** random.uniform(-6, 6, (50, 1, rank))
     middle = root @ root.transpose(0, 2, 1)
     outer = random.normal(size=(50, 4, 3)) * 10.0 ** random.uniform(-3, 3, (50, 4, 1))
-    found = sandwiches(outer, middle)
+    found = squares(roots(outer, middle))
     along = outer @ root
     scale = np.linalg.norm(outer, axis=2) * np.linalg.norm(root, axis=(1, 2))[:, None]
     error = np.abs(found - along @ along.transpose(0, 2, 1))

@@ -12,7 +12,7 @@ from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, tr
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, sandwiches
+from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
 from rangeseg_ros.core.regions import region_sizes
 from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.sensing.moments import COUNT
@@ -181,10 +181,10 @@ def describe_regions(
     probability = np.ones(len(theta)) if probability is None else probability
     if not theta.any():
         return []
-    theta_covariance = fits.covariances()
-    surfaces = submit(common_surfaces, fits, theta_covariance)
+    root = fits.covariance_roots()
+    surfaces = submit(common_surfaces, fits, squares(root))
     normal, distance, centroid, rms, confidence = _described(fits, sensor or fits.sensor)
-    covariance = sandwiches(plane_jacobians(normal, distance), theta_covariance)
+    covariance = squares(plane_jacobians(normal, distance) @ root)
     if image.place.any():
         # From the sensor to the frame of the points.
         shift = np.eye(4)
@@ -195,7 +195,7 @@ def describe_regions(
     farthest = fits.farthest() / _FAR
     found = np.flatnonzero(farthest > 0)
     known, outlines = found.tolist(), []
-    for k, box, far in zip(known, fits.boxes()[found].tolist(), farthest[found], strict=True):
+    for k, box, far in zip(known, fits.sums.box[found].tolist(), farthest[found], strict=True):
         crop = slice(box[0], box[2]), slice(box[1], box[3])
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))

@@ -38,8 +38,7 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     order = np.argsort(-fits.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
     cells = Cells.of(fits.sums, fits.level, distortion_field(fits.sensor))
-    start, inverses = fits.sums.start, fits.inverses()
-    return _surfaces(order, start, fits.theta, inverses, covariance, cells)
+    return _surfaces(order, fits.sums.start, fits.theta, fits.inverses(), covariance, cells)
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
-from rangeseg_ros.core.fitting.uncertainty import levels, theta_covariances
+from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -64,10 +64,6 @@ class Fits(NamedTuple):
         """Number of measured pixels of each region, (M + 1,)."""
         return self.sums.pixels
 
-    def boxes(self) -> NDArray[np.intp]:
-        """First row and column of each region, and the ones after its last, (M + 1, 4)."""
-        return self.sums.box
-
     def farthest(self) -> NDArray[np.float64]:
         """Least inverse range (M + 1,) of planes in their regions; 0 or less where none ends."""
         least = np.where(np.diff(self.sums.start) > 0, np.inf, 0.0)
@@ -86,9 +82,9 @@ class Fits(NamedTuple):
         inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
         return inverse.reshape(-1, 3, 3)
 
-    def covariances(self) -> NDArray[np.float64]:
-        """Covariances of theta, (M + 1, 3, 3)."""
-        return theta_covariances(self.sums, self.level, self.inverses(), self.sensor)
+    def covariance_roots(self) -> NDArray[np.float64]:
+        """Roots R of the covariances R R^T of theta, (M + 1, 3, 3)."""
+        return covariance_roots(self.sums, self.level, self.inverses(), self.sensor)
 
 
 def _total_least_squares(

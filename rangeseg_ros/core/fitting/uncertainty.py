@@ -55,10 +55,10 @@ def distortion_field(sensor: SensorModel) -> Field:
     return sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2
 
 
-def theta_covariances(
+def covariance_roots(
     sums: RegionSums, level: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
-    """Covariances (M + 1, 3, 3) of planes theta . ray = inverse range of regions.
+    """Roots (M + 1, 3, 3) of the covariances of planes theta . ray = inverse range of regions.
 
     `level` (N,) are the inverse ranges of cells on them, see `levels`, and `inverse`
     (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
@@ -80,7 +80,7 @@ def theta_covariances(
             middle += half + half.transpose(0, 2, 1)
     total = sum_by_label(sums.owners, own, len(inverse))
     middle += total[:, _FULL].reshape(-1, 3, 3)
-    return sandwiches(inverse, middle)
+    return roots(inverse, middle)
 
 
 def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -90,15 +90,19 @@ def levels(sums: RegionSums, theta: NDArray[np.float64]) -> NDArray[np.float64]:
     return total / sums.cells[:, WEIGHT]
 
 
-def sandwiches(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
-    """outer middle outer^T, (N, m, m), of `outer` (N, m, 3) and covariances `middle` (N, 3, 3).
+def roots(outer: NDArray[np.float64], middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """R (N, m, 3) with R R^T = outer middle outer^T, of `outer` (N, m, 3) and `middle` (N, 3, 3).
 
-    By a root of it, so that no rounding that `outer` magnifies makes a variance negative. What
-    rounding has made of directions without variance is left out.
+    So no rounding that `outer` magnifies makes a variance negative. What rounding has made of
+    directions without variance is left out.
     """
     values, vectors = np.linalg.eigh(middle)
-    along = outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None])
-    result: NDArray[np.float64] = (along[:, :, None] * along[:, None]).sum(axis=3)
+    return outer @ (vectors * np.sqrt(np.maximum(values, 0))[:, None])
+
+
+def squares(root: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Covariances R R^T, (N, m, m), of roots R (N, m, 3)."""
+    result: NDArray[np.float64] = (root[:, :, None] * root[:, None]).sum(axis=3)
     return result
 
 
