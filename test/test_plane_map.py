@@ -163,6 +163,28 @@ def test_what_a_frame_finds_on_two_surfaces_is_not_one_plane():
     assert low.centroid[2] < 0.02 < high.centroid[2]
 
 
+def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
+    pose = Pose.looking((0, 0, 1.2), 0, 0, 0)
+    view = simulate_kinect(Scene((half_space((-1, 0, 0), (2.5, 0, 0)),), (pose,)), CAMERA)
+    labels = view.labels.copy()
+    middle = labels.shape[1] // 2
+    labels[:, middle:] *= 2
+    labels[:, middle - 4 : middle + 4] = 0
+    image = RangeImage.from_depth(view.depth, CAMERA)
+    parts, plane_map, counts = fit_planes(labels, image, SENSOR), PlaneMap(), []
+    for k in range(8):
+        planes = [
+            replace(plane, id=10 * k + plane.label, surface=plane.label if k < 4 else 1)
+            for plane in parts
+        ]
+        where = Transform(pose.rotation, pose.position)
+        plane_map.add(labels, planes, image, where, 10**9 + k * 10**8)
+        counts.append(len(plane_map))
+    assert counts[3] == 2 and counts[7] == 1
+    (wall,) = plane_map.planes
+    assert wall.area == pytest.approx(sum(plane.area for plane in parts), rel=0.15)
+
+
 def test_what_rays_pass_through_is_gone_within_seconds():
     pose = Pose.looking((0, 0, 1.2), 0, 20, 0)
     room = (half_space((0, 0, 1), (0, 0, 0)), half_space((-1, 0, 0), (3.5, 0, 0)))
