@@ -182,6 +182,7 @@ def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
         counts.append(len(plane_map))
     assert counts[3] == 2 and counts[7] == 1
     (wall,) = plane_map.planes
+    assert wall.observations == 2 * 8
     assert wall.area == pytest.approx(sum(plane.area for plane in parts), rel=0.15)
 
 
