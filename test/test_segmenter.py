@@ -43,6 +43,20 @@ def segment(depth, config=NORMALS, camera=CAMERA):
     return Segmenter(config).segment(RangeImage.from_depth(depth, camera))
 
 
+def test_a_bent_wall_of_two_directions_is_two_labels_and_one_plane():
+    """Its halves differ by a tenth of a degree, and the nearest directions are two."""
+    known = directions('platonic', NORMALS.direction_count)
+    towards = known[known[:, 2] < -0.9]
+    first, second = towards[np.argsort(-(towards @ towards[0]))[:2]]
+    across = (second - first) / np.linalg.norm(second - first)
+    left = CAMERA.rays @ across < 0
+    halves = [first + second + sign * 0.002 * across for sign in (-1, 1)]
+    one, other = (np.linalg.norm(n) / 2 / (-CAMERA.rays @ n.astype(float)) for n in halves)
+    result = segment(2 * np.where(left, one, other), replace(NORMALS, smoothness=0.01))
+    assert len(np.unique(result.labelling.labels[10:-10, 10:-10])) == 2
+    assert len(result.planes) == 1 and (result.labels > 0).mean() > 0.98
+
+
 @pytest.mark.parametrize('seed', range(4))
 def test_every_face_of_a_noise_free_room_is_found(seed):
     """Faces of 500 pixels that are nowhere thinner than the 9 pixels jump edges look at."""

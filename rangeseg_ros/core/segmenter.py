@@ -12,6 +12,7 @@ from rangeseg_ros.core.by_normals import method as by_normals
 from rangeseg_ros.core.by_planes import method as by_planes
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
+from rangeseg_ros.core.by_planes.surfaces import unite_regions
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane, describe_regions
 from rangeseg_ros.core.fitting.fits import Fits
@@ -126,11 +127,14 @@ class Segmenter:
             found = labelling.labels
             # Labels of planes are smooth: hardly any of their regions is thin.
             regions = plane_regions(found, found > 0, view.grid, 'leave', view.least)
+            regions = unite_regions(regions, view, config.plane_smoothness)
             regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
             found, valid = labelling.labels, view.whole.valid
             regions = plane_regions(found, valid, view.grid, config.noise_regions, view.least)
+            # Of a plane between two directions, parts have one and parts the other.
+            regions = unite_regions(regions, view, config.plane_smoothness)
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)

@@ -12,7 +12,7 @@ from rangeseg_ros.core.by_planes.labelling import refine
 from rangeseg_ros.core.by_planes.patches import Nodes, find_patches
 from rangeseg_ros.core.by_planes.plane_energy import Models, Problem, costs
 from rangeseg_ros.core.by_planes.posterior import plane_probabilities
-from rangeseg_ros.core.by_planes.surfaces import join_surfaces, unite_regions
+from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.graphcut.expansion import energy
@@ -60,7 +60,6 @@ def flat_regions(
 
     Numbered anew, with the probabilities (M + 1,) and the fits of the first.
     """
-    regions = unite_regions(regions, view, config.plane_smoothness)
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
     probability = plane_probabilities(fits, config.plane_prior)
     curved = probability < config.plane_probability

@@ -23,8 +23,7 @@ T = TypeVar('T')
 
 # More would wait for the memory.
 _MAX_THREADS = 4
-# Rows that are worth the handing over.
-_ROWS = 16
+_ROWS = 16  # that are worth the handing over
 # Rows on either side of the middle of the image that are looked at again.
 _SEAM = 8
 
