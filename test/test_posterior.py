@@ -45,6 +45,20 @@ def test_planes_that_the_sensor_bends_are_planes(seed):
     assert (probabilities(inverse, regions, seed)[1:] > 0.5).all()
 
 
+@pytest.mark.parametrize('bend', [0.08, 0.2])
+def test_rows_and_columns_are_alike(bend):
+    """A tilted and bent surface is as probably a plane where rows and columns are exchanged."""
+    camera = Camera(120, 120, 150.0, 150.0, 59.5, 59.5)
+    sensor, rays = SensorModel.from_config(Config(), camera.shape), camera.rays.astype(float)
+    inverse = rays @ np.array([0.5, 0.1, 0.5]) + bend * (rays[..., :2] ** 2 @ np.array([1, 0.5]))
+    one, other = (
+        plane_probabilities(Fits.of(np.ones(camera.shape, np.uint16), image, sensor), 0.5)[1]
+        for values in (inverse, inverse.T.copy())
+        for image in [RangeImage(camera.rays, values.astype(np.float32), camera)]
+    )
+    assert one == pytest.approx(other, rel=1e-6) and 0.2 < one < 0.9
+
+
 @pytest.mark.parametrize('radius', [0.3, 0.5])
 @pytest.mark.parametrize('seed', range(2))
 def test_cylinders_are_none(radius, seed):
