@@ -1,6 +1,7 @@
 """Images, cameras, parameters and tables: what is read back, and refused in one line."""
 
 import csv
+import json
 import os
 import resource
 import struct
@@ -15,6 +16,7 @@ from planes_of_labels import stated_plane
 
 from rangeseg_ros import CameraError, Config, ConfigError
 from rangeseg_ros.cli.errors import one_line
+from rangeseg_ros.cli.options import write_json
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import FileError, replacing
 from rangeseg_ros.io.images import (
@@ -298,3 +300,10 @@ def test_errors_are_one_line_of_printable_characters():
     assert one_line(ValueError('a\nb\x00\x1b[31m')) == 'a\\nb\\x00\\x1b[31m'
     assert one_line(MemoryError()) == 'not enough memory'
     assert one_line(FileNotFoundError(2, 'No such file', 'x')) == 'x: No such file'
+
+
+def test_figures_are_json_as_they_are_and_nan_is_null(tmp_path):
+    figures = {'a': 0.25, 'b': {'c': float('nan'), 'd': 3}, 'e': [1.5, 'x'], 'f': None}
+    write_json(tmp_path / 'a.json', figures)
+    told = json.loads((tmp_path / 'a.json').read_text())
+    assert told == {'a': 0.25, 'b': {'c': None, 'd': 3}, 'e': [1.5, 'x'], 'f': None}
