@@ -7,6 +7,9 @@ import pytest
 from clouds import cloud_of
 
 from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_planes.borders import with_sharp_borders
+from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
+from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.sensing.binning import STEPS, Bins, bin_side, step_within
 from rangeseg_ros.core.sensing.camera import Camera
@@ -110,6 +113,44 @@ def test_the_model_of_bins_is_that_of_their_means(correlation, white):
     # Noise that hangs together over less than a pixel is new in each.
     narrow = pixels._replace(correlation=0.01, white=0.0).binned(2)
     assert narrow.noise == pytest.approx(pixels.noise / 2)
+
+
+@pytest.mark.parametrize('side', [2, 3])
+def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
+    """One by one, given their neighbours: rows 0, 2, ... of bins first."""
+    draw, camera = np.random.default_rng(side), Camera(21, 17, 20.0, 21.0, 10.0, 8.0)
+    bins = -(-17 // side), -(-21 // side)
+    coarse = draw.integers(0, 4, (4, 4), np.uint16).repeat(3, 0).repeat(3, 1)
+    regions = np.ascontiguousarray(coarse[: bins[0], : bins[1]])
+    theta = np.array([[0, 0, 0], [0.1, 0, 0.5], [0, 0.1, 0.52], [-0.1, 0, 0.49]])
+    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), Shifts.none(4))
+    truth = draw.integers(1, 4, camera.shape)
+    inverse = (theta[truth] * camera.rays).sum(axis=2) + draw.normal(0, 0.01, camera.shape)
+    inverse[draw.random(camera.shape) < 0.1] = 0
+    image = RangeImage(camera.rays, inverse.astype(np.float32), camera)
+    sensor, prior = SensorModel(0.01, 0, 1, 0, 0, 0, 35), 0.9
+    expected = regions.repeat(side, 0).repeat(side, 1)[:17, :21] * image.valid
+    order = sorted(np.ndindex(bins), key=lambda bin: (bin[0] % 2, bin))
+    for i, j in order:
+        around = [(i, j), (i - 1, j), (i, j - 1), (i, j + 1), (i + 1, j)]
+        inside = [at for at in around if 0 <= at[0] < bins[0] and 0 <= at[1] < bins[1]]
+        names = list(dict.fromkeys(int(regions[at]) for at in inside))[:4]
+        for u, v in np.ndindex(side, side) if len(names) > 1 else ():
+            u, v = i * side + u, j * side + v
+            if u >= 17 or v >= 21 or inverse[u, v] == 0:
+                continue
+            near = [(u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)]
+            near = [at for at in near if 0 <= at[0] < 17 and 0 <= at[1] < 21 and image.valid[at]]
+            off = image.inverse[u, v] - theta[names] @ camera.rays[u, v]
+            costs = np.minimum(models.half_precision[names] * off**2 / 1e-4, CAP)
+            costs[np.equal(names, 0)] = NO_PLANE
+            costs += [prior * sum(expected[at] != name for at in near) for name in names]
+            expected[u, v] = names[int(costs.argmin())]
+    found = with_sharp_borders(
+        regions, regions.astype(np.int32), models, image, side, sensor, prior
+    )
+    np.testing.assert_array_equal(found, expected)
+    assert (expected != regions.repeat(side, 0).repeat(side, 1)[:17, :21])[image.valid].sum() > 20
 
 
 def test_borders_are_those_of_pixels():
