@@ -59,7 +59,7 @@ class Config:
         130.0, 'method normals: lambda of eq. 5.3, against degrees; thesis: 55', 0.0, 10000.0
     )
     plane_smoothness: float = option(
-        1.2, 'method planes: lambda of eq. 5.3, against half the squared residuals', 0.0, 10000.0
+        1.2, 'lambda of eq. 5.3 against half the squared residuals, of planes', 0.0, 10000.0
     )
     plane_probability: float = option(
         0.5, 'smallest probability of a plane, no curved surface; 0 = planes of all', 0.0, 1.0

@@ -124,17 +124,17 @@ class Segmenter:
         curved: NDArray[np.uint16] | None = None
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
-            found = labelling.labels
             # Labels of planes are smooth: hardly any of their regions is thin.
-            regions = plane_regions(found, found > 0, view.grid, 'leave', view.least)
-            regions = unite_regions(regions, view, config.plane_smoothness)
-            regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
+            valid, thin = labelling.labels > 0, 'leave'
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
-            found, valid = labelling.labels, view.whole.valid
-            regions = plane_regions(found, valid, view.grid, config.noise_regions, view.least)
-            # Of a plane between two directions, parts have one and parts the other.
-            regions = unite_regions(regions, view, config.plane_smoothness)
+            valid, thin = view.whole.valid, config.noise_regions
+        regions = plane_regions(labelling.labels, valid, view.grid, thin, view.least)
+        # Parts of a plane that holes cut, or that have either of two directions it lies between.
+        regions = unite_regions(regions, view, config.plane_smoothness)
+        if config.method == 'planes':
+            regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
+        else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)

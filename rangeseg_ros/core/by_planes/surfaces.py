@@ -115,7 +115,7 @@ def _agglomerate(
     residual = fit_all(moments)[1]
     length, target = contacts.length, contacts.target
     # Of half-edges: moments of the patches along the border. Of contacts: how far two parts are
-    # from one surface, 1 being too far.
+    # from one surface, 1 being too far; one more than there are, as there may be none.
     strips, apart = np.zeros((2 * len(length), SIZE)), np.full(len(length) + 1, np.inf)
     for e in range(len(length)):
         a, b = _ends(target, e)

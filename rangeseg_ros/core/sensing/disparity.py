@@ -27,15 +27,15 @@ def shows_disparity(image: RangeImage) -> bool:
     """
     if image.camera is None:
         return False
-    inverse = _blocks(image.inverse[..., None], image.inverse.size)
+    inverse = _blocks(image.inverse[..., None])
     known = (inverse > 0).all(axis=(1, 2))
     if not known.any():
         return False
     fits = _fits.get(image.camera)
     if fits is None:
-        rays = _blocks(image.rays, image.inverse.size)
-        # Rays of a very narrow view are all but one: by more than rounding of squares.
-        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=1.5e-8)
+        # Rays of a very narrow view are all but one, but for the rounding of their squares.
+        rays, precise = _blocks(image.rays), np.finfo(np.float64).eps ** 0.5
+        fits = _fits[image.camera] = rays, np.linalg.pinv(rays, rcond=precise)
     inverse, rays, fit = inverse[known], fits[0][known], fits[1][known]
     # Behind the camera where no plane fits.
     level = np.maximum(rays @ (fit @ (1 / inverse)), 0.5 / inverse.max(axis=1, keepdims=True))
@@ -69,9 +69,9 @@ def from_disparity(image: RangeImage) -> RangeImage:
 _fits: WeakKeyDictionary[Camera, tuple[NDArray[np.float64], ...]] = WeakKeyDictionary()
 
 
-def _blocks(values: NDArray[np.float32], pixels: int) -> NDArray[np.float64]:
-    """Samples (N, S, K) of the values (H, W, K) of so many pixels, in blocks."""
-    step = max(round(_SIDE / _SAMPLES * (pixels / VGA) ** 0.5), 1)
+def _blocks(values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Samples (N, S, K) of values (H, W, K) in blocks."""
+    step = max(round(_SIDE / _SAMPLES * (values[..., 0].size / VGA) ** 0.5), 1)
     some = values[::step, ::step].astype(np.float64)
     n, (rows, columns) = _SAMPLES, (length // _SAMPLES for length in some.shape[:2])
     blocks = some[: rows * n, : columns * n].reshape(rows, n, columns, n, some.shape[2])
