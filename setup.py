@@ -43,10 +43,7 @@ def compile_kernels(folder):
     start = 'from rangeseg_ros.start import rangeseg; rangeseg()'
     # There, as Python looks for packages first where it is started: not beside the sources.
     made = subprocess.run(
-        [sys.executable, '-c', start, 'compile'],
-        cwd=folder,
-        stderr=subprocess.PIPE,
-        text=True,
+        [sys.executable, '-c', start, 'compile'], cwd=folder, stderr=subprocess.PIPE, text=True
     )
     if made.returncode and cpu:
         sys.exit(made.stderr)
@@ -199,6 +196,6 @@ setup(
         'console_scripts': [
             'rangeseg = rangeseg_ros.start:rangeseg',
             'segment_planes = rangeseg_ros.start:segment_planes',
-        ],
+        ]
     },
 )

@@ -23,6 +23,7 @@ import cv2
 import numpy as np
 from click.testing import CliRunner
 from numpy.typing import NDArray
+from tracks import ids_of_faces, track_figures
 
 from rangeseg_ros.cli.main import rangeseg
 from rangeseg_ros.core.config import Config
@@ -37,7 +38,6 @@ from rangeseg_ros.evaluation.label_files import EvaluationError, Truth, as_truth
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.plane_errors import plane_errors
 from rangeseg_ros.evaluation.terrain import TerrainTask, shares
-from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room, walk
 
@@ -147,9 +147,7 @@ def real_frames(folder: Path, most: int) -> Iterator[Frame]:
                 yield Frame(kind, sensor, image, truth, {}, least)
 
 
-def _loaders(
-    folder: Path,
-) -> Iterator[tuple[str, Callable[[], tuple[RangeImage, Truth, int]]]]:
+def _loaders(folder: Path) -> Iterator[tuple[str, Callable[[], tuple[RangeImage, Truth, int]]]]:
     """Names of the frames of a set, and what reads them, their truth and the least region."""
     for path in sorted(folder.glob('*_truth.png')):
         yield path.stem.removesuffix('_truth'), lambda path=path: _of_8_bits(path)

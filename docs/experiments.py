@@ -37,14 +37,8 @@ DIRECTIONS = {
     for kind, counts in (('platonic', (17, 73, 305, 1249)), ('regular', (25, 225, 1225)))
     for count in counts
 }
-POSTPROCESSING = {
-    'none': {'noise_regions': 'leave'},
-    'identified': {'noise_regions': 'identify'},
-}
-WEIGHTS = {
-    '4-connectivity': {'jump_edges': 'none'},
-    'jump edge disconnection': {},
-}
+POSTPROCESSING = {'none': {'noise_regions': 'leave'}, 'identified': {'noise_regions': 'identify'}}
+WEIGHTS = {'4-connectivity': {'jump_edges': 'none'}, 'jump edge disconnection': {}}
 LAMBDAS = tuple(float(value) for value in range(20, 151, 10))
 # Without post-processing the best lambda lies far higher (thesis 6.5).
 HIGH_LAMBDAS = (55.0, 100.0, 150.0, 200.0)

@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 
 from rangeseg_ros import Config, RangeImage, Segmenter, SequenceSegmenter, Transform
 from rangeseg_ros.core.calibration.calibrate import calibrate, without_plane
-from rangeseg_ros.drawing import colours, grey, normals_picture, overlay
+from rangeseg_ros.drawing import colours, grey, overlay
 from rangeseg_ros.evaluation.label_files import read_label_image
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, write_image
@@ -139,6 +139,13 @@ def coloured(image, labels):
 def in_colour(result):
     """Planes in colour over the depth."""
     return overlay(result.image.inverse, result.labels, result.planes)
+
+
+def normals_picture(normals):
+    """Unit normals (H, W, 3) in colours: red to the right, green up, blue to the sensor."""
+    colour = 127.5 * (1 + np.nan_to_num(normals) * np.array([1, -1, -1]))
+    colour[np.isnan(normals[..., 0])] = 0
+    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
 
 
 def normals(image):

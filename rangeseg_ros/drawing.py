@@ -77,16 +77,6 @@ def overlay(
     return picture
 
 
-def normals_picture(normals: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Colour unit normals (H, W, 3) in an optical frame, black where NaN; (H, W, 3) uint8 RGB.
-
-    Red towards the right, green upwards, blue towards the sensor, each from 0 at -1 to 255 at 1.
-    """
-    colour = 127.5 * (1 + np.nan_to_num(normals) * np.array([1, -1, -1]))
-    colour[np.isnan(normals[..., 0])] = 0
-    return np.clip(np.rint(colour), 0, 255).astype(np.uint8)
-
-
 def borders(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
     """Pixels whose right or lower neighbour has another label."""
     border = np.zeros(labels.shape, bool)

@@ -8,15 +8,16 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment
-from rangeseg_ros.core.mapping.observations import LASTING, PoseNoise, observations
+from rangeseg_ros.core.mapping.observations import LASTING, PlaneSet, PoseNoise, observations
 from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents
+from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents, to_errors
 
 FACES = np.array(
     [(0, 0, 1, 0), (0, 0, -1, 2.5), (-1, 0, 0, 3), (1, 0, 0, 3), (0, 1, 0, 2), (0, -1, 0, 2)]
 )
 NOISE = PoseNoise(0.005, np.radians(0.3))
+IDENTITY = Transform.identity()
 # Of planes as a sensor shows them: direction about two axes, and offset.
 SIGMA = np.array([0.004, 0.004, 0.003])
 
@@ -44,8 +45,8 @@ def seen(random, face, pose, lasting):
 
 def sighting(pose, planes, *about):
     """Planes that a frame shows."""
-    seen = observations(planes, np.zeros((len(planes), 0)), pose, NOISE)
-    return Sighting(pose, seen, *about)
+    seen = observations(planes, np.zeros((len(planes), 1)), pose, NOISE)
+    return Sighting(pose, seen, *about, np.zeros((1, 3)))
 
 
 def solved(seed, drift=(0, 0, 0), frames=40, moving=0.0, odometry=False):
@@ -147,3 +148,62 @@ def test_planes_are_moved_with_their_outlines_and_the_same_each_time():
     for a, b in zip(*(solved(1)[0].planes for _ in range(2)), strict=True):
         assert np.array_equal(a.covariance, b.covariance) and a.distance == b.distance
         np.testing.assert_allclose(a.hull @ a.normal + a.distance, 0, atol=1e-9)
+
+
+RAYS = np.stack([*np.meshgrid([-0.6, -0.2, 0.2, 0.6], [-0.4, 0.0, 0.4]), np.ones((3, 4))], axis=-1)
+
+
+def distorted(face, pose, view, field):
+    """Equation of a face as pixels of these cells show it with this error of the inverse range."""
+    rays = RAYS.reshape(-1, 3)
+    told = -(pose.rotation.T @ face[:3]) / (face[3] + face[:3] @ pose.shift)
+    design = np.sqrt(view)[:, None] * rays
+    slope = np.linalg.lstsq(design, np.sqrt(view) * (rays @ told + field), rcond=None)[0]
+    return np.append(-slope, 1) / np.linalg.norm(slope)
+
+
+def test_what_a_distortion_makes_of_planes_is_what_fits_show():
+    random, pose = np.random.default_rng(4), Transform(np.eye(3), np.array([0.5, 0.2, -1.0]))
+    field = 1e-6 * random.standard_normal(12)
+    for cells in (12, 4, 1):
+        view = random.uniform(1, 2, 12) * (random.permutation(12) < cells)
+        face = np.array([0.36, 0.48, -0.8, 2.0])
+        if cells < 3:  # of which nothing tells the direction
+            face[:3] = 0, 0, -1
+        before, after = (distorted(face, pose, view, f) for f in (0 * field, field))
+        normal, distance = before[None, :3], before[None, 3]
+        planes = PlaneSet(normal, -distance[:, None] * normal, tangents(normal))
+        told = planes.by_field(view[None], RAYS.reshape(-1, 3))[0] @ field
+        found = to_errors(planes.axes, planes.point)[0] @ (after - before)
+        if cells < 3:
+            told, found = told[2:], found[2:]
+        np.testing.assert_allclose(told, found, rtol=1e-3, atol=1e-12)
+
+
+def test_the_distortion_of_the_sensor_is_told_from_the_planes():
+    random, off, found = np.random.default_rng(5), [], []
+    field = 0.004 * random.standard_normal(12)
+    adjustments = Adjustment(NOISE), Adjustment(NOISE)
+    for _ in range(60):
+        turn = Rotation.from_rotvec(random.normal(0, 1, 3)).as_matrix()
+        truth = Transform(turn, random.uniform((-2, -1, 0.5), (2, 1, 2.0)))
+        told = truth.by(random.normal(0, NOISE.deviations))
+        planes, views, ids = [], [], []
+        for number, face in enumerate(FACES, 1):
+            if (truth.rotation.T @ face[:3])[2] < -0.7:
+                view = random.uniform(0.1, 1, 12) * (random.random(12) < 0.8)
+                normal, distance = np.split(distorted(face, truth, view, field), [3])
+                planes.append(seen(random, np.append(normal, distance), IDENTITY, np.zeros(3)))
+                views.append(view)
+                ids.append(number)
+        views, begins = np.reshape(views, (-1, 12)), np.full(len(ids), True)
+        sensed = observations(planes, views, told, NOISE)
+        for adjustment, rays in zip(adjustments, (RAYS, 0 * RAYS), strict=True):
+            adjustment.add(Sighting(told, sensed, np.array(ids, int), begins, rays.reshape(-1, 3)))
+    start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
+    for adjustment in adjustments:
+        solution = adjustment.solve(start, {})
+        off.append([plane.distance for plane in solution.planes] - FACES[:, 3])
+        found.append(solution.field)
+    np.testing.assert_allclose(found[0], field, atol=0.002)
+    assert np.abs(off[0]).mean() < 0.5 * np.abs(off[1]).mean()

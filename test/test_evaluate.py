@@ -16,14 +16,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.evaluation.datasets import find_cases, read_segcomp
 from rangeseg_ros.evaluation.hoover import classify
-from rangeseg_ros.evaluation.measure import (
-    CORRECT,
-    MISSED,
-    NO_DATA,
-    NOISE,
-    OVER,
-    class_picture,
-)
+from rangeseg_ros.evaluation.measure import CORRECT, MISSED, NO_DATA, NOISE, OVER, class_picture
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.params import read_config, read_params
 from rangeseg_ros.segcomp import abw_calibration

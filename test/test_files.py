@@ -19,11 +19,7 @@ from rangeseg_ros.cli.errors import one_line
 from rangeseg_ros.cli.options import write_json
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.files import FileError, replacing
-from rangeseg_ros.io.images import (
-    read_depth,
-    read_labels,
-    write_image,
-)
+from rangeseg_ros.io.images import read_depth, read_labels, write_image
 from rangeseg_ros.io.params import NODE_ONLY, read_config, read_params
 from rangeseg_ros.io.tables import columns, open_table, values
 from rangeseg_ros.io.yaml_files import read_yaml

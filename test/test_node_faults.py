@@ -75,10 +75,7 @@ def test_camera_info_of_another_frame_is_used_with_a_warning(bench):
 
 @pytest.mark.parametrize(
     'fields, words',
-    [
-        ({'data': array('B', bytes(1000))}, '1000 bytes'),
-        ({'height': 2**32 - 1}, '4294967295'),
-    ],
+    [({'data': array('B', bytes(1000))}, '1000 bytes'), ({'height': 2**32 - 1}, '4294967295')],
 )
 def test_malformed_image(bench, fields, words):
     bench.camera_info.publish(bench.info())

@@ -233,11 +233,7 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
 @pytest.fixture(scope='module')
 def robot(tf_messages):
     topics = 'labels', 'planes', 'markers'
-    with (
-        Bench(**FRAMES, tf_timeout=20.0) as bench,
-        bench.listening(*topics),
-        bench.camera_on(),
-    ):
+    with Bench(**FRAMES, tf_timeout=20.0) as bench, bench.listening(*topics), bench.camera_on():
         robot = Robot(bench, tf_messages)
         bench.until(robot.moving.get_subscription_count)
         bench.until(robot.static.get_subscription_count)

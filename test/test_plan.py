@@ -17,9 +17,14 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.cli.main import rangeseg
-from rangeseg_ros.core.mapping.floor_plan import estimate_up
-from rangeseg_ros.core.mapping.right_angles import square_up
+from rangeseg_ros.core.ground.stairs import Stairs
+from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.io.plans import write_dxf, write_geojson
+from rangeseg_ros.plan.flights import Flight, flights
+from rangeseg_ros.plan.floor_plan import FloorPlan, Up, estimate_up
+from rangeseg_ros.plan.right_angles import square_up
+from rangeseg_ros.report.plan import svg
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 from rangeseg_ros.simulation.solids import box, cast, half_space
 
@@ -82,8 +87,8 @@ def folders(tmp_path_factory):
     return root
 
 
-def of_role(folder, role):
-    collection = json.loads((folder / 'plan.geojson').read_text())
+def of_role(folder, role, name='plan.geojson'):
+    collection = json.loads((folder / name).read_text())
     return [f for f in collection['features'] if f['properties']['role'] == role]
 
 
@@ -226,3 +231,56 @@ def test_up_is_known_as_well_as_its_deviation_says():
         gaps.append(np.arccos(np.clip(up.direction @ turn.apply([0, 0, 1]), -1, 1)) / up.deviation)
     # Of two directions.
     assert 0.3 < np.mean(np.square(gaps)) / 2 < 2
+
+
+def sighted(edge, direction, pose, random, count):
+    """Stairs at an edge (2, 3) as a camera sees them: a part of it, its ends in any order."""
+    left, right = sorted(random.uniform(0, 1, 2) * (0.1, 0.1) + (0, 0.9))
+    ends = edge[0] + np.outer([left, right], edge[1] - edge[0])
+    ends = ends[:: random.choice([-1, 1])] + random.normal(0, 0.01, (2, 3))
+    return Stairs(pose.inverse().apply(ends), 1.2, count, 0.17, 0.28, direction), pose
+
+
+def test_stairs_of_several_frames_are_one_flight():
+    random, seen = np.random.default_rng(1), []
+    up = np.array([[2.0, -0.6, 0.0], [2.0, 0.6, 0.0]])
+    down = np.array([[-1.0, 3.0, 0.0], [-2.2, 3.0, 0.0]])
+    for k in range(9):
+        turn = Rotation.from_euler('zyx', random.uniform(-30, 30, 3), degrees=True).as_matrix()
+        pose = Transform(turn, np.array([0.1 * k - 1, 0.05 * k, 1.0]))
+        seen.append(sighted(up, 'up', pose, random, 2 + k % 3))
+        seen.append(sighted(down, 'down', pose, random, 3))
+        if k < 2:  # too few to be sure
+            seen.append(sighted(up + np.array([3, 0, 0]), 'up', pose, random, 3))
+    first, second = flights(seen)
+    assert (first.direction, second.direction) == ('up', 'down')
+    assert str(first) == 'stairs up, 4 x 0.17 / 0.28 m'
+    # Upwards along x, and downwards along y, away from the camera.
+    np.testing.assert_allclose(
+        first.edges[:, :, 0].mean(axis=1), 2 + 0.28 * np.arange(5), atol=0.02
+    )
+    np.testing.assert_allclose(np.ptp(first.edges[:, :, 1], axis=1), 1.2, atol=0.15)
+    np.testing.assert_allclose(
+        second.edges[:, :, 1].mean(axis=1), 3 + 0.28 * np.arange(4), atol=0.02
+    )
+    assert flights([]) == []
+
+
+def test_stairs_are_in_every_drawing(tmp_path):
+    edges = np.array([[[1.0, 0, 0], [1, 1, 0]], [[1.28, 0, 0], [1.28, 1, 0]]])[..., :2]
+    up, cells = Up(np.array([0.0, 0, 1]), 0.0, 'test'), np.zeros((20, 20), np.int8)
+    flight, still = Flight(edges, 0.17, 0.28, 'up'), Transform.identity()
+    plan = FloorPlan('map', still, up, 0.0, [], [], [], [flight], cells, (0.0, 0.0), 0.1)
+    write_dxf(tmp_path / 'a.dxf', plan)
+    lines = ezdxf.readfile(tmp_path / 'a.dxf').modelspace().query('LINE[layer=="STAIRS"]')
+    assert [line.dxf.start.x for line in lines] == [1.0, 1.28]
+    write_geojson(tmp_path / 'a.geojson', plan)
+    (stairs,) = of_role(tmp_path, 'stairs', 'a.geojson')
+    assert stairs['geometry']['coordinates'] == edges.tolist()
+    assert stairs['properties']['treads'] == 1 and stairs['properties']['direction'] == 'up'
+    group = ET.fromstring(svg(plan)).find("{*}g[@class='stairs']")
+    assert group.find('{*}title').text == str(flight)
+    assert [(line.get('x1'), line.get('y2')) for line in group.findall('{*}line')] == [
+        ('1.0', '-1.0'),
+        ('1.28', '-1.0'),
+    ]

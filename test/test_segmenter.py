@@ -17,7 +17,6 @@ from rangeseg_ros.core.by_normals.labelling import (
 )
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.drawing import normals_picture
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
@@ -299,9 +298,3 @@ def test_messages_hold_normals_and_edges(room):
     np.testing.assert_array_equal(sent, result.normals)
     assert made['edges']['encoding'] == 'mono8'
     np.testing.assert_array_equal(made['edges']['data'].reshape(120, 160) == 255, result.edges)
-
-
-def test_picture_of_normals():
-    normals = np.array([[[0, 0, -1], [1, 0, 0], [0, 1, 0], [np.nan] * 3]], np.float32)
-    expected = [[[128, 128, 255], [255, 128, 128], [128, 0, 128], [0, 0, 0]]]
-    np.testing.assert_array_equal(normals_picture(normals), expected)

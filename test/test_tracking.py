@@ -8,13 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planes_of_labels import fit_planes
 from scipy.spatial.transform import Rotation
+from tracks import ids_of_faces, track_figures
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.tracker import Tracker
-from rangeseg_ros.evaluation.tracks import ids_of_faces, track_figures
 from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import kinect_camera

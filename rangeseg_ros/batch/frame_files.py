@@ -38,8 +38,7 @@ FRAME_FILES = {
     'labels': _image('_labels.png', lambda image, result: result.labels),
     'curved': _image('_curved.png', lambda image, result: result.curved),
     'overlay': _image(
-        '_overlay.png',
-        lambda image, result: overlay(image.inverse, result.labels, result.planes),
+        '_overlay.png', lambda image, result: overlay(image.inverse, result.labels, result.planes)
     ),
     'normals': _image('_normals.tiff', lambda image, result: result.normals),
     'terrain': _image('_terrain.png', lambda image, result: result.terrain),

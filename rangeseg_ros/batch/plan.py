@@ -13,16 +13,10 @@ from numpy.typing import NDArray
 from rangeseg_ros.batch.locator import Locator
 from rangeseg_ros.batch.replay import Progress, segment_frames
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.adjustment import Adjustment
-from rangeseg_ros.core.mapping.floor_plan import (
-    Up,
-    estimate_up,
-    make_plan,
-    points_within,
-)
+from rangeseg_ros.core.ground.stairs import Stairs
+from rangeseg_ros.core.mapping.adjustment import Adjustment, Solution
 from rangeseg_ros.core.mapping.observations import PoseNoise
 from rangeseg_ros.core.mapping.plane_map import PlaneMap
-from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.bags import DamagedBagError, DepthBag
@@ -31,6 +25,7 @@ from rangeseg_ros.io.files import NotReplacedError
 from rangeseg_ros.io.plans import plan_files, write_plan
 from rangeseg_ros.io.recordings import BagError
 from rangeseg_ros.io.transforms import fixed_frame_of
+from rangeseg_ros.plan.floor_plan import Up, estimate_up, make_plan, points_within
 from rangeseg_ros.report.plan import write_picture, write_plan_page
 
 PICTURE, PAGE = 'plan.svg', 'plan.html'
@@ -40,19 +35,15 @@ PICTURE, PAGE = 'plan.svg', 'plan.html'
 class PlanOutcome:
     """What became of a recording.
 
-    Numbers of its frames and of those whose place was known, its fixed `frame`; numbers of planes,
-    walls, openings, and planes with exact right angles (`squared`) in the plan; what tells which
-    way is `up`.
+    Numbers of its frames and of those whose place was known, its fixed `frame`, what tells which
+    way is `up`, and what is in the plan, in words.
     """
 
     frames: int
     located: int
     frame: str
-    planes: int
-    walls: int
-    openings: int
-    squared: int
     up: str
+    content: str
     warnings: list[str] = field(default_factory=list)
 
 
@@ -60,13 +51,15 @@ class PlanOutcome:
 class _Stretch:
     """What was seen while the map was one: it begins anew where the fixed frame jumps.
 
-    `frames` are the numbers of its frames; `looked` and `told` are sums of the directions of up in
-    the images, by the parameters and by the sensors.
+    `frames` are the numbers of its frames, `stairs` those they show, with their places among
+    these; `looked` and `told` are sums of the directions of up in the images, by the parameters
+    and by the sensors.
     """
 
     map: PlaneMap
     seen: Adjustment
     frames: list[int] = field(default_factory=list)
+    stairs: list[tuple[Stairs, int]] = field(default_factory=list)
     looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
     told: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
@@ -125,28 +118,25 @@ class PlanTask:
         solution = best.seen.solve(planes, best.map.successors)
         if solution.drifts:
             warnings.append(solution.drift_text())
-        points = self._points(dict(zip(best.frames, solution.poses, strict=True)), config)
+        points = self._points(best.frames, solution, config)
         up = estimate_up(solution.planes, best.looked, np.radians(config.role_tolerance))
         if best.told.any():
             source = config.gravity_frame or 'the accelerometer'
             up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
         grid = self.headroom, self.resolution
-        plan = make_plan(solution, config.map_frame, up, points, config, *grid)
+        stairs = [(each, solution.poses[k]) for each, k in best.stairs]
+        plan = make_plan(solution, config.map_frame, up, points, stairs, config, *grid)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_picture(self.folder / PICTURE, plan)
         write_plan_page(self.folder / PAGE, self.recording.name, plan, warnings)
-        return PlanOutcome(
-            frames,
-            len(best.frames),
-            config.map_frame,
-            len(plan.planes),
-            len(plan.walls),
-            len(plan.openings),
-            sum(plane.exact == 'square' for plane in plan.planes),
-            plan.up.source,
-            warnings,
+        square = sum(plane.exact == 'square' for plane in plan.planes)
+        content = (
+            f'{len(plan.planes)} planes, {len(plan.walls)} upright, {square} of them square, '
+            f'{len(plan.openings)} openings, {len(plan.stairs)} stairs'
         )
+        told = config.map_frame, up.source, content, warnings
+        return PlanOutcome(frames, len(best.frames), *told)
 
     def _map(self, config: Config, progress: Progress | None) -> tuple[int, _Stretch, list[str]]:
         """Number of frames, the stretch with the largest map, and what is to be told."""
@@ -158,13 +148,15 @@ class PlanTask:
 
         stretches, frames, warnings = [begin()], 0, []
         with self._open() as source, Locator(self.recording, config) as located:
-            for number, *_ in segment_frames(source, sequence, located.place, progress):
+            for number, *_, result in segment_frames(source, sequence, located.place, progress):
                 frames += 1
                 if stretches[-1].map is not sequence.map:
                     warnings.append(f'frame {number}: {sequence.map.begun_anew}')
                     stretches.append(begin())
                 now = stretches[-1]
                 if sequence.map.sighting and sequence.pose:
+                    if not result.tilt:
+                        now.stairs += [(stairs, len(now.frames)) for stairs in result.stairs]
                     now.frames.append(number)
                     now.seen.add(sequence.map.sighting)
                     turn = sequence.pose.rotation
@@ -178,16 +170,20 @@ class PlanTask:
         return frames, best, warnings + sequence.map.doubts
 
     def _points(
-        self, poses: dict[int, Transform], config: Config
+        self, frames: list[int], solution: Solution, config: Config
     ) -> Iterator[NDArray[np.float64]]:
-        """Points of the frames, by their numbers, where their poses were solved."""
-        sensor = SensorModel.from_config(config)
+        """Points of the frames of these numbers, at their poses and without the distortion."""
+        sensor, poses = (
+            SensorModel.from_config(config),
+            dict(zip(frames, solution.poses, strict=True)),
+        )
         with self._open() as source:
             try:
                 for done, frame in enumerate(source):
                     pose = poses.get(done + source.lost.total())
                     if pose:
                         image = corrected(frame.range_image(), config)
+                        image = solution.corrected(image, config.distortion_length)
                         points = points_within(image, sensor, self.resolution) - image.place
                         yield pose.apply(points)
             # What comes after the damage has no poses.

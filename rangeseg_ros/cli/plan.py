@@ -53,7 +53,7 @@ def command(
 
     \b
     Writes, into a folder for each recording if there are several:
-      plan.svg            walls coloured by standard deviation, openings, floor
+      plan.svg            walls coloured by standard deviation, openings, floor, stairs
       plan.dxf            the same for CAD
       plan.geojson        planes with their outlines, roles and deviations
       plan.html           plan and map, to turn and to measure in
@@ -88,7 +88,6 @@ def _report(task: PlanTask, outcome: PlanOutcome | Failure) -> int:
         click.echo(f'rangeseg: {task.recording}: {warning}', err=True)
     click.echo(
         f'{task.folder}: {outcome.located} of {outcome.frames} frames in {outcome.frame}, up by '
-        f'{outcome.up}: {outcome.planes} planes, {outcome.walls} upright, '
-        f'{outcome.squared} of them square, {outcome.openings} openings'
+        f'{outcome.up}: {outcome.content}'
     )
     return 0

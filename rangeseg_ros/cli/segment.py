@@ -42,9 +42,7 @@ _SHOWN = ('labels', 'planes', 'overlay', 'normals', 'terrain', 'stairs')
     help='Also write <stem>_curved.png: smooth regions that are no planes, 16 bits, 0 = none.',
 )
 @click.option(
-    '--sensor',
-    is_flag=True,
-    help='Also print the errors of the sensor as every image shows them.',
+    '--sensor', is_flag=True, help='Also print the errors of the sensor as every image shows them.'
 )
 def command(
     depth: tuple[Path, ...],

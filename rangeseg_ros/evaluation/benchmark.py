@@ -46,11 +46,7 @@ class Frames:
 
 
 def measure(
-    frames: Frames,
-    config: Config,
-    rounds: int,
-    progress: Progress,
-    threads: int | None = None,
+    frames: Frames, config: Config, rounds: int, progress: Progress, threads: int | None = None
 ) -> dict[str, Any]:
     """Time and memory of the segmenter, in a process of its own.
 

@@ -18,12 +18,7 @@ from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.label_files import EvaluationError, read_label_image
-from rangeseg_ros.evaluation.stairs import (
-    StairsCheck,
-    check_stairs,
-    stairs_figures,
-    stairs_line,
-)
+from rangeseg_ros.evaluation.stairs import StairsCheck, check_stairs, stairs_figures, stairs_line
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.io.images import read_depth, write_image

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.meshes import write_mesh
+from rangeseg_ros.plan.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
+from rangeseg_ros.plan.right_angles import Squared
 
 # Shades of map_server, and thresholds between them: 205 is unknown, as 1 - 205 / 255 lies between.
 _SHADES = {FREE: 254, OCCUPIED: 0}
@@ -26,6 +26,7 @@ _UNKNOWN, _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 205, 0.65, 0.196
 
 # Layers of the drawing and their colours.
 _LAYERS = {'WALLS': 1, 'FACES': 8, 'OPENINGS': 5, 'FLOOR': 3, 'LEVEL': 30, 'PLANES': 9, 'TEXT': 7}
+_LAYERS['STAIRS'] = 6
 
 
 def plan_files() -> dict[str, Callable[[Path, FloorPlan], None]]:
@@ -65,7 +66,7 @@ def write_dxf(path: Path, plan: FloorPlan) -> None:
     """Write the plan for CAD: walls and openings as lines, outlines as polylines.
 
     Layers WALLS (role wall), FACES (smaller upright planes), OPENINGS, FLOOR, LEVEL (other level
-    planes), PLANES (all parts of all planes in space) and TEXT.
+    planes), PLANES (all parts of all planes in space), STAIRS and TEXT.
     """
     import ezdxf
     from ezdxf import units
@@ -87,6 +88,8 @@ def write_dxf(path: Path, plan: FloorPlan) -> None:
     for opening in plan.openings:
         start, end = opening.ends
         space.add_line(start, end, dxfattribs={'layer': 'OPENINGS', 'linetype': 'DASHED'})
+    for start, end in (edge for flight in plan.stairs for edge in flight.edges):
+        space.add_line(start, end, dxfattribs={'layer': 'STAIRS'})
     for plane in plan.planes:
         level = abs(plane.normal[2]) > 0.5 and plane.role != 'ceiling'
         layer = 'FLOOR' if plane.role == 'floor' else 'LEVEL'
@@ -123,6 +126,11 @@ def write_geojson(path: Path, plan: FloorPlan) -> None:
         about = {'role': 'opening', 'width': round(opening.width, 4)}
         about['wall'] = plan.planes[opening.plane].id
         features.append(({'type': 'LineString', 'coordinates': _rounded(opening.ends)}, about))
+    for flight in plan.stairs:
+        about = {'role': 'stairs', 'direction': flight.direction, 'treads': len(flight.edges) - 1}
+        about |= {'rise': round(flight.rise, 4), 'run': round(flight.run, 4)}
+        lines = {'type': 'MultiLineString', 'coordinates': _rounded(flight.edges)}
+        features.append((lines, about))
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = plan.motion
     collection = {

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rangeseg_ros.core.mapping.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
-from rangeseg_ros.core.mapping.right_angles import Squared
 from rangeseg_ros.drawing import colours
 from rangeseg_ros.io.files import replacing
 from rangeseg_ros.io.plans import plane_row
+from rangeseg_ros.plan.floor_plan import FREE, OCCUPIED, FloorPlan, deviation_of
+from rangeseg_ros.plan.right_angles import Squared
 from rangeseg_ros.report.page import render, write_page
 
 # Deviations of walls, metres, up to which they have the colours of the legend.
@@ -60,6 +60,7 @@ def svg(plan: FloorPlan) -> str:
         level=level,
         walls=walls,
         openings=[(o.ends.round(3).tolist(), o.width) for o in plan.openings],
+        stairs=[(flight.edges.round(3).tolist(), str(flight)) for flight in plan.stairs],
         classes=_CLASSES,
     )
 
@@ -110,5 +111,6 @@ def write_plan_page(path: Path, name: str, plan: FloorPlan, warnings: Sequence[s
         drawing=svg(plan),
         rows=sorted(map(plane_row, plan.planes), key=lambda row: -row['area']),
         openings=[round(opening.width, 3) for opening in plan.openings],
+        stairs=[str(flight) for flight in plan.stairs],
         solids=json.dumps(solids, separators=(',', ':')),
     )

@@ -49,11 +49,7 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        node: Node,
-        publication: Publication,
-        settings: Settings,
-        statistics: FrameStatistics,
+        self, node: Node, publication: Publication, settings: Settings, statistics: FrameStatistics
     ) -> None:
         self._node = node
         self._publication = publication

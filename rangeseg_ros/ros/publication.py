@@ -43,10 +43,7 @@ class Publication:
     """Publishes results, each topic (by its name) while somebody listens to it."""
 
     def __init__(
-        self,
-        publishers: Mapping[str, Publisher],
-        settings: Settings,
-        statistics: FrameStatistics,
+        self, publishers: Mapping[str, Publisher], settings: Settings, statistics: FrameStatistics
     ) -> None:
         self._publishers = publishers
         self._settings = settings

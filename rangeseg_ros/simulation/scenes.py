@@ -12,15 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.simulation.solids import (
-    Solid,
-    about_z,
-    box,
-    cast,
-    cylinder,
-    half_space,
-    sphere,
-)
+from rangeseg_ros.simulation.solids import Solid, about_z, box, cast, cylinder, half_space, sphere
 
 OPTICAL_IN_BODY = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation of the optical frame (z forward, REP 103) in a body frame with x forward, z up."""

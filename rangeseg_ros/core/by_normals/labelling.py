@@ -56,10 +56,7 @@ def minimise(
 
 
 def minimise_exactly(
-    normals: NDArray[np.float32],
-    directions: NDArray[np.float32],
-    grid: Grid,
-    smoothness: float,
+    normals: NDArray[np.float32], directions: NDArray[np.float32], grid: Grid, smoothness: float
 ) -> NDArray[np.int32]:
     """What `minimise` finds, from the nearest direction at every pixel on.
 

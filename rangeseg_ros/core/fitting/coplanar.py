@@ -7,11 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.fitting.uncertainty import (
-    Cells,
-    add_common_errors,
-    distortion_field,
-)
+from rangeseg_ros.core.fitting.uncertainty import Cells, add_common_errors, distortion_field
 from rangeseg_ros.core.sensing.moments import cofactors
 from rangeseg_ros.core.significance import chi2_quantile
 

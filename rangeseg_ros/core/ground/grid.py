@@ -152,11 +152,7 @@ class GroundMemory:
         self._layers[(slice(None), *new)] = kept[(slice(None), *old)]
 
     def _count(
-        self,
-        kind: int,
-        points: NDArray[np.float64],
-        errors: NDArray[np.float64],
-        seconds: float,
+        self, kind: int, points: NDArray[np.float64], errors: NDArray[np.float64], seconds: float
     ) -> None:
         """Add points (N, 3) of the ground, or of a kind of danger; variances (N,) of heights."""
         odds, height, variance, danger, seen = (layer.reshape(-1) for layer in self._layers)

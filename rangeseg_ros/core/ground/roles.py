@@ -170,11 +170,7 @@ class Tilt(NamedTuple):
 
 
 def tilt_of(
-    planes: Sequence[Plane],
-    up: NDArray[np.float64],
-    tolerance: float,
-    area: float,
-    slope: float,
+    planes: Sequence[Plane], up: NDArray[np.float64], tolerance: float, area: float, slope: float
 ) -> Tilt | None:
     """The tilt that the planes show; None where they agree with `up`, or do not tell.
 

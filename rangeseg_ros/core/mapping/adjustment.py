@@ -4,13 +4,14 @@ A bundle adjustment with planes instead of points (Kaess, "Simultaneous localiza
 with infinite planes", ICRA 2015). What a frame f shows of plane p differs from the plane as it is
 estimated by the three numbers (`plane_errors`)
 
-    z = x_p + D s_f + v,
+    z = x_p + D s_f + P b + S u_r + v,
 
-x_p the error of the plane, s_f that of the pose (a turn about the camera and a shift), and v that
-of the sensor. The part of v that lasts (`observations`) is the same in the n frames of a run in
-which the plane is seen by the same pixels: it counts n times, so that the mean of the run has it
-once. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and noise e_f;
-those before a jump (`plane_filter`) moreover by what the jump was taken for wrongly.
+x_p the error of the plane, s_f that of the pose (a turn about the camera and a shift), P b what
+the distortion b of the sensor, an inverse range for each cell of the image, makes of a plane in
+these pixels, and v what is new in the frame. What else lasts of the sensor's errors
+(`observations`) is u_r in the run of frames in which the same pixels see the plane, in standard
+deviations S. Poses err by s_f = (0, w_f d) + e_f: a drift d over the way w_f of the camera, and
+noise e_f; those before a jump (`plane_filter`) moreover by what the jump was taken for wrongly.
 The errors of an odometry add up: e_f - e_(f-1) is its noise, and it has no other drift. A drift
 that is not significant is none.
 """
@@ -18,7 +19,7 @@ that is not significant is none.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +29,21 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_onto
-from rangeseg_ros.core.mapping.observations import LASTING, PlaneSet, PoseNoise
+from rangeseg_ros.core.mapping.observations import (
+    LASTING,
+    PlaneSet,
+    PoseNoise,
+    cell_rays,
+    in_pixels,
+)
 from rangeseg_ros.core.mapping.plane_filter import Jump
 from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import cross_matrix
+from rangeseg_ros.core.sensing.distortion import DistortionMap
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.significance import OUTLIER, chi2_quantile
-from rangeseg_ros.core.tracking.plane_errors import GATE, congruent, from_errors
+from rangeseg_ros.core.tracking.plane_errors import GATE, from_errors
 
 _ROUNDS = 6  # until weights settle
 _SYMMETRIC = {'SymmetricMode': True}
@@ -49,7 +58,8 @@ class Solution(NamedTuple):
 
     `covariance` (4 P, 4 P) is of normal and distance of all planes in turn. `drift` (3,) is of the
     poses as they were told, metres per metre of the `way` of the camera, metres; where it is more
-    than chance makes it (chi-squared, 0.999), the camera `drifts`, and it is taken off.
+    than chance makes it (chi-squared, 0.999), the camera `drifts`, and it is taken off. `field`
+    (C,), 1/m, is the distortion in the cells of the image.
     """
 
     planes: list[MapPlane]
@@ -59,6 +69,17 @@ class Solution(NamedTuple):
     drift_covariance: NDArray[np.float64]
     way: float
     drifts: bool
+    field: NDArray[np.float64]
+
+    def corrected(self, image: RangeImage, stated: float) -> RangeImage:
+        """An image of a camera without the field; `stated` is the parameter `distortion_length`.
+
+        Itself where the field is that of images of other cells.
+        """
+        if image.camera is None or len(cell_rays(image, stated)) != len(self.field):
+            return image
+        error = in_pixels(self.field, image.shape, stated)
+        return DistortionMap(error.astype(np.float32)).corrected(image)
 
     def drift_text(self) -> str:
         """The drift in words."""
@@ -83,7 +104,9 @@ class Adjustment:
         self._odometry = odometry
         self._poses: list[Transform] = []
         self._planes: list[PlaneSet] = []
-        self._covariance: list[NDArray[np.float64]] = []
+        # Of their covariances, and in their units what the distortion makes of them.
+        self._root: list[NDArray[np.float64]] = []
+        self._effects: list[sparse.csr_array] = []
         # Number of its frame, id of its plane and number of its run, for each observation.
         self._index: list[tuple[int, int, int]] = []
         self._runs: dict[int, int] = {}
@@ -101,8 +124,15 @@ class Adjustment:
             self._index.append((len(self._poses), number, self._runs[number]))
         self._poses.append(frame.pose)
         # As the camera sees them.
-        self._planes.append(frame.seen.planes.moved(frame.pose.inverse()))
-        self._covariance.append(frame.seen.covariance)
+        planes = frame.seen.planes.moved(frame.pose.inverse())
+        self._planes.append(planes)
+        self._root.append(np.linalg.cholesky(frame.seen.covariance))
+        effects = np.linalg.solve(self._root[-1], planes.by_field(frame.seen.view, frame.rays))
+        effects = sparse.csr_array(effects.reshape(-1, len(frame.rays)))
+        # Images of another size would have a field of their own.
+        if self._effects and effects.shape[1] != (cells := self._effects[0].shape[1]):
+            effects = sparse.csr_array((effects.shape[0], cells))
+        self._effects.append(effects)
 
     def solve(self, planes: Sequence[MapPlane], successors: Mapping[int, int]) -> Solution:
         """Planes and poses of all frames, of these planes of the map.
@@ -119,18 +149,25 @@ class Adjustment:
         index = [(at, now(own), run) for at, own, run in self._index]
         frame, plane, runs = np.array(index, np.intp).reshape(-1, 3).T
         used = plane >= 0
-        frame, plane, runs = frame[used], plane[used], runs[used]
-        times = np.bincount(runs)[runs]
+        _, runs = np.unique(runs[used], return_inverse=True)
         seen = PlaneSet(*map(np.concatenate, zip(*self._planes, strict=True))).where(used)
-        error = np.concatenate(self._covariance)[used]
-        error *= (1 - LASTING + times * LASTING)[:, None, None]
+        root = np.concatenate(self._root)[used]
+        field = sparse.vstack(self._effects).tocsr()[np.repeat(used, 3)]
+        own = _blocks(np.eye(3) + 0 * root, runs, int(runs.max(initial=-1)) + 1)
+        lasting = sparse.hstack([own, field]) / (1 - LASTING) ** 0.5
+        # How much of what lasts is of the field is not known: all of it may be, or none. What no
+        # plane shows has to be something.
+        size = field.power(2).sum(axis=1).reshape(-1, 3).mean(axis=1)
+        size = max(float(np.median(size)), 1.0) if len(size) else 1.0
+        precision = np.repeat([1.0, size], [own.shape[1], field.shape[1]]) / LASTING
         told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
-        sightings = frame, plane, seen, error
-        state, drift, covariance = self._solved(told, sightings, drifts=not self._odometry)
+        sightings = _Sightings(frame[used], plane[used], seen, root, lasting, precision)
+        state, rest, covariance = self._solved(told, sightings, drifts=not self._odometry)
+        drift = rest[-3:]
         drift_covariance = covariance[-3:, -3:]
         drifts = drift @ np.linalg.solve(drift_covariance, drift) > chi2_quantile(3)
         if not drifts:
-            state, _, covariance = self._solved(told, sightings, drifts=False)
+            state, rest, covariance = self._solved(told, sightings, drifts=False)
         jacobian = block_diag(*from_errors(state.planes.axes, state.planes.point))
         joint = jacobian @ covariance[:-3, :-3] @ jacobian.T
         return Solution(
@@ -141,45 +178,34 @@ class Adjustment:
             drift_covariance,
             float(self._way()[-1]),
             bool(drifts),
+            rest[own.shape[1] :][: field.shape[1]],
         )
 
     def _solved(
-        self,
-        told: _State,
-        sightings: tuple[NDArray[np.intp], NDArray[np.intp], PlaneSet, NDArray[np.float64]],
-        drifts: bool,
+        self, told: _State, sightings: _Sightings, drifts: bool
     ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
-        """The most probable state and drift, and the covariance of all planes and the drift."""
-        state, weight = told, np.ones(len(sightings[0]))
-        # What jumps were taken for wrongly, and the drift.
-        rest = np.zeros(6 * len(self._jumps) + 3)
+        """The most probable state and all else, and the covariance of all planes and the drift."""
+        state = told
+        # What lasts, what jumps were taken for wrongly, and the drift.
+        rest = np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
         first, last = 3 * len(told.planes.normal), 3 * len(told.planes.normal) + 6 * len(told.turn)
-        prior = self._prior(first, drifts)
+        prior = self._prior(first, sightings.precision, drifts)
         for _ in range(_ROUNDS):
-            design, gap = state.equations(*sightings, len(rest))
+            design, gap = state.equations(sightings, rest)
             known = np.concatenate([np.zeros(first), state.pose_errors(told), rest])
-            scale = np.repeat(np.sqrt(weight), 3)
+            # Cauchy's weights: things that move by themselves are not to move the camera.
+            off = (gap.reshape(-1, 3) ** 2).sum(axis=1)
+            scale = np.repeat(1 / np.sqrt(1 + off / GATE), 3)
             rows = sparse.vstack([sparse.diags_array(scale) @ design, prior]).tocsr()
             factors = splu((rows.T @ rows).tocsc(), 'MMD_AT_PLUS_A', 0.0, options=_SYMMETRIC)
             step = factors.solve(rows.T @ np.concatenate([scale * gap, -prior @ known]))
-            # Huber's weights: things that move by themselves are not to move the camera.
-            left = ((gap - design @ step).reshape(-1, 3) ** 2).sum(axis=1)
-            weight = np.minimum(1.0, np.sqrt(GATE / np.maximum(left, 1e-12)))
             state, rest = state.corrected(step[:first], step[first:last]), rest + step[last:]
         # Of the inverse, what is of the planes and the drift.
         chosen = np.r_[:first, len(step) - 3 : len(step)]
         unit = sparse.eye_array(len(step), format='csc')
         blocks = np.split(chosen, range(_COLUMNS, len(chosen), _COLUMNS))
         parts = [factors.solve(unit[:, block].toarray())[chosen] for block in blocks]
-        covariance, of_drift = np.hstack(parts), factors.solve(unit[:, -3:].toarray())
-        # What planes disagree by, each with all of its errors: a cluster-robust variance (Liang
-        # and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
-        left = scale**2 * (gap - design @ step)
-        part = (design @ of_drift) * left[:, None]
-        each = np.zeros((len(told.planes.normal), 3))
-        np.add.at(each, np.repeat(sightings[1], 3), part)
-        covariance[-3:, -3:] += each.T @ each
-        return state, rest[-3:], covariance
+        return state, rest, np.hstack(parts)
 
     def _way(self) -> NDArray[np.float64]:
         """(F,) way of the camera up to each frame; less than the noise of poses is no way."""
@@ -191,8 +217,8 @@ class Adjustment:
             way.append(total)
         return np.array(way)
 
-    def _prior(self, planes: int, drifts: bool) -> sparse.csr_array:
-        """What is known beforehand of the poses and the drift, as equations of unit variance."""
+    def _prior(self, planes: int, precision: NDArray[np.float64], drifts: bool) -> Any:
+        """What is known beforehand of all but the planes, as equations of unit variance."""
         frames, way = len(self._poses), self._way()
         change = sparse.eye_array(frames)
         if self._odometry:
@@ -211,8 +237,35 @@ class Adjustment:
         # No drift is longer than the way.
         known.append(sparse.eye_array(3) / (1.0 if drifts else _LEAST))
         rest = -poses @ sparse.csr_array(np.hstack(effects))
-        rows = sparse.block_array([[poses, rest], [None, sparse.block_diag(known)]])
+        rows = sparse.block_array([
+            [poses, None, rest],
+            [None, sparse.diags_array(np.sqrt(precision)), None],
+            [None, None, sparse.block_diag(known)],
+        ])  # fmt: skip
         return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()
+
+
+def _blocks(values: NDArray[np.float64], column: NDArray[np.intp], count: int) -> sparse.csr_array:
+    """Matrices (N, 3, K) one below the other, each at one of `count` columns of matrices."""
+    size = values.shape[2]
+    columns = np.repeat(size * column[:, None] + np.arange(size), 3, axis=0).ravel()
+    begin = np.arange(0, values.size + 1, size)
+    return sparse.csr_array((values.ravel(), columns, begin), (3 * len(values), size * count))
+
+
+class _Sightings(NamedTuple):
+    """N planes as cameras saw them, with the roots (N, 3, 3) of the covariances of their errors.
+
+    Of each the numbers of its frame and plane. `lasting` (3 N, L) is what lasts of each run and of
+    the field, in what is new of the errors, `precision` (L,) its inverse variance beforehand.
+    """
+
+    frame: NDArray[np.intp]
+    plane: NDArray[np.intp]
+    seen: PlaneSet
+    root: NDArray[np.float64]
+    lasting: sparse.csr_array
+    precision: NDArray[np.float64]
 
 
 class _State(NamedTuple):
@@ -236,26 +289,22 @@ class _State(NamedTuple):
         )
 
     def equations(
-        self,
-        frame: NDArray[np.intp],
-        plane: NDArray[np.intp],
-        seen: PlaneSet,
-        error: NDArray[np.float64],
-        rest: int,
+        self, sightings: _Sightings, rest: NDArray[np.float64]
     ) -> tuple[sparse.csr_array, NDArray[np.float64]]:
         """Derivatives (3 N, D) of observations by all unknowns, and the gaps (3 N,), whitened.
 
-        The last `rest` unknowns are of the poses only.
+        Of the `rest`, the first are what lasts of the errors; the others are of the poses only.
         """
+        frame, plane, seen, root, lasting, _ = sightings
         pose = Transform(self.turn[frame], self.shift[frame])
         planes = self.planes.where(plane)
         gap, turned = planes.apart(seen.moved(pose))
-        whiten = np.linalg.inv(np.linalg.cholesky(congruent(turned, error)))
-        values = np.concatenate([whiten, -whiten @ planes.by_motion(pose.shift)], axis=2)
-        first = 3 * len(self.planes.normal)
-        places = [3 * plane[:, None] + np.arange(3), first + 6 * frame[:, None] + np.arange(6)]
-        columns = np.repeat(np.concatenate(places, axis=1), 3, axis=0)
-        begin = np.arange(0, columns.size + 1, columns.shape[1])
-        shape = len(columns), first + 6 * len(self.turn) + rest
-        design = sparse.csr_array((values.ravel(), columns.ravel(), begin), shape)
-        return design, (whiten @ gap[..., None]).ravel()
+        whiten = np.linalg.inv(turned @ root) / (1 - LASTING) ** 0.5
+        design = sparse.hstack([
+            _blocks(whiten, plane, len(self.planes.normal)),
+            _blocks(-whiten @ planes.by_motion(pose.shift), frame, len(self.turn)),
+            lasting,
+            sparse.csr_array((gap.size, len(rest) - lasting.shape[1])),
+        ])  # fmt: skip
+        gap = (whiten @ gap[..., None]).ravel() - lasting @ rest[: lasting.shape[1]]
+        return design.tocsr(), gap

@@ -12,10 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import length_of_distortion
 from rangeseg_ros.core.tracking.plane_errors import (
     by_motion,
@@ -83,6 +85,23 @@ class PlaneSet(NamedTuple):
     def by_motion(self, place: NDArray[np.float64]) -> NDArray[np.float64]:
         """(N, 3, 6) what a turn about `place` (3,) or (N, 3) and a shift of planes change."""
         return by_motion(self.normal, self.axes, self.point - place)
+
+    def by_field(
+        self, view: NDArray[np.float64], rays: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """(N, 3, C) what planes err by with errors of the inverse range in C cells of the image.
+
+        `view` (N, C) is of `views`, `rays` (C, 3) of `cell_rays`; planes are where the camera sees
+        them: of y = a . r, a = -n / distance, the pixels change a by least squares.
+        """
+        weighted = view[:, None] * rays.T
+        change = np.linalg.pinv(weighted @ rays, hermitian=True) @ weighted
+        normal, distance = self.normal[:, :, None], self.distance[:, None, None]
+        along = np.swapaxes(normal, 1, 2) @ change
+        equations = np.concatenate(
+            [distance * (normal * along - change), distance**2 * along], axis=1
+        )
+        return np.asarray(to_errors(self.axes, self.point) @ equations)
 
     def apart(self, others: PlaneSet) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """What others differ by, (N, 3), as errors of these, and (N, 3, 3) that by their own."""
@@ -172,13 +191,8 @@ def views(
     Cells are twice as large as the pixels over which the errors of the sensor hang together, as
     the parameter `distortion_length` has `stated`.
     """
-    length = length_of_distortion(stated, labels.shape)
-    step = max(int(2 * length // _SAMPLES), 1)
-    coarse = labels[::step, ::step]
-    side = max(int(2 * length / step), 1)
-    rows, columns = (np.arange(size) // side for size in coarse.shape)
-    cell = rows[:, None] * (columns[-1] + 1) + columns
-    count = int(cell[-1, -1]) + 1
+    step, cell = _cells(labels.shape, stated)
+    coarse, count = labels[::step, ::step], int(cell[-1, -1]) + 1
     listed = np.array([plane.label for plane in planes], np.intp)
     number = np.zeros(max(int(listed.max(initial=0)), int(coarse.max(initial=0))) + 1, np.intp)
     number[listed] = np.arange(1, len(planes) + 1)
@@ -187,3 +201,32 @@ def views(
     )
     found = pixels.reshape(-1, count)[1:]
     return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1))
+
+
+def _cells(shape: tuple[int, int], stated: float) -> tuple[int, NDArray[np.intp]]:
+    """Step of the pixels that are looked at, and their cells (H / step, W / step)."""
+    length = length_of_distortion(stated, shape)
+    step = max(int(2 * length // _SAMPLES), 1)
+    side = max(int(2 * length / step), 1)
+    rows, columns = (np.arange(-(-size // step)) // side for size in shape)
+    return step, rows[:, None] * (columns[-1] + 1) + columns
+
+
+def cell_rays(image: RangeImage, stated: float) -> NDArray[np.float64]:
+    """(C, 3) mean rays of the cells of `views`."""
+    step, cell = _cells(image.shape, stated)
+    rays = image.rays[::step, ::step].reshape(-1, 3)
+    sums = [np.bincount(cell.ravel(), part) for part in rays.T]
+    return np.stack(sums, axis=1) / np.bincount(cell.ravel())[:, None]
+
+
+def in_pixels(
+    field: NDArray[np.float64], shape: tuple[int, int], stated: float
+) -> NDArray[np.float64]:
+    """Values of cells (C,) in the pixels of an image (H, W), linear between their middles."""
+    step, cell = _cells(shape, stated)
+    columns = int(cell[0, -1]) + 1
+    side = step * int(np.count_nonzero(cell[0] == 0))
+    across = [(np.arange(size) + 0.5) / side - 0.5 for size in shape]
+    places = np.meshgrid(*across, indexing='ij')
+    return map_coordinates(field.reshape(-1, columns), places, order=1, mode='nearest')

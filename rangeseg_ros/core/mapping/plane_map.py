@@ -12,7 +12,13 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.roles import corners_of
 from rangeseg_ros.core.mapping.map_planes import MapPlane, Record, describe
-from rangeseg_ros.core.mapping.observations import Observations, PoseNoise, observations, views
+from rangeseg_ros.core.mapping.observations import (
+    Observations,
+    PoseNoise,
+    cell_rays,
+    observations,
+    views,
+)
 from rangeseg_ros.core.mapping.plane_filter import Jump, PlaneFilters, find_jump
 from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
@@ -36,14 +42,15 @@ class Sighting(NamedTuple):
     """What a frame shows of the planes of a map: M planes, of parts of one the largest.
 
     `pose` takes the frame of the image to the fixed frame, `ids` (M,) are of the planes of the
-    map, and `begins` (M,) tells whether other pixels than before see them. `jump` is that of the
-    fixed frame since the frame before.
+    map, and `begins` (M,) tells whether other pixels than before see them. `rays` (C, 3) are of
+    the cells that `seen` has views of; `jump` is that of the fixed frame since the frame before.
     """
 
     pose: Transform
     seen: Observations
     ids: NDArray[np.int64]
     begins: NDArray[np.bool_]
+    rays: NDArray[np.float64]
     jump: Jump | None = None
 
 
@@ -70,6 +77,7 @@ class PlaneMap:
         self.successors: dict[int, int] = {}
         self._records: list[Record] = []
         self._filters = PlaneFilters.of(observations([], np.zeros((0, 0)), *_NOWHERE))
+        self._rays = np.zeros((0, 3))
         self._next = 1
         self._stamp = self._time = self._frames = 0
 
@@ -129,6 +137,7 @@ class PlaneMap:
             # Of images of another size, what comes is of other pixels than before.
             view = np.zeros((len(self._records), seen.view.shape[1]))
             self._filters = self._filters._replace(view=view)
+            self._rays = cell_rays(image, config.distortion_length)
         jump = self._followed(planes, seen, camera, noise)
         match = self._associate(planes, seen, camera)
         new = match < 0
@@ -145,7 +154,7 @@ class PlaneMap:
         largest = order[first]
         begins = self._filters.update(index, seen.where(largest))
         ids = np.array([self._records[k].id for k in index.tolist()], np.int64)
-        self.sighting = Sighting(pose, seen.where(largest), ids, begins, jump)
+        self.sighting = Sighting(pose, seen.where(largest), ids, begins, self._rays, jump)
         self._find(labels, planes, match, image, pose, noise)
         self._merge(index, camera)
         self._forget()

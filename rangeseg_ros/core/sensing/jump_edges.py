@@ -87,10 +87,7 @@ def _framed(values: NDArray[Any]) -> NDArray[Any]:
 
 @njit(cache=True, nogil=True)
 def _find_deviations(
-    means: NDArray[np.float32],
-    limits: NDArray[np.float32],
-    down: bool,
-    result: NDArray[np.bool_],
+    means: NDArray[np.float32], limits: NDArray[np.float32], down: bool, result: NDArray[np.bool_]
 ) -> None:
     """Whether the windows on either side of boundaries deviate from those beyond."""
     for i in range(len(result)):

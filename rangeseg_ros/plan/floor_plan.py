@@ -10,16 +10,18 @@ import shapely
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
+from rangeseg_ros.core.ground.stairs import Stairs
 from rangeseg_ros.core.mapping.adjustment import Solution
 from rangeseg_ros.core.mapping.map_planes import MapPlane, moved_planes
 from rangeseg_ros.core.mapping.plane_grid import HIT, LEAST, MISS, PlaneGrid
-from rangeseg_ros.core.mapping.right_angles import Squared, square_up
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.rotations import turn_between
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
 from rangeseg_ros.core.significance import chi2_quantile
 from rangeseg_ros.core.tracking.plane_errors import moved_plane
+from rangeseg_ros.plan.flights import Flight, flights
+from rangeseg_ros.plan.right_angles import Squared, square_up
 
 _ROUNDS = 5  # until the direction of up settles
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -111,6 +113,7 @@ class FloorPlan(NamedTuple):
     planes: list[Squared]
     walls: list[Wall]
     openings: list[Opening]
+    stairs: list[Flight]
     cells: NDArray[np.int8]
     origin: tuple[float, float]
     resolution: float
@@ -163,12 +166,14 @@ def make_plan(
     frame: str,
     up: Up,
     points: Iterable[NDArray[np.float64]],
+    stairs: Sequence[tuple[Stairs, Transform]],
     config: Config,
     headroom: float,
     resolution: float,
 ) -> FloorPlan:
     """Turn the planes of a map, in a frame of that name, and points (N, 3) of frames into a plan.
 
+    `stairs` are those that frames show, with the poses of these.
     What is higher above the ground than the headroom, metres, is not in the way; `resolution`,
     metres, is the side of the cells of the grid. Of the parameters, `role_tolerance`, `role_area`,
     `role_height` and `obstacle_height` count.
@@ -194,7 +199,8 @@ def make_plan(
     cells = _drawn(grid, [plane for plane in squared if plane.role == 'floor'], walls)
     openings = [o for wall in walls for o in _openings(wall, cells, grid)]
     x, y = (grid.first * resolution).tolist()
-    told = frame, motion, up, ground, squared, walls, openings
+    seen = [(each, motion.after(pose)) for each, pose in stairs]
+    told = frame, motion, up, ground, squared, walls, openings, flights(seen)
     return FloorPlan(*told, cells, (x, y), resolution)
 
 
