@@ -1,6 +1,7 @@
 """From a recording with tf to the map of planes: every format, poses in files, the command."""
 
 import csv
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -13,6 +14,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.io.files import FileError
 from rangeseg_ros.io.poses import match_poses, read_pose
+from rangeseg_ros.io.tables import parts_value
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY
 
@@ -50,6 +52,8 @@ def check(folder):
     assert wall['role'] == 'wall' and ground['role'] == 'floor'
     for row in rows:
         assert int(row['observations']) == FRAMES
+        parts = [part.split('|') for part in row['parts'].split('||')]
+        assert parts[0] == [row['hull'], *filter(None, row['holes'].split('|'))]
         assert int(row['last_stamp']) - int(row['first_stamp']) == (FRAMES - 1) * 10**8
     assert (folder / 'map.ply').read_bytes().startswith(b'ply')
 
@@ -203,3 +207,9 @@ def test_a_pose_is_read_whatever_separates_its_numbers(tmp_path):
     found = read_pose(path)
     assert isinstance(found, Transform)
     np.testing.assert_allclose(found.rotation, some_pose(2)[:3, :3], atol=1e-8)
+
+
+def test_all_parts_of_a_plane_are_in_its_row():
+    hull, hole, other = (np.full((2, 3), k) for k in (1, 2, 3.5))
+    plane = SimpleNamespace(outline=SimpleNamespace(parts=[[hull, hole], [other]]))
+    assert parts_value(plane) == '1 1 1;1 1 1|2 2 2;2 2 2||3.5 3.5 3.5;3.5 3.5 3.5'

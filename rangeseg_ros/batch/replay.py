@@ -186,8 +186,9 @@ class _Results:
             write_trajectory(folder / 'trajectory.txt', self.trajectory)
         if config.map_frame:
             without = ('label',)
-            rows = [tables.values(plane, without) for plane in mapped.planes]
-            tables.write_table(folder / 'map.csv', tables.columns(MapPlane, without), rows)
+            rows = [[*tables.values(p, without), tables.parts_value(p)] for p in mapped.planes]
+            columns = [*tables.columns(MapPlane, without), 'parts']
+            tables.write_table(folder / 'map.csv', columns, rows)
             shades = colours([plane.id for plane in mapped.planes])
             write_mesh(folder / 'map.ply', mapped.planes, shades)
         damage = [source.damage, source.loss()]

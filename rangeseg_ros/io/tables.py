@@ -77,6 +77,11 @@ def values(plane: Plane, without: Collection[str] = ()) -> list[Any]:
     return found
 
 
+def parts_value(plane: Plane) -> str:
+    """All parts of a plane, joined by '||': the hull of each and its holes, joined by '|'."""
+    return '||'.join('|'.join(map(_points, part)) for part in plane.outline.parts)
+
+
 def stairs_values(stairs: Stairs) -> list[Any]:
     """Values of a staircase for the columns `STAIRS`."""
     size = (stairs.width, stairs.count, stairs.rise, stairs.run, stairs.direction)
