@@ -99,10 +99,10 @@ def _write_id(picture: NDArray[np.uint8], region: NDArray[np.bool_], text: str) 
         return
     scale, centre = min(0.8, radius / 15 + 0.2), (2 * (y + row - 1), 2 * (x + column - 1))
     # The outline grows from the text itself: bold letters are wider in some versions of OpenCV.
-    font, margin = cv2.FONT_HERSHEY_SIMPLEX, 3
-    (wide, high), below = cv2.getTextSize(text, font, scale, 1)
-    letters = np.zeros((high + below + 2 * margin, wide + 2 * margin), np.uint8)
-    cv2.putText(letters, text, (margin, margin + high), font, scale, 255, 1, cv2.LINE_AA)
+    letters = np.zeros((40, 20 * len(text) + 20), np.uint8)
+    cv2.putText(letters, text, (9, 28), cv2.FONT_HERSHEY_SIMPLEX, scale, 255, 1, cv2.LINE_AA)
+    left, top, wide, high = cv2.boundingRect(letters)
+    letters = letters[top - 1 : top + high + 1, left - 1 : left + wide + 1]
     outline = cv2.dilate(letters, _SQUARE)
     top, left = (
         max(0, min(middle - size // 2, full - size))

@@ -11,9 +11,9 @@ import pytest
 from rangeseg_ros.core.sensing.binning import STEPS, step_within
 from rangeseg_ros.ros import counting
 from rangeseg_ros.ros.counting import Losses, Window
+from rangeseg_ros.ros.handover import TicketLock
 from rangeseg_ros.ros.pace import Pace
 from rangeseg_ros.ros.pairing import KEPT, Found, StampPairing
-from rangeseg_ros.ros.ticket_lock import TicketLock
 
 
 @pytest.mark.parametrize(

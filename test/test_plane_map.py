@@ -2,6 +2,7 @@
 
 import pickle
 from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
@@ -235,6 +236,34 @@ def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
         offset += plane.distance - normal @ jump.shift - after[number].distance
         assert np.degrees(np.arccos(min(1, normal @ after[number].normal))) < 1.5
         assert abs(offset) < 0.03
+
+
+def test_a_tread_that_is_taken_for_the_next_is_no_jump():
+    treads = [
+        box((0.28, 3, 0.17 * k), np.eye(3), (1.4 + 0.28 * k, 0, 0.085 * k)) for k in (1, 2, 3, 4)
+    ]
+    pose = Pose.looking((0, 0, 1.5), 0, 32, 0)
+    scene = Scene((half_space((0, 0, 1), (0, 0, 0)), *treads), (pose,) * 8)
+    plane_map, told = PlaneMap(), Transform(pose.rotation, pose.position)
+    for k in range(8):
+        view = simulate_kinect(scene, CAMERA, frame=k, seed=1)
+        image = RangeImage.from_depth(view.depth, CAMERA)
+        face = {plane.label: plane.face for plane in view.planes}
+        planes = fit_planes(view.labels, image, SENSOR)
+        # In the last frame all that is level has the id of what was one step higher.
+        level = sorted(
+            (p for p in planes if p.normal @ pose.rotation[2] > 0.9),
+            key=lambda p: p.centroid @ pose.rotation[2],
+        )
+        assert len(level) > 3
+        ids = {p.label: face[p.label] + 1 for p in planes}
+        if k == 7:
+            ids |= {p.label: face[q.label] + 1 for p, q in pairwise(level)} | {level[-1].label: 99}
+        named = [replace(p, id=ids[p.label]) for p in planes]
+        plane_map.add(view.labels, named, image, told, 10**9 + k * 10**9 // 30)
+    assert plane_map.jumps == []
+    heights = sorted(plane.centroid[2] for plane in plane_map.planes if plane.normal[2] > 0.9)
+    np.testing.assert_allclose(heights[:4], 0.17 * np.arange(4), atol=0.03)
 
 
 def test_a_looped_recording_begins_the_map_anew():

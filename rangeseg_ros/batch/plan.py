@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -51,14 +51,15 @@ class PlanOutcome:
 class _Stretch:
     """What was seen while the map was one: it begins anew where the fixed frame jumps.
 
-    `frames` are the numbers of its frames, `stairs` those they show, with their places among
-    these; `looked` and `told` are sums of the directions of up in the images, by the parameters
-    and by the sensors.
+    `frames` are the numbers of its frames, `heights` of the camera in them, metres, NaN where not
+    known; `stairs` that they show, with their places among the frames; `looked` and `told` sums
+    of the directions of up in the images, by the parameters and by the sensors.
     """
 
     map: PlaneMap
     seen: Adjustment
     frames: list[int] = field(default_factory=list)
+    heights: list[float] = field(default_factory=list)
     stairs: list[tuple[Stairs, int]] = field(default_factory=list)
     looked: np.ndarray = field(default_factory=lambda: np.zeros(3))
     told: np.ndarray = field(default_factory=lambda: np.zeros(3))
@@ -125,18 +126,18 @@ class PlanTask:
             up = Up(best.told / np.linalg.norm(best.told), 0.0, source)
         grid = self.headroom, self.resolution
         stairs = [(each, solution.poses[k]) for each, k in best.stairs]
-        plan = make_plan(solution, config.map_frame, up, points, stairs, config, *grid)
+        heights = np.array(best.heights)[:, None] * up.direction
+        stood = np.array([pose.shift for pose in solution.poses]) - heights
+        plan = make_plan(solution, config.map_frame, up, points, stairs, stood, config, *grid)
         self.folder.mkdir(parents=True, exist_ok=True)
         write_plan(self.folder, plan)
         write_picture(self.folder / PICTURE, plan)
         write_plan_page(self.folder / PAGE, self.recording.name, plan, warnings)
         square = sum(plane.exact == 'square' for plane in plan.planes)
-        content = (
-            f'{len(plan.planes)} planes, {len(plan.walls)} upright, {square} of them square, '
-            f'{len(plan.openings)} openings, {len(plan.stairs)} stairs'
-        )
-        told = config.map_frame, up.source, content, warnings
-        return PlanOutcome(frames, len(best.frames), *told)
+        content = f'{len(plan.planes)} planes, {len(plan.walls)} upright, {square} of them square'
+        content += f', {len(plan.openings)} openings, {len(plan.stairs)} stairs'
+        located = len(best.frames)
+        return PlanOutcome(frames, located, config.map_frame, up.source, content, warnings)
 
     def _map(self, config: Config, progress: Progress | None) -> tuple[int, _Stretch, list[str]]:
         """Number of frames, the stretch with the largest map, and what is to be told."""
@@ -158,6 +159,7 @@ class PlanTask:
                     if not result.tilt:
                         now.stairs += [(stairs, len(now.frames)) for stairs in result.stairs]
                     now.frames.append(number)
+                    now.heights.append(config.sensor_height or located.last.height or np.nan)
                     now.seen.add(sequence.map.sighting)
                     turn = sequence.pose.rotation
                     now.looked += turn @ (config.up_x, config.up_y, config.up_z)
@@ -173,22 +175,16 @@ class PlanTask:
         self, frames: list[int], solution: Solution, config: Config
     ) -> Iterator[NDArray[np.float64]]:
         """Points of the frames of these numbers, at their poses and without the distortion."""
-        sensor, poses = (
-            SensorModel.from_config(config),
-            dict(zip(frames, solution.poses, strict=True)),
-        )
-        with self._open() as source:
-            try:
-                for done, frame in enumerate(source):
-                    pose = poses.get(done + source.lost.total())
-                    if pose:
-                        image = corrected(frame.range_image(), config)
-                        image = solution.corrected(image, config.distortion_length)
-                        points = points_within(image, sensor, self.resolution) - image.place
-                        yield pose.apply(points)
-            # What comes after the damage has no poses.
-            except DamagedBagError:
-                pass
+        sensor = SensorModel.from_config(config)
+        poses = dict(zip(frames, solution.poses, strict=True))
+        # What comes after damage has no poses.
+        with self._open() as source, suppress(DamagedBagError):
+            for done, frame in enumerate(source):
+                if pose := poses.get(done + source.lost.total()):
+                    image = corrected(frame.range_image(), config)
+                    image = solution.corrected(image, config.distortion_length)
+                    points = points_within(image, sensor, self.resolution) - image.place
+                    yield pose.apply(points)
 
     @contextmanager
     def _open(self) -> Iterator[DepthBag]:

@@ -56,7 +56,9 @@ def write_image(path: Path, image: NDArray) -> None:
     """Write (H, W) uint8, uint16 or float32, or (H, W, 3) R, G, B: PNG, or TIFF by its suffix."""
     if image.ndim == 3:
         image = cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, data = cv2.imencode(path.suffix, image)
+    # Some versions of OpenCV round three channels of floats for TIFF (LogLuv); LZW (5) does not.
+    lossless = [cv2.IMWRITE_TIFF_COMPRESSION, 5] if path.suffix.startswith('.tif') else []
+    _, data = cv2.imencode(path.suffix, image, lossless)
     with replacing(path) as partial:
         partial.write_bytes(data.tobytes())
 

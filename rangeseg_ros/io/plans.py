@@ -63,11 +63,7 @@ def plane_row(plane: Squared) -> dict[str, Any]:
 
 
 def write_dxf(path: Path, plan: FloorPlan) -> None:
-    """Write the plan for CAD: walls and openings as lines, outlines as polylines.
-
-    Layers WALLS (role wall), FACES (smaller upright planes), OPENINGS, FLOOR, LEVEL (other level
-    planes), PLANES (all parts of all planes in space), STAIRS and TEXT.
-    """
+    """Write the plan for CAD; PLANES has all parts of all planes in space."""
     import ezdxf
     from ezdxf import units
 

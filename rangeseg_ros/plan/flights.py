@@ -27,8 +27,8 @@ class Flight(NamedTuple):
     direction: str
 
     def __str__(self) -> str:
-        treads = len(self.edges) - 1
-        return f'stairs {self.direction}, {treads} x {self.rise:.2f} / {self.run:.2f} m'
+        size = f'{self.rise:.2f} / {self.run:.2f} m'
+        return f'stairs {self.direction}, {len(self.edges) - 1} x {size}'
 
 
 def flights(seen: Sequence[tuple[Stairs, Transform]]) -> list[Flight]:
@@ -46,9 +46,9 @@ def flights(seen: Sequence[tuple[Stairs, Transform]]) -> list[Flight]:
             ahead, ends = -ahead, ends[::-1]
         for group in groups:
             first, there, way = group[0]
-            near = abs(way @ (middle - there.mean(axis=0))) < first.run
-            beside = np.linalg.norm(middle - there.mean(axis=0)) < max(first.width, stairs.width)
-            if near and beside and first.direction == stairs.direction and way @ ahead > 0.5**0.5:
+            gap, same = middle - there.mean(axis=0), first.direction == stairs.direction
+            near = abs(way @ gap) < first.run and np.hypot(*gap) < max(first.width, stairs.width)
+            if near and same and way @ ahead > 0.5**0.5:
                 group.append((stairs, ends, ahead))
                 break
         else:

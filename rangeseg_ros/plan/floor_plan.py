@@ -167,13 +167,15 @@ def make_plan(
     up: Up,
     points: Iterable[NDArray[np.float64]],
     stairs: Sequence[tuple[Stairs, Transform]],
+    stood: NDArray[np.float64],
     config: Config,
     headroom: float,
     resolution: float,
 ) -> FloorPlan:
     """Turn the planes of a map, in a frame of that name, and points (N, 3) of frames into a plan.
 
-    `stairs` are those that frames show, with the poses of these.
+    `stairs` are those that frames show, with the poses of these, `stood` (F, 3) where the ground
+    was below the camera, NaN where nobody told.
     What is higher above the ground than the headroom, metres, is not in the way; `resolution`,
     metres, is the side of the cells of the grid. Of the parameters, `role_tolerance`, `role_area`,
     `role_height` and `obstacle_height` count.
@@ -183,7 +185,7 @@ def make_plan(
     turned = np.kron(np.eye(len(solution.planes)), moved_plane(*motion))
     covariance = turned @ solution.covariance @ turned.T
     squared = square_up(moved_planes(solution.planes, motion), covariance, tolerance)
-    roles, ground = _roles(squared, config)
+    roles, ground = _roles(squared, motion.apply(stood)[:, 2], config)
     squared = [plane.named(role=role) for plane, role in zip(squared, roles, strict=True)]
     # Ground that errs by less than a cell is ground.
     band = (max(config.obstacle_height, resolution), headroom)
@@ -216,11 +218,13 @@ def _upright(up: Up) -> Transform:
     return Transform(turn, np.zeros(3))
 
 
-def _roles(planes: Sequence[MapPlane], config: Config) -> tuple[list[str], float]:
+def _roles(
+    planes: Sequence[MapPlane], told: NDArray[np.float64], config: Config
+) -> tuple[list[str], float]:
     """Roles of planes in a frame whose z is up, and the height of the ground.
 
-    The ground is the lowest large plane that faces up; without one, the lowest point that was
-    seen.
+    The ground is the large plane that faces up and is nearest to its heights as told (F,), or else
+    the lowest; without one, the lowest point that was seen.
     """
     tolerance = np.radians(config.role_tolerance)
     tilt = np.array([plane.normal[2] for plane in planes])
@@ -228,7 +232,11 @@ def _roles(planes: Sequence[MapPlane], config: Config) -> tuple[list[str], float
     large = np.array([plane.area >= config.role_area for plane in planes], np.bool_)
     facing_up, facing_down = tilt > np.cos(tolerance), tilt < -np.cos(tolerance)
     lowest = [ring[:, 2].min() for plane in planes for ring in plane.outline.rings]
-    ground = float(min(height[facing_up & large].tolist() or lowest or [0.0]))
+    level, told = height[facing_up & large], told[np.isfinite(told)]
+    ground = float(min(level.tolist() or lowest or [0.0]))
+    off = np.abs(level - np.median(told)) if len(told) else np.full(len(level), np.inf)
+    if off.min(initial=np.inf) <= config.role_height:
+        ground = float(level[off.argmin()])
     top = height[facing_down & large].max(initial=-np.inf)
     found = np.full(len(planes), 'other', dtype='<U7')
     found[large & (np.abs(tilt) < np.sin(tolerance))] = 'wall'

@@ -20,13 +20,12 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.corrections import corrected
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.ros.diagnostics import FrameStatistics
-from rangeseg_ros.ros.latest_ready import LatestReady
+from rangeseg_ros.ros.handover import LatestReady, TicketLock
 from rangeseg_ros.ros.locator import Locator
 from rangeseg_ros.ros.memory import give_back_memory
 from rangeseg_ros.ros.pace import Pace
 from rangeseg_ros.ros.publication import Publication, Segmented
 from rangeseg_ros.ros.settings import Settings
-from rangeseg_ros.ros.ticket_lock import TicketLock
 
 _AT_ONCE = 2
 """Frames that are worked on at a time: one that comes before the last is done need not wait."""

@@ -9,7 +9,7 @@ from threading import Condition, Thread
 from rangeseg_ros.compilation.preparation import FIRST, needs, prepare
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.ros.latest_ready import LatestReady
+from rangeseg_ros.ros.handover import LatestReady
 from rangeseg_ros.ros.parameters import NodeConfig
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.calibration.field import residuals, robust_weights, solve
 from rangeseg_ros.core.calibration.sightings import Sightings, cell_grid, cell_size
 from rangeseg_ros.core.sensing.camera import Camera
-from rangeseg_ros.core.sensing.distortion import DistortionMap
+from rangeseg_ros.core.sensing.distortion import DistortionMap, in_pixels
 
 BLOCKS = 5
 """Parts of the recording that are left out in turn."""
@@ -119,12 +119,12 @@ def calibrate(
     pixels = np.kron(known, np.ones((size, size), np.bool_))[: shape[0], : shape[1]]
     slope = None
     if len(field) > 1:
-        sloping = pixels * _smooth_in_pixels(field[1].reshape(grid) / spread, shape)
+        sloping = pixels * in_pixels(field[1].reshape(grid) / spread, size, shape)
         # One slope everywhere scales all planes, and leaves them planes.
         slope = (sloping - pixels * sloping[pixels].mean()).astype(np.float32)
     distortion = DistortionMap(
-        without_plane(_smooth_in_pixels(flat, shape), pixels).astype(np.float32),
-        (pixels * _smooth_in_pixels(deviation, shape)).astype(np.float32),
+        without_plane(in_pixels(flat, size, shape), pixels).astype(np.float32),
+        (pixels * in_pixels(deviation, size, shape)).astype(np.float32),
         slope,
         camera,
         0.0 if slope is None else reference,
@@ -223,10 +223,3 @@ def without_plane(field: NDArray[np.float64], known: NDArray[np.bool_]) -> NDArr
     result = np.zeros_like(field)
     result[v, u] = field[v, u] - terms @ plane
     return result
-
-
-def _smooth_in_pixels(cells: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Values of cells, linear between their middles."""
-    rows, columns = (n * cell_size(shape) for n in cells.shape)
-    whole = cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(whole, np.float64)[: shape[0], : shape[1]]

@@ -34,7 +34,7 @@ from rangeseg_ros.core.mapping.observations import (
     PlaneSet,
     PoseNoise,
     cell_rays,
-    in_pixels,
+    field_in_pixels,
 )
 from rangeseg_ros.core.mapping.plane_filter import Jump
 from rangeseg_ros.core.mapping.plane_map import Sighting
@@ -78,7 +78,7 @@ class Solution(NamedTuple):
         """
         if image.camera is None or len(cell_rays(image, stated)) != len(self.field):
             return image
-        error = in_pixels(self.field, image.shape, stated)
+        error = field_in_pixels(self.field, image.shape, stated)
         return DistortionMap(error.astype(np.float32)).corrected(image)
 
     def drift_text(self) -> str:
@@ -185,9 +185,8 @@ class Adjustment:
         self, told: _State, sightings: _Sightings, drifts: bool
     ) -> tuple[_State, NDArray[np.float64], NDArray[np.float64]]:
         """The most probable state and all else, and the covariance of all planes and the drift."""
-        state = told
         # What lasts, what jumps were taken for wrongly, and the drift.
-        rest = np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
+        state, rest = told, np.zeros(sightings.lasting.shape[1] + 6 * len(self._jumps) + 3)
         first, last = 3 * len(told.planes.normal), 3 * len(told.planes.normal) + 6 * len(told.turn)
         prior = self._prior(first, sightings.precision, drifts)
         for _ in range(_ROUNDS):

@@ -12,11 +12,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.distortion import in_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import length_of_distortion
 from rangeseg_ros.core.tracking.plane_errors import (
@@ -220,13 +220,10 @@ def cell_rays(image: RangeImage, stated: float) -> NDArray[np.float64]:
     return np.stack(sums, axis=1) / np.bincount(cell.ravel())[:, None]
 
 
-def in_pixels(
+def field_in_pixels(
     field: NDArray[np.float64], shape: tuple[int, int], stated: float
 ) -> NDArray[np.float64]:
-    """Values of cells (C,) in the pixels of an image (H, W), linear between their middles."""
+    """A field over cells (C,) in the pixels of an image (H, W)."""
     step, cell = _cells(shape, stated)
-    columns = int(cell[0, -1]) + 1
     side = step * int(np.count_nonzero(cell[0] == 0))
-    across = [(np.arange(size) + 0.5) / side - 0.5 for size in shape]
-    places = np.meshgrid(*across, indexing='ij')
-    return map_coordinates(field.reshape(-1, columns), places, order=1, mode='nearest')
+    return in_pixels(field.reshape(-1, int(cell[0, -1]) + 1), side, shape)

@@ -174,9 +174,20 @@ class PlaneMap:
             return None
         same = self._filters.where([known[planes[m].id] for m in both])
         jump = find_jump(same, seen.where(both), camera, noise)
-        if jump:
-            self.jumps.append((self._stamp, jump))
-            self._filters = self._filters.moved(jump.motion, jump.camera, jump.covariance)
+        if not jump:
+            return None
+        after = self._filters.moved(jump.motion, jump.camera, np.zeros((6, 6)))
+        pixels, scores = np.array([plane.count for plane in planes]), []
+        for filters in (self._filters, after):
+            _, which, value = filters.alike(seen.planes, seen.spread, camera)
+            likely = np.zeros(len(planes))
+            np.maximum.at(likely, which, np.exp(-value / 2))
+            scores.append(likely @ pixels)
+        # Treads look alike: one that was taken for the next one is no jump by a step.
+        if scores[1] <= scores[0]:
+            return None
+        self.jumps.append((self._stamp, jump))
+        self._filters = self._filters.moved(jump.motion, jump.camera, jump.covariance)
         return jump
 
     def _associate(

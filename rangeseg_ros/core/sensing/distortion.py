@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,3 +63,12 @@ class DistortionMap:
                 raise DistortionError(
                     f'the distortion map is of another camera: {name} {expected:g}, not {found:g}'
                 )
+
+
+def in_pixels(
+    cells: NDArray[np.float64], side: int, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Values of square cells in the pixels (H, W), linear between the middles of the cells."""
+    rows, columns = (n * side for n in cells.shape)
+    whole = cv2.resize(cells, (columns, rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(whole, np.float64)[: shape[0], : shape[1]]

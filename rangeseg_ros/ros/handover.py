@@ -1,9 +1,10 @@
-"""A buffer of items that wait for what they need, such as transforms."""
+"""Between threads: items that wait for what they need, such as transforms; turns in order."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from threading import Condition
 from typing import Generic, TypeVar
 
@@ -65,3 +66,29 @@ class LatestReady(Generic[Item]):
     def _left(self, k: int) -> float:
         item, came = self._items[k]
         return self._delay(item, time.monotonic() - came)
+
+
+class TicketLock:
+    """Lock whose order is fixed before threads are ready to take it."""
+
+    def __init__(self) -> None:
+        self._changed = Condition()
+        self._next = self._serving = 0
+
+    def take_ticket(self) -> int:
+        """Number of a turn after those of all earlier tickets."""
+        with self._changed:
+            self._next += 1
+            return self._next - 1
+
+    @contextmanager
+    def turn(self, ticket: int) -> Iterator[None]:
+        """Wait for the turn of a ticket; it ends with the block, also by an exception."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._serving == ticket)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._serving += 1
+                self._changed.notify_all()
