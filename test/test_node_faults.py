@@ -149,7 +149,7 @@ def test_sizes_from_small_to_12_megapixels_whose_memory_comes_back(bench):
         segment(*size)
     before = resident()
     segment(4096, 3072)
-    for _ in range(20):
+    for _ in range(100):
         segment(320, 240)
         bench.spin(0.1)  # it is given back after the frame was published
         if resident() < before + 100:

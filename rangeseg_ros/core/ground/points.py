@@ -21,10 +21,11 @@ def points_of_class(image: RangeImage, terrain: Terrain, kind: int) -> NDArray[n
 
     In the frame of the image (H, W), in the order of the pixels; `kind` is `GROUND`, say.
     """
-    where = terrain.classes == kind
-    points = np.empty((np.count_nonzero(where), 4), np.float32)
-    points[:, :3] = image.rays[where] / image.inverse[where][:, None] + image.place
-    points[:, 3] = terrain.height[where]
+    where = np.flatnonzero(terrain.classes == kind)
+    points = np.empty((len(where), 4), np.float32)
+    rays, inverse = image.rays.reshape(-1, 3).take(where, axis=0), image.inverse.take(where)
+    points[:, :3] = rays / inverse[:, None] + image.place
+    points[:, 3] = terrain.height.take(where)
     return points
 
 
@@ -33,19 +34,20 @@ def thinned(
 ) -> NDArray[np.float32]:
     """One of the points (N, K), that begin with x, y, z, of each cube that has any.
 
-    Cubes have sides of `resolution` metres, 0 for all points, and are larger where more than
-    `most` points would be left.
+    Cubes have sides of `resolution` metres, 0 for all points, and ones twice, four times, ... as
+    long where more than `most` points would be left.
     """
-    while resolution > 0 and len(points):
-        cubes = np.floor(points[:, :3] / resolution).astype(np.int64)
-        cubes -= cubes.min(axis=0)
-        across, _, high = cubes.max(axis=0) + 1
-        key = (cubes[:, 1] * across + cubes[:, 0]) * high + cubes[:, 2]
-        kept = np.sort(np.unique(key, return_index=True)[1])
+    if resolution <= 0 or not len(points):
+        return points
+    kept, cubes = np.arange(len(points)), np.floor(points[:, :3].T / resolution).astype(np.int64)
+    while True:
+        x, y, z = cubes - cubes.min(axis=1, keepdims=True)
+        key = (y * (x.max() + 1) + x) * (z.max() + 1) + z
+        first = np.sort(np.unique(key, return_index=True)[1])
+        kept, cubes = kept[first], cubes[:, first]
         if len(kept) <= most:
             return points[kept]
-        resolution *= 2**0.5
-    return points
+        cubes >>= 1  # twice as large
 
 
 def drops(image: RangeImage, terrain: Terrain) -> NDArray[np.float32]:
