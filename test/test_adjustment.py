@@ -8,9 +8,18 @@ from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment
-from rangeseg_ros.core.mapping.observations import LASTING, PlaneSet, PoseNoise, observations
+from rangeseg_ros.core.mapping.observations import (
+    LASTING,
+    PlaneSet,
+    PoseNoise,
+    cell_rays,
+    observations,
+    views,
+)
 from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sensing.camera import Camera
+from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.tracking.plane_errors import from_errors, tangents, to_errors
 
 FACES = np.array(
@@ -207,3 +216,19 @@ def test_the_distortion_of_the_sensor_is_told_from_the_planes():
         found.append(solution.field)
     np.testing.assert_allclose(found[0], field, atol=0.002)
     assert np.abs(off[0]).mean() < 0.5 * np.abs(off[1]).mean()
+
+
+def test_images_are_corrected_by_the_field_of_their_cells():
+    camera = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+    image = RangeImage.from_depth(np.full((120, 160), 2.0, np.float32), camera)
+    field = 0.001 * np.arange(12.0)
+    solution = solved(0, frames=2)[0]._replace(field=field)
+    # Cells of 40 pixels, three rows of four; the middle of each is between two pixels.
+    middle = solution.corrected(image, 20.0).inverse[19::40, 19::40]
+    np.testing.assert_allclose(middle.ravel(), 0.5 - field, atol=1e-4)
+    rays = cell_rays(image, 20.0).reshape(3, 4, 3)
+    np.testing.assert_allclose(rays[1, 2], camera.rays[40:80, 80:120].mean(axis=(0, 1)), atol=0.01)
+    labels = np.zeros((120, 160), np.uint16)
+    labels[40:80, 80:120] = 1
+    assert views(labels, [SimpleNamespace(label=1)], 20.0)[0].tolist() == np.eye(12)[6].tolist()
+    assert solution.corrected(image, 40.0) is image
