@@ -16,6 +16,7 @@ from rangeseg_ros.core.mapping.observations import (
     observations,
     views,
 )
+from rangeseg_ros.core.mapping.plane_filter import Jump
 from rangeseg_ros.core.mapping.plane_map import Sighting
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.camera import Camera
@@ -232,3 +233,33 @@ def test_images_are_corrected_by_the_field_of_their_cells():
     labels[40:80, 80:120] = 1
     assert views(labels, [SimpleNamespace(label=1)], 20.0)[0].tolist() == np.eye(12)[6].tolist()
     assert solution.corrected(image, 40.0) is image
+
+
+def test_what_a_jump_was_taken_for_wrongly_is_taken_off():
+    """Poses before it are off as one body: a turn about where the camera was, and a shift."""
+    camera = np.array([1.0, 0.5, 1.2])
+    wrong = np.array([0.0, 0.02, 0.03, 0.05, -0.04, 0.03])
+    spread = np.diag(np.repeat([0.03, 0.05], 3) ** 2)
+    off = []
+    for told_spread in (spread, 1e-6 * spread):
+        random, adjustment, truths = np.random.default_rng(2), Adjustment(NOISE), []
+        turn = Rotation.from_rotvec(wrong[:3]).as_matrix()
+        moved = Transform(turn, camera + wrong[3:] - turn @ camera)
+        for k in range(24):
+            body = Rotation.from_rotvec(0.3 * np.sin([k / 7, k / 9, k / 5])).as_matrix()
+            truth = Transform(body, np.array([-2 + k / 6, 0.3 * np.sin(k / 5), 1.2]))
+            told = truth.by(random.normal(0, NOISE.deviations))
+            # Most frames before it show floor and ceiling only.
+            shown = 6 if k in (0, 9, 17) or k >= 18 else 2
+            planes = [seen(random, f, truth, np.zeros(3)) for f in FACES[:shown]]
+            ids, begins = np.arange(shown) + 1, np.full(shown, True)
+            jump = Jump(Transform.identity(), camera, wrong, told_spread) if k == 18 else None
+            told = moved.after(told) if k < 18 else told
+            seen_now = sighting(told, planes, ids, begins)
+            adjustment.add(seen_now._replace(jump=jump))
+            truths.append(truth)
+        start = [map_plane(k + 1, f[:3], -f[:3] * f[3], 0.01) for k, f in enumerate(FACES)]
+        solution = adjustment.solve(start, {})
+        off.append([a.shift - b.shift for a, b in zip(solution.poses, truths, strict=True)][:18])
+    known, unknown = np.sqrt(np.mean(np.square(off), axis=(1, 2)))
+    assert known < 0.01 < unknown / 5
