@@ -43,28 +43,23 @@ class PlaneGrid:
 
     `odds` (V, U) float32 are 0 where nothing is known, rows along the second axis; `first` (2,)
     are the numbers of the first cell along both axes. From `most` cells on, they become twice as
-    large.
+    large. `area`, square metres, is where the plane is, `sure_area` where it surely is, `circle`
+    the middle (2,) and the radius of one around all cells, metres.
     """
 
     def __init__(self, side: float, most: float = _CELLS) -> None:
         self.side, self._most = side, most
         self.odds = np.zeros((0, 0), np.float32)
         self.first = np.zeros(2, np.intp)
+        self._measure()
 
-    @property
-    def area(self) -> float:
-        """Square metres of cells where the plane is."""
-        return float(np.count_nonzero(self.odds > 0)) * self.side**2
-
-    @property
-    def sure_area(self) -> float:
-        """Square metres of cells where it surely is: seen three times, or as much oftener."""
-        return float(np.count_nonzero(self.odds >= SURE)) * self.side**2
-
-    def circle(self) -> tuple[NDArray[np.float64], float]:
-        """Middle (2,) and radius of a circle around all cells, metres."""
-        size = np.array(self.odds.shape[::-1]) * self.side
-        return self.first * self.side + size / 2, float(np.hypot(*size)) / 2
+    def _measure(self) -> None:
+        """Work out what follows from the cells, as most planes of a map do not change."""
+        cell, size = self.side**2, np.array(self.odds.shape[::-1]) * self.side
+        self.area = float(np.count_nonzero(self.odds > 0)) * cell
+        # Seen three times, or as much oftener.
+        self.sure_area = float(np.count_nonzero(self.odds >= SURE)) * cell
+        self.circle = self.first * self.side + size / 2, float(np.hypot(*size)) / 2
 
     def centres(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """Centres (K, 2) of the cells where the plane is, or of those chosen (V, U)."""
@@ -101,12 +96,15 @@ class PlaneGrid:
 
     def add(self, cells: NDArray[np.bool_], change: float) -> None:
         """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
-        self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
+        if cells.any():
+            self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
+            self._measure()
 
     def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
         self.reach(centres)
         np.maximum.at(self.odds, self.cells(centres), odds)
+        self._measure()
 
     def polygons(self) -> list[Polygon]:
         """Outlines of the parts, largest first, counter-clockwise, holes clockwise."""
@@ -143,6 +141,7 @@ class PlaneGrid:
             return self.reach(points)
         self.odds = np.pad(self.odds, list(zip(before[::-1], after[::-1], strict=True)))
         self.first = self.first - before
+        self._measure()
 
     def _coarsen(self) -> None:
         """Cells twice as large, each as sure as its surest quarter."""
@@ -152,6 +151,7 @@ class PlaneGrid:
         height, width = odds.shape
         self.odds = odds.reshape(height // 2, 2, width // 2, 2).max(axis=(1, 3))
         self.first, self.side = self.first // 2, 2 * self.side
+        self._measure()
 
 
 def may_be_in_sight(

@@ -236,7 +236,7 @@ class PlaneMap:
         # Of a cloud, nobody knows which pixel looks where.
         if not camera or not records:
             return
-        circles = [record.grid.circle() for record in records]
+        circles = [record.grid.circle for record in records]
         middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
         near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
         # In turns, every second frame: what is gone is seldom, and to look for it takes long.
@@ -274,7 +274,7 @@ class PlaneMap:
             (k, a), (m, b) = sorted(((k, a), (m, b)), key=lambda pair: -pair[1].observations)
             own = filters.planes.where([m]).points(b.grid.centres())
             centres = filters.planes.where([k]).coordinates(own)
-            if not len(own) or a.grid.distance(centres.mean(axis=0)) > 2 * b.grid.circle()[1]:
+            if not len(own) or a.grid.distance(centres.mean(axis=0)) > 2 * b.grid.circle[1]:
                 continue
             a.grid.absorb(centres, b.grid.odds[b.grid.odds > 0])
             first, second = sorted((a.id, b.id))
