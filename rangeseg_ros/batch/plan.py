@@ -51,7 +51,7 @@ class PlanOutcome:
 class _Stretch:
     """What was seen while the map was one: it begins anew where the fixed frame jumps.
 
-    `frames` are the numbers of its frames, `heights` of the camera in them, metres, NaN where not
+    `frames` are the numbers of its frames, `heights` of the sensor in them, metres, NaN where not
     known; `stairs` that they show, with their places among the frames; `looked` and `told` sums
     of the directions of up in the images, by the parameters and by the sensors.
     """
@@ -136,8 +136,8 @@ class PlanTask:
         square = sum(plane.exact == 'square' for plane in plan.planes)
         content = f'{len(plan.planes)} planes, {len(plan.walls)} upright, {square} of them square'
         content += f', {len(plan.openings)} openings, {len(plan.stairs)} stairs'
-        located = len(best.frames)
-        return PlanOutcome(frames, located, config.map_frame, up.source, content, warnings)
+        told = config.map_frame, up.source, content, warnings
+        return PlanOutcome(frames, len(best.frames), *told)
 
     def _map(self, config: Config, progress: Progress | None) -> tuple[int, _Stretch, list[str]]:
         """Number of frames, the stretch with the largest map, and what is to be told."""
@@ -149,17 +149,18 @@ class PlanTask:
 
         stretches, frames, warnings = [begin()], 0, []
         with self._open() as source, Locator(self.recording, config) as located:
-            for number, *_, result in segment_frames(source, sequence, located.place, progress):
+            for k, _, image, found in segment_frames(source, sequence, located.place, progress):
                 frames += 1
                 if stretches[-1].map is not sequence.map:
-                    warnings.append(f'frame {number}: {sequence.map.begun_anew}')
+                    warnings.append(f'frame {k}: {sequence.map.begun_anew}')
                     stretches.append(begin())
                 now = stretches[-1]
                 if sequence.map.sighting and sequence.pose:
-                    if not result.tilt:
-                        now.stairs += [(stairs, len(now.frames)) for stairs in result.stairs]
-                    now.frames.append(number)
-                    now.heights.append(config.sensor_height or located.last.height or np.nan)
+                    # As the poses, from where the sensor is.
+                    for s in [] if found.tilt else found.stairs:
+                        now.stairs.append((replace(s, edge=s.edge - image.place), len(now.frames)))
+                    now.frames.append(k)
+                    now.heights.append(getattr(found.survey, 'sensor_height', 0) or np.nan)
                     now.seen.add(sequence.map.sighting)
                     turn = sequence.pose.rotation
                     now.looked += turn @ (config.up_x, config.up_y, config.up_z)

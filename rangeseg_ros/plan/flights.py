@@ -27,8 +27,9 @@ class Flight(NamedTuple):
     direction: str
 
     def __str__(self) -> str:
-        size = f'{self.rise:.2f} / {self.run:.2f} m'
-        return f'stairs {self.direction}, {len(self.edges) - 1} x {size}'
+        return (
+            f'stairs {self.direction}, {len(self.edges) - 1} x {self.rise:.2f} / {self.run:.2f} m'
+        )
 
 
 def flights(seen: Sequence[tuple[Stairs, Transform]]) -> list[Flight]:

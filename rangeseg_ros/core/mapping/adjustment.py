@@ -72,9 +72,9 @@ class Solution(NamedTuple):
     field: NDArray[np.float64]
 
     def corrected(self, image: RangeImage, stated: float) -> RangeImage:
-        """An image of a camera without the field; `stated` is the parameter `distortion_length`.
+        """An image of a camera, of the same cells, without the field; any other one as it is.
 
-        Itself where the field is that of images of other cells.
+        `stated` is the parameter `distortion_length`.
         """
         if image.camera is None or len(cell_rays(image, stated)) != len(self.field):
             return image
