@@ -220,10 +220,8 @@ def cell_rays(image: RangeImage, stated: float) -> NDArray[np.float64]:
     return np.stack(sums, axis=1) / np.bincount(cell.ravel())[:, None]
 
 
-def field_in_pixels(
-    field: NDArray[np.float64], shape: tuple[int, int], stated: float
-) -> NDArray[np.float64]:
-    """A field over cells (C,) in the pixels of an image (H, W)."""
+def field_in_pixels(field: NDArray[np.float64], shape: tuple[int, int], stated: float) -> NDArray:
+    """A field over cells (C,) in the pixels of an image (H, W); `stated` as for `views`."""
     step, cell = _cells(shape, stated)
     side = step * int(np.count_nonzero(cell[0] == 0))
     return in_pixels(field.reshape(-1, int(cell[0, -1]) + 1), side, shape)
