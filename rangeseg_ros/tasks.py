@@ -126,7 +126,6 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
         yield pool
     finally:
         alive = [child for child in multiprocessing.active_children() if child not in others]
-        pool.shutdown(wait=False, cancel_futures=True)
         end = time.monotonic() + _PATIENCE
         while alive and time.monotonic() < end:
             for process in alive:
@@ -135,6 +134,8 @@ def _workers(count: int) -> Iterator[ProcessPoolExecutor]:
             alive = [process for process in alive if process.is_alive()]
         for process in alive:
             process.kill()
+        # Only now: of a broken pool it waits for workers, which are told to end only once.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _begin() -> None:

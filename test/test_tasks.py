@@ -57,6 +57,8 @@ class LosesSignals:
     folder: Path
 
     def run(self):
+        if (self.folder / 'put away').exists():
+            return
         (self.folder / 'begun').touch()
         with suppress(SystemExit):
             time.sleep(600)
@@ -80,10 +82,22 @@ class RaisesOnceBegun:
         raise KeyError('fault')
 
 
+class DiesOnceBegun(RaisesOnceBegun):
+    def run(self):
+        wait_for((self.folder / 'begun').exists)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
 def test_a_worker_that_loses_a_signal_is_told_again_but_not_while_it_puts_away(tmp_path):
     with pytest.raises(KeyError, match='fault'):
         list(attempt_all([LosesSignals(tmp_path), RaisesOnceBegun(tmp_path)], 2))
     assert (tmp_path / 'put away').exists()
+
+
+def test_a_worker_that_loses_a_signal_ends_where_another_dies(tmp_path):
+    # A result first: the pool waits for a worker just started only from its next result on.
+    tasks = [LosesSignals(tmp_path), Square(2), DiesOnceBegun(tmp_path)]
+    assert [type(result) for result in attempt_all(tasks, 2)] == [type(None), int, Failure]
 
 
 def test_results_come_in_order_whatever_workers_die(tmp_path):
