@@ -152,7 +152,6 @@ MECHANISMS = (
               {'segmenter.with_sharp_borders': lambda _: lambda regions, surfaces, models, image,
                side, *rest: regions.repeat(side, 0).repeat(side, 1)[
                    : image.shape[0], : image.shape[1]] * image.valid}),
-    Mechanism('thin regions are noise', 'regions.py:_thin', {'noise_regions': 'leave'}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),

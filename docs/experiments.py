@@ -2,9 +2,8 @@
 
 python docs/experiments.py EXPERIMENT DIR --output FOLDER [--params FILE] [--images N] [--jobs N]
 
-directions      sets of directions, without post-processing (figure 6.2)
-lambda          lambda with and without post-processing, T = 0.8 (figure 6.3)
-postprocessing  the same against the tolerance (figure 6.4)
+directions      sets of directions (figure 6.2)
+lambda          lambda, T = 0.8 (figure 6.3)
 weights         neighbourhood weights of section 5.5 (figure 5.5)
 comparison      ours on the test images, beside published results (figure 6.5, table B.1)
 
@@ -31,13 +30,12 @@ from rangeseg_ros.io.params import read_config
 from rangeseg_ros.tasks import run_all
 
 PARAMS = Path(__file__).parents[1] / 'params'
-EXPERIMENTS = ('directions', 'lambda', 'postprocessing', 'weights', 'comparison')
+EXPERIMENTS = ('directions', 'lambda', 'weights', 'comparison')
 DIRECTIONS = {
     f'{count} {kind}': {'directions': kind, 'direction_count': count}
     for kind, counts in (('platonic', (17, 73, 305, 1249)), ('regular', (25, 225, 1225)))
     for count in counts
 }
-POSTPROCESSING = {'none': {'noise_regions': 'leave'}, 'identified': {'noise_regions': 'identify'}}
 WEIGHTS = {'4-connectivity': {'jump_edges': 'none'}, 'jump edge disconnection': {}}
 LAMBDAS = tuple(float(value) for value in range(20, 151, 10))
 # Without post-processing the best lambda lies far higher (thesis 6.5).
@@ -101,9 +99,9 @@ def rows_of(name, base, training, test, run):
     if name == 'comparison':
         return comparison(base, training, test, run) + published(test[0].sensor)
     if name == 'directions':
-        sets = variations(replace(base, noise_regions='leave'), DIRECTIONS)
+        sets = variations(base, DIRECTIONS)
         return by_tolerance(train(run, sets, HIGH_LAMBDAS, training or test))
-    changes = WEIGHTS if name == 'weights' else POSTPROCESSING
+    changes = WEIGHTS if name == 'weights' else {'as published': {}}
     found = train(run, variations(base, changes), LAMBDAS, training or test)
     return by_lambda(found) if name == 'lambda' else by_tolerance(found)
 
@@ -170,10 +168,7 @@ def by_tolerance(results):
 
 def comparison(base, training, test, run):
     """Method `normals` with lambda trained, and method `planes`, on the test images."""
-    normals = {
-        'normals as published, identified': base,
-        'normals, defaults': Config(method='normals'),
-    }
+    normals = {'normals as published': base, 'normals, defaults': Config(method='normals')}
     tested = run({'planes, defaults': Config()}, test)
     results = train(run, normals, LAMBDAS, training or test)
     best = {name: best_lambda(found) for name, found in results.items()}

@@ -312,7 +312,7 @@ def experiments(monkeypatch):
     return importlib.import_module('experiments')
 
 
-@pytest.mark.parametrize(('name', 'count'), [('lambda', 2 * 3), ('comparison', 3 * 6 + 9)])
+@pytest.mark.parametrize(('name', 'count'), [('lambda', 3), ('comparison', 3 * 6 + 9)])
 def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
     monkeypatch.setattr(experiments, 'LAMBDAS', (20.0, 85.0, 150.0))
     folder = segcomp_set(tmp_path / 'abw')
@@ -327,11 +327,7 @@ def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
 
 @pytest.mark.parametrize(
     ('sensor', 'changes'),
-    [
-        ('perceptron', {}),
-        ('abw', {'dithering': 0.001}),
-        ('kinect', {'smoothness': 100.0, 'noise_regions': 'leave'}),
-    ],
+    [('perceptron', {}), ('abw', {'dithering': 0.001}), ('kinect', {'smoothness': 100.0})],
 )
 def test_parameter_files_hold_the_published_settings(sensor, changes):
     path = ROOT / 'params' / f'thesis_{sensor}.yaml'

@@ -24,9 +24,7 @@ from rangeseg_ros.simulation.sensors.kinect import kinect_camera
 
 NORMALS = Config(method='normals')
 # Without noise neither a wide baseline nor much smoothing is called for.
-NOISE_FREE = replace(
-    NORMALS, normal_baseline=1, smoothness=20.0, noise_regions='leave', edge_step=0.0065
-)
+NOISE_FREE = replace(NORMALS, normal_baseline=1, smoothness=20.0, edge_step=0.0065)
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
@@ -90,7 +88,6 @@ def test_every_face_of_a_noise_free_room_is_found(seed):
         {'jump_edges': 'sobel'},
         {'jump_edges': 'none'},
         {'exact': True, 'direction_count': 73},
-        {'noise_regions': 'leave'},
         {'dithering': 0.001},
     ],
     ids=lambda options: ' '.join(f'{name}={value}' for name, value in options.items()),

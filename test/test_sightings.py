@@ -4,13 +4,14 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
     PlaneGrid,
-    may_be_in_sight,
+    in_sight,
     passed_through,
     seen_cells,
 )
@@ -31,20 +32,33 @@ def passed(points, image):
     return passed_through(points, distance, lambda k: np.full(len(k), 1e-4), image, SENSOR)
 
 
-def test_whatever_rays_tell_of_lies_in_spheres_that_may_be_in_sight():
+@pytest.mark.parametrize('camera', [CAMERA, BODY])
+def test_whatever_a_camera_looks_at_is_in_the_part_in_sight(camera):
     random = np.random.default_rng(1)
-    image = RangeImage.from_depth(np.full(CAMERA.shape, 8.0), CAMERA)
-    centres = random.normal(0, 2, (4000, 3))
-    radii = random.exponential(0.5, 4000)
-    within = random.normal(size=(4000, 3))
-    within *= (radii * random.random(4000) / np.linalg.norm(within, axis=1))[:, None]
-    found = passed(centres + within, image)
-    shown = may_be_in_sight(centres, radii, CAMERA)
-    assert np.count_nonzero(found) > 200
-    assert shown[found].all()
-    # What is behind the camera or far to its sides is not.
-    aside = np.array([[0, 0, -2.0], [9, 0, 2], [0, -9, 2]])
-    assert not may_be_in_sight(aside, np.ones(3), CAMERA).any()
+    image = RangeImage.from_depth(random.uniform(1, 3, camera.shape), camera)
+    normal = random.normal(size=(200, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    known = PlaneSet(normal, random.normal(0, 2, (200, 3)), tangents(normal))
+    grids = [PlaneGrid(0.1) for _ in normal]
+    for grid in grids:
+        grid.reach(np.array([[-1.5, -1.0], [1.5, 2.0]]))
+        grid.add(np.ones(grid.odds.shape, bool), HIT)
+    shown = in_sight(grids, known, image)
+    through = hidden = 0
+    for k, grid in enumerate(grids):
+        found = passed(known.where([k]).points(grid.centres()), image).reshape(grid.odds.shape)
+        through += np.count_nonzero(found)
+        if k not in shown:
+            assert not found.any()
+            continue
+        # What is taken in there is in the whole as well.
+        area = grid.area
+        shown[k].add(np.ones(shown[k].odds.shape, bool), -2 * HIT)
+        assert (grid.odds[found] < 0).all()
+        assert area - grid.area == pytest.approx(0.01 * np.count_nonzero(grid.odds < 0))
+        hidden += np.count_nonzero(grid.odds > 0)
+    assert 0 < len(shown) < 200 and through > 1000 and hidden > 1000
+    assert not in_sight(grids, known, RangeImage.from_depth(np.zeros(camera.shape), camera))
 
 
 def test_rays_pass_through_what_is_before_their_ends_in_any_frame_of_the_camera():

@@ -76,11 +76,6 @@ class Config:
         0.0,
         1.0,
     )
-    noise_regions: str = option(
-        'identify',
-        'method normals: regions of few pixels for their perimeter: leave, or mark as no plane',
-        choices=('leave', 'identify'),
-    )
     min_pixels: int = option(0, 'smallest plane, pixels; 0 = 300 in VGA', 0, 100000000)
     # Errors of the sensor, by default of a Kinect: noise of 0.45, distortion of half a step of
     # its disparity, of which the quantisation is new in every pixel.

@@ -7,11 +7,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
-
-# Pixels of an image of the ABW set, which the thesis's experiments are about.
-_IMAGE = 512 * 512
 
 
 def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
@@ -23,22 +19,15 @@ def least_pixels(min_pixels: int, shape: tuple[int, int]) -> int:
 
 
 def plane_regions(
-    labels: NDArray[np.integer],
-    valid: NDArray[np.bool_],
-    grid: Grid,
-    noise_regions: str,
-    min_pixels: int,
+    labels: NDArray[np.integer], valid: NDArray[np.bool_], grid: Grid, min_pixels: int
 ) -> NDArray[np.uint16]:
     """Segmentation (H, W) of a labelling: its components that are large enough for planes.
 
     1...M by falling size, 0 for no plane: pixels that are not valid, and regions of less than
-    `min_pixels`. What becomes of small and thin ones is told by `noise_regions`, see `Config`.
+    `min_pixels`.
     """
     components = connected_components(labels, grid, valid)
     area = np.bincount(components.ravel())
-    if noise_regions != 'leave':
-        upper, lower = map_halves(_perimeters, len(components), components, len(area))
-        area = np.where(_thin(area, upper + lower, labels.shape), 0, area)
     area[0] = 0
     return relabel(components, by_falling_size(np.where(area < min_pixels, 0, area)))
 
@@ -82,36 +71,6 @@ def connected_components(
         last += parent[k] == k
         number[k] = last if parent[k] == k else number[parent[k]]
     return number[found.ravel()].reshape(labels.shape)
-
-
-@njit(cache=True, nogil=True)
-def _perimeters(
-    first: int, after: int, regions: NDArray[np.int32], count: int
-) -> NDArray[np.int64]:
-    """Pixels (count,) of each region in some rows, at another one or the image's border."""
-    (height, width), perimeter = regions.shape, np.zeros(count, np.int64)
-    for i in range(first, after):
-        for j in range(width):
-            here = regions[i, j]
-            inner = 0 < i < height - 1 and 0 < j < width - 1
-            inner = inner and here == regions[i, j - 1] == regions[i, j + 1]
-            inner = inner and here == regions[i - 1, j] == regions[i + 1, j]
-            perimeter[here] += not inner
-    return perimeter
-
-
-def _thin(
-    area: NDArray[np.int64], perimeter: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Regions of fewer than two pixels per pixel of the perimeter (thesis eq. 6.3); never 0.
-
-    In images as large as the thesis's, or larger: a smaller one shows the same strip narrower. But
-    transitions between two surfaces are a pixel or two wide at any size, without inner pixels.
-    """
-    least = 2 * min(float(np.sqrt(shape[0] * shape[1] / _IMAGE)), 1.0)
-    noise = (area < least * perimeter) | (area == perimeter)
-    noise[0] = False
-    return noise
 
 
 @njit(cache=True, nogil=True)

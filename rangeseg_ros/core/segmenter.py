@@ -124,12 +124,11 @@ class Segmenter:
         curved: NDArray[np.uint16] | None = None
         if config.method == 'planes':
             labelling = by_planes.segment(view, config, watch.lap)
-            # Labels of planes are smooth: hardly any of their regions is thin.
-            valid, thin = labelling.labels > 0, 'leave'
+            valid = labelling.labels > 0
         else:
             labelling = by_normals.segment(view.whole, view.grid, config, watch.lap)
-            valid, thin = view.whole.valid, config.noise_regions
-        regions = plane_regions(labelling.labels, valid, view.grid, thin, view.least)
+            valid = view.whole.valid
+        regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
         regions = unite_regions(regions, view, config.plane_smoothness)
         if config.method == 'planes':

@@ -43,23 +43,30 @@ class PlaneGrid:
 
     `odds` (V, U) float32 are 0 where nothing is known, rows along the second axis; `first` (2,)
     are the numbers of the first cell along both axes. From `most` cells on, they become twice as
-    large. `area`, square metres, is where the plane is, `sure_area` where it surely is, `circle`
-    the middle (2,) and the radius of one around all cells, metres.
+    large. `area`, square metres, is where the plane is, `sure_area` where it surely is.
     """
 
     def __init__(self, side: float, most: float = _CELLS) -> None:
         self.side, self._most = side, most
         self.odds = np.zeros((0, 0), np.float32)
         self.first = np.zeros(2, np.intp)
+        self._whole: PlaneGrid | None = None
         self._measure()
 
     def _measure(self) -> None:
-        """Work out what follows from the cells, as most planes of a map do not change."""
-        cell, size = self.side**2, np.array(self.odds.shape[::-1]) * self.side
-        self.area = float(np.count_nonzero(self.odds > 0)) * cell
-        # Seen three times, or as much oftener.
-        self.sure_area = float(np.count_nonzero(self.odds >= SURE)) * cell
-        self.circle = self.first * self.side + size / 2, float(np.hypot(*size)) / 2
+        """Count cells where the plane is, as most planes of a map do not change."""
+        # Surely: seen three times, or as much oftener.
+        self._counts = np.array(
+            [np.count_nonzero(self.odds > 0), np.count_nonzero(self.odds >= SURE)]
+        )
+
+    @property
+    def area(self) -> float:
+        return float(self._counts[0]) * self.side**2
+
+    @property
+    def sure_area(self) -> float:
+        return float(self._counts[1]) * self.side**2
 
     def centres(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.float64]:
         """Centres (K, 2) of the cells where the plane is, or of those chosen (V, U)."""
@@ -97,8 +104,23 @@ class PlaneGrid:
     def add(self, cells: NDArray[np.bool_], change: float) -> None:
         """Take in a look, `HIT` or `MISS`, at cells (V, U)."""
         if cells.any():
+            before = self._counts
             self.odds[cells] = np.clip(self.odds[cells] + change, LEAST, _MOST)
             self._measure()
+            if self._whole:
+                self._whole._counts += self._counts - before
+
+    def part(self, least: NDArray[np.float64], most: NDArray[np.float64]) -> PlaneGrid:
+        """The cells of a rectangle, from its least to its greatest coordinates (2,), shared."""
+        size = self.odds.shape[::-1]
+        ends = np.floor(least / self.side), np.floor(most / self.side) + 1
+        start, end = (np.clip(cell - self.first, 0, size).astype(np.intp) for cell in ends)
+        part = PlaneGrid(self.side, self._most)
+        part.odds = self.odds[start[1] : end[1], start[0] : end[0]]
+        part.first, part._whole = self.first + start, self
+        if part.odds.size:
+            part._measure()
+        return part
 
     def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
         """Take in cells (K, 2) of another grid, with their odds (K,), on this plane."""
@@ -154,17 +176,28 @@ class PlaneGrid:
         self._measure()
 
 
-def may_be_in_sight(
-    centres: NDArray[np.float64], radii: NDArray[np.float64], camera: Camera
-) -> NDArray[np.bool_]:
-    """Whether spheres, centres (K, 3) and radii (K,) metres, reach into what a camera looks at."""
-    # A cone around the optical axis, through the farthest corner.
-    right = max(camera.cx + 0.5, camera.width - 0.5 - camera.cx) / camera.fx
-    down = max(camera.cy + 0.5, camera.height - 0.5 - camera.cy) / camera.fy
-    slope = float(np.hypot(right, down))
-    x, y, z = (centres @ camera.axes).T
-    outside: NDArray[np.float64] = np.hypot(x, y) - slope * z
-    return (outside <= radii * np.hypot(1, slope)) & (z >= -radii)
+def in_sight(
+    grids: Sequence[PlaneGrid], planes: PlaneSet, image: RangeImage
+) -> dict[int, PlaneGrid]:
+    """Numbers of planes, in the frame of the image, and the cells that a camera may look at.
+
+    They are around what the pyramid of its rays, up to the farthest range measured, has of planes.
+    """
+    camera = image.camera
+    assert camera is not None
+    nearest = cv2.minMaxLoc(image.inverse, (image.inverse > 0).view(np.uint8))[0]
+    if not nearest:
+        return {}
+    sides = [(u, v, 1.0) for u in (-0.5, camera.width - 0.5) for v in (-0.5, camera.height - 0.5)]
+    corners = np.zeros((5, 3))
+    corners[1:] = np.array(sides) @ np.linalg.inv(camera.matrix).T @ camera.axes.T / nearest
+    height = corners @ planes.normal.T + planes.distance
+    crossed = np.flatnonzero((height.min(axis=0) <= 0) & (height.max(axis=0) >= 0))
+    some = planes.where(crossed)
+    at = (corners - some.point[:, None]) @ np.swapaxes(some.axes, 1, 2)
+    ends = zip(crossed.tolist(), at.min(axis=1), at.max(axis=1), strict=True)
+    parts = {k: grids[k].part(least, most) for k, least, most in ends}
+    return {k: part for k, part in parts.items() if part.odds.size}
 
 
 def seen_cells(

@@ -24,7 +24,7 @@ from rangeseg_ros.core.mapping.plane_grid import (
     HIT,
     MISS,
     PlaneGrid,
-    may_be_in_sight,
+    in_sight,
     passed_through,
     seen_cells,
 )
@@ -218,36 +218,37 @@ class PlaneMap:
         noise: PoseNoise,
     ) -> None:
         """Take in the cells of planes of the map that a frame finds, and those it sees through."""
-        camera, records = image.camera, self._records
+        camera, grids = image.camera, [record.grid for record in self._records]
         seen = self._filters.moved(pose.inverse(), np.zeros(3), np.diag(noise.deviations**2))
-        found = {}
-        for k in np.unique(match).tolist():
-            own, grid = seen.planes.where([k]), records[k].grid
-            parts = [planes[m] for m in np.flatnonzero(match == k).tolist()]
-            # Through a lens, or in a cloud, no homography leads from cells to pixels.
-            if camera and not camera.distortion_model:
-                grid.reach(own.coordinates(np.concatenate([corners_of(part) for part in parts])))
-                each = [seen_cells(grid, own, part, labels, camera) for part in parts]
-                found[k] = np.any(each, axis=0)
+        parts: dict[int, list[Plane]] = {}
+        for plane, k in zip(planes, match.tolist(), strict=True):
+            parts.setdefault(k, []).append(plane)
+        for k, some in parts.items():
+            corners = np.concatenate([corners_of(part) for part in some])
+            grids[k].reach(seen.planes.where([k]).coordinates(corners))
+        # Through a lens, or in a cloud, no homography leads from cells to pixels.
+        pinhole = camera if camera and not camera.distortion_model else None
+        looked_at = in_sight(grids, seen.planes, image) if camera else {}
+        if not pinhole:
+            looked_at = {k: grids[k] for k in looked_at | parts}
+        others, centres, points = {}, [np.zeros((0, 2))], [np.zeros((0, 3))]
+        for k, grid in looked_at.items():
+            own, found = seen.planes.where([k]), np.zeros(grid.odds.shape, np.bool_)
+            if pinhole:
+                for part in parts.get(k, []):
+                    found |= seen_cells(grid, own, part, labels, pinhole)
             else:
-                borders = [[part.hull, *part.holes] for part in parts if len(part.hull) > 2]
-                found[k] = grid.fill([[own.coordinates(r) for r in rings] for rings in borders])
-            grid.add(found[k], HIT)
-        # Of a cloud, nobody knows which pixel looks where.
-        if not camera or not records:
+                borders = [[p.hull, *p.holes] for p in parts.get(k, []) if len(p.hull) > 2]
+                found = grid.fill([[own.coordinates(r) for r in rings] for rings in borders])
+            # In turns, every second frame: what is gone is seldom, and to look for it takes long.
+            if camera and (self._records[k].id + self._frames) % 2:
+                others[k] = (grid.odds > 0) & ~found
+                centres.append(grid.centres(others[k]))
+                points.append(own.points(centres[-1]))
+            grid.add(found, HIT)
+        if not camera:
             return
-        circles = [record.grid.circle for record in records]
-        middles, reaches = (np.array(part) for part in zip(*circles, strict=True))
-        near = may_be_in_sight(seen.planes.points(middles), reaches, camera)
-        # In turns, every second frame: what is gone is seldom, and to look for it takes long.
-        shown = [k for k in np.flatnonzero(near).tolist() if (records[k].id + self._frames) % 2]
-        others, centres, points = [], [np.zeros((0, 2))], [np.zeros((0, 3))]
-        for k in shown:
-            grid = records[k].grid
-            others.append((grid.odds > 0) & ~found.get(k, np.False_))
-            centres.append(grid.centres(others[-1]))
-            points.append(seen.planes.where([k]).points(centres[-1]))
-        owner = np.repeat(shown, [len(own) for own in centres[1:]]).astype(np.intp)
+        owner = np.repeat(list(others), [len(own) for own in centres[1:]]).astype(np.intp)
         at, sensor = np.concatenate(centres), SensorModel.from_config(self.config)
         passed = passed_through(
             np.concatenate(points),
@@ -256,9 +257,9 @@ class PlaneMap:
             image,
             sensor,
         )
-        for k, cells in zip(shown, others, strict=True):
+        for k, cells in others.items():
             cells[cells], passed = np.split(passed, [np.count_nonzero(cells)])
-            records[k].grid.add(cells, 2 * MISS)
+            looked_at[k].add(cells, 2 * MISS)
 
     def _merge(self, some: NDArray[np.intp], camera: NDArray[np.float64]) -> None:
         """Unite planes of the map that turn out to be one with `some` of this frame."""
@@ -274,7 +275,11 @@ class PlaneMap:
             (k, a), (m, b) = sorted(((k, a), (m, b)), key=lambda pair: -pair[1].observations)
             own = filters.planes.where([m]).points(b.grid.centres())
             centres = filters.planes.where([k]).coordinates(own)
-            if not len(own) or a.grid.distance(centres.mean(axis=0)) > 2 * b.grid.circle[1]:
+            if (
+                not len(own)
+                or a.grid.distance(centres.mean(axis=0))
+                > np.hypot(*b.grid.odds.shape) * b.grid.side
+            ):
                 continue
             a.grid.absorb(centres, b.grid.odds[b.grid.odds > 0])
             first, second = sorted((a.id, b.id))
