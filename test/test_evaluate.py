@@ -327,11 +327,15 @@ def test_tables_and_plots(experiments, tmp_path, monkeypatch, name, count):
 
 @pytest.mark.parametrize(
     ('sensor', 'changes'),
-    [('perceptron', {}), ('abw', {'dithering': 0.001}), ('kinect', {'smoothness': 100.0})],
+    [
+        ('perceptron', {}),
+        ('abw', {'dithering': 0.001}),
+        ('kinect', {'smoothness': 100.0, 'min_pixels': 2}),
+    ],
 )
 def test_parameter_files_hold_the_published_settings(sensor, changes):
     path = ROOT / 'params' / f'thesis_{sensor}.yaml'
-    thesis = {'method': 'normals', 'normal_baseline': 1, 'jump_edges': 'sobel', 'min_pixels': 2}
+    thesis = {'method': 'normals', 'normal_baseline': 1, 'jump_edges': 'sobel', 'min_pixels': 100}
     assert read_config(path) == Config(**{**thesis, 'smoothness': 55.0, **changes})
     # Whatever the defaults become.
     assert {*thesis, 'smoothness'} <= set(read_params(path))
