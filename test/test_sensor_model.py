@@ -118,7 +118,7 @@ def test_a_few_blocks_tell_no_kind_of_error(count, told):
         blocks = Blocks(none, squared, none, none)
         strata = Strata.of(blocks, np.arange(count))
         shown = strata.medians(1e-6 * squared**2 * draw.uniform(0.5, 2, count))
-        law = fit_law(strata, shown, np.zeros(len(shown)), in_range=True)
+        law = fit_law(strata, shown, np.zeros(len(shown)))
         assert (law.quartic > 0) == told and (law.constant > 0) != told
 
 

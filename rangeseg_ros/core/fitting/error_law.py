@@ -82,13 +82,11 @@ def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     return np.partition(values, rank)[..., rank].copy()
 
 
-def fit_law(
-    strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64], in_range: bool
-) -> Law:
+def fit_law(strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64]) -> Law:
     """The law that with what is `known` explains the variances (S,) that strata show.
 
-    Constant in disparity or, if that explains them better and `in_range`, in range: of both
-    together a few blocks tell nothing. First of surfaces that face the sensor: noise makes slopes
+    Constant in disparity or, if that explains them better, in range: of both together a few
+    blocks tell nothing. First of surfaces that face the sensor: noise makes slopes
     of its own, which would explain it. Then slopes explain what is left where that is no chance.
     """
     facing = np.arange(0, len(shown), strata.slopes)
@@ -97,7 +95,7 @@ def fit_law(
     factor, deviance = _scale_term(np.ones(len(facing)), ahead, before)
     law = Law(factor, 0.0)
     # One stratum is explained by either, and rounding would decide.
-    if in_range and len(facing) > 1:
+    if len(facing) > 1:
         factor, other = _scale_term(quartic, ahead, before)
         law = Law(0.0, factor) if other < deviance else law
     known = known + law.facing(strata.squared)

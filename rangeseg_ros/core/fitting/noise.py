@@ -16,8 +16,13 @@ from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, quantile
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, sum_of_four
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
-from rangeseg_ros.core.sensing.sensor import FLOOR, SensorModel, correlated_residuals
-from rangeseg_ros.core.significance import CLEARLY, SAMPLES, chi2_quantile
+from rangeseg_ros.core.sensing.sensor import (
+    FLOOR,
+    SensorModel,
+    correlated_residuals,
+    systematic_variance,
+)
+from rangeseg_ros.core.significance import CLEARLY, OUTLIER, SAMPLES, chi2_quantile
 
 ROUGH = chi2_quantile(13) / 13
 """Chi-squared of 13 degrees of freedom over its mean: what is rougher is no part of a plane."""
@@ -75,8 +80,8 @@ def measured_sensor(
     strata = Strata.of(coarse, used)
     shown = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
     shown = np.maximum(shown, least.facing(strata.squared))
-    noise = fit_law(strata, shown, np.zeros(len(shown)), True)
-    found = _over_scales(image.rays, blocks, coarse, noise, least)
+    noise = fit_law(strata, shown, np.zeros(len(shown)))
+    found = _over_scales(image.rays, blocks, coarse, noise, least, prior)
     if found is None:
         return prior
     within, between, filled, distortion = found
@@ -98,13 +103,18 @@ def measured_sensor(
 
 
 def _over_scales(
-    rays: NDArray[np.float32], blocks: Blocks, coarse: Blocks, noise: Law, least: Law
+    rays: NDArray[np.float32],
+    blocks: Blocks,
+    coarse: Blocks,
+    noise: Law,
+    least: Law,
+    prior: SensorModel,
 ) -> tuple[list[float], float, float, Law] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    With the rays (H, W, 3) and the least noise. V(4), V(8), ... relative to `noise`, what 8 pixels
-    show; M(8) relative to it; the measured share of most blocks; the largest distortion that any
-    scale shows. None where too few blocks are flat.
+    With the rays (H, W, 3), the least noise, and the `prior` of the distortion. V(4), V(8), ...
+    relative to `noise`, what 8 pixels show; M(8) relative to it; the measured share of most
+    blocks; the largest distortion that any scale shows. None where too few blocks are flat.
     """
     variance = noise.variances(coarse)
     level = variance.repeat(2, axis=0).repeat(2, axis=1)
@@ -138,13 +148,15 @@ def _over_scales(
             filled = pixels / BLOCK**2
         expected = shown.variances(larger)
         bent, known = strata.medians(excess), strata.medians(expected)
-        # Lasers err in range alone.
-        bend = fit_law(strata, np.maximum(bent, FLOOR), known, noise.quartic > 0)
+        bend = fit_law(strata, np.maximum(bent, FLOOR), known)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
         typical = 8 / pixels * float(np.median(bend.facing(strata.squared)))
         if typical > most:
             most, distortion = typical, bend.times(8 / pixels)
-        flat = whole & (excess < _BENT * (expected + bend.variances(larger)))
+        # What one surface leaves where the sensor errs by as much as the prior allows. No less: of
+        # a bent one, only what happens to be flat would be left to tell the distortion.
+        allowed = OUTLIER**2 * systematic_variance(prior, larger.squared) * pixels / 8
+        flat = whole & (excess < _BENT * (expected + allowed))
         side *= 2
         blocks, larger = larger, larger.merged(rays, side)
     return (within, between, filled, distortion) if len(within) > 1 else None
