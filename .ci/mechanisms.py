@@ -52,6 +52,11 @@ def _given(place: int, value: Any) -> Callable[[Any], Any]:
     return lambda original: lambda *given: original(*given[:place], value, *given[place + 1 :])
 
 
+def _of_one_range(original: Any) -> Any:
+    """A fit over strata as if all had one range: nothing depends on it."""
+    return lambda strata, *rest: original(strata._replace(squared=0 * strata.squared + 1), *rest)
+
+
 def _sensor(**fields: Callable[[Any, Any], float]) -> dict[str, Any]:
     """The measured sensor with fields that follow from it and from the stated one."""
 
@@ -109,7 +114,7 @@ MECHANISMS = (
               {'segmenter.quantisation': _returning((0.0, 0.0))}),
     Mechanism('noise of directions', 'sensing/sensor.py:tilt_variance', _zero('direction_noise')),
     Mechanism('errors in range', 'fitting/error_law.py:_scale_term,_deviance',
-              {'fitting.noise.fit_law': _given(3, False)}),
+              {'fitting.noise.fit_law': _of_one_range}),
     # Edges and holes.
     Mechanism('jump edges', 'sensing/jump_edges.py fitting/steps.py',
               {'jump_edges': 'none'}),
