@@ -50,7 +50,7 @@ def test_replicated_pixels_are_undone_whatever_is_cropped(seen, factor):
         crop = rng.integers(0, factor, 4)
         image = RangeImage.from_depth(*enlarged(depth, camera, factor, crop))
         cells = replication(image)
-        assert cells == (factor, crop[0], crop[1])
+        assert cells == (factor, crop[0], crop[1], False)
         reduced = cells.reduced(image)
         np.testing.assert_array_equal(reduced.inverse, original.inverse)
         np.testing.assert_allclose(reduced.rays, original.rays, atol=1e-5)
@@ -81,7 +81,7 @@ def test_clouds_and_their_own_body_are_reduced_as_well(seen):
     turned = points + np.float32(0.001) * np.sin(np.arange(640))[:, None]  # of no pinhole camera
     image = RangeImage.from_points(turned.repeat(2, axis=0).repeat(2, axis=1))
     cells = replication(image)
-    assert image.camera is None and cells == (2, 0, 0)
+    assert image.camera is None and cells == (2, 0, 0, False)
     body = np.zeros(image.shape, bool)
     body[:100] = True
     reduced = cells.reduced(image.without(body))
@@ -92,20 +92,34 @@ def test_clouds_and_their_own_body_are_reduced_as_well(seen):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize('unmeasured', [0, np.nan])
 @pytest.mark.parametrize('factor', (*FACTORS, 16))
-def test_linear_enlargement_is_found(seen, factor):
-    depth = seen.depth[:240, :320].astype(np.float32) / 1000
-    camera = replace(seen.camera, width=320, height=240)
-    frame = enlarged(depth, camera, factor, (1, 1, 0, 0), cv2.INTER_LINEAR)
-    assert interpolation(RangeImage.from_depth(*frame)).factor == factor
+def test_linear_interpolation_is_undone_whatever_is_cropped(seen, factor, unmeasured):
+    depth, camera = seen.depth[:240, :320] / 1000, replace(seen.camera, width=320, height=240)
+    crop = np.random.default_rng(factor).integers(0, factor, 4)
+    before = np.where(depth > 0, depth, unmeasured).astype(np.float32)
+    wide, wide_camera = enlarged(before, camera, factor, crop, cv2.INTER_LINEAR)
+    image = RangeImage.from_depth(wide, wide_camera)
+    cells = interpolation(image)
+    assert cells == (factor, crop[0], crop[1], True)
+    reduced = cells.reduced(image)
+    np.testing.assert_allclose(reduced.rays, RangeImage.from_depth(depth, camera).rays, atol=1e-5)
+    # But for cells whose centres are cropped.
+    inverse, true = reduced.inverse[1:-1, 1:-1], depth[1:-1, 1:-1]
+    found = np.divide(1, inverse, out=np.zeros(inverse.shape), where=inverse > 0)
+    both = (found > 0) & (true > 0)
+    np.testing.assert_allclose(found[both], true[both], atol=1e-4)
+    if unmeasured == 0:
+        np.testing.assert_array_equal(found > 0, true > 0)
+    assert not (found[true == 0] > 0).any() and both.sum() > 0.97 * (true > 0).sum()
 
 
-def test_a_linear_enlargement_gives_what_the_original_gives(seen):
-    """With an odd factor every third pixel is one of the original."""
-    depth = seen.depth.astype(np.float32) / 1000
-    frame = enlarged(depth, seen.camera, 3, (0, 0, 0, 0), cv2.INTER_LINEAR)
-    small = segment(depth, seen.camera).labels
-    np.testing.assert_array_equal(segment(*frame).labels[1::3, 1::3], small)
+def test_a_linear_enlargement_in_millimetres_gives_what_the_original_gives(seen):
+    depth = seen.depth.astype(np.float32)
+    frame = enlarged(depth, seen.camera, 2, (0, 0, 0, 0), cv2.INTER_LINEAR)
+    small = segment(depth / 1000, seen.camera).labels
+    large = segment(np.rint(frame[0]).astype(np.uint16), frame[1]).labels
+    assert (large[::2, ::2] == small).mean() > 0.98
 
 
 def test_levels_of_exact_scenes_are_not_replication():
