@@ -31,11 +31,7 @@ from rangeseg_ros.tasks import run_all
 
 PARAMS = Path(__file__).parents[1] / 'params'
 EXPERIMENTS = ('directions', 'lambda', 'weights', 'comparison')
-DIRECTIONS = {
-    f'{count} {kind}': {'directions': kind, 'direction_count': count}
-    for kind, counts in (('platonic', (17, 73, 305, 1249)), ('regular', (25, 225, 1225)))
-    for count in counts
-}
+DIRECTIONS = {f'{count} directions': {'direction_count': count} for count in (17, 73, 305, 1249)}
 WEIGHTS = {'4-connectivity': {'jump_edges': 'none'}, 'jump edge disconnection': {}}
 LAMBDAS = tuple(float(value) for value in range(20, 151, 10))
 # Without post-processing the best lambda lies far higher (thesis 6.5).

@@ -122,17 +122,16 @@ def test_changes_apply_all_or_none(node_with):
         ({'min_pixels': 3, 'method': 'magic'}, 'method'),
         ({'min_pixels': 3, 'smoothness': -1.0}, 'smoothness'),
         ({'min_pixels': 3, 'smoothness': float('nan')}, 'smoothness'),
-        ({'min_pixels': 3, 'directions': 'regular'}, 'direction_count'),
+        ({'min_pixels': 3, 'direction_count': 225}, 'direction_count'),
         ({'min_pixels': 3, 'smoothness': 'much'}, 'DOUBLE'),
     ]:
         result = change(**values)
         assert not result.successful and reason in result.reason
         assert node.get_parameter('min_pixels').value == 2
     # Values that only together make sense go together.
-    assert change(directions='regular', direction_count=225).successful
-    assert applied[1:] == [
-        NodeConfig(smoothness=10.0, min_pixels=2, directions='regular', direction_count=225)
-    ]
+    assert change(work_budget=0.5).successful and not change(method='normals').successful
+    assert change(method='normals', work_budget=1.0).successful
+    assert applied[2:] == [NodeConfig(smoothness=10.0, min_pixels=2, method='normals')]
 
 
 def test_parameters_of_others_are_none_of_ours(node_with):

@@ -42,7 +42,7 @@ def segment(depth, config=NORMALS, camera=CAMERA):
 
 def test_a_bent_wall_of_two_directions_is_two_labels_and_one_plane():
     """Its halves differ by a tenth of a degree, and the nearest directions are two."""
-    known = directions('platonic', NORMALS.direction_count)
+    known = directions(NORMALS.direction_count)
     towards = known[known[:, 2] < -0.9]
     first, second = towards[np.argsort(-(towards @ towards[0]))[:2]]
     across = (second - first) / np.linalg.norm(second - first)
@@ -84,7 +84,7 @@ def test_every_face_of_a_noise_free_room_is_found(seed):
     [
         {'normals': 'plane_fit'},
         {'normal_baseline': 1},
-        {'directions': 'regular', 'direction_count': 225},
+        {'direction_count': 17},
         {'jump_edges': 'sobel'},
         {'jump_edges': 'none'},
         {'exact': True, 'direction_count': 73},
@@ -142,7 +142,7 @@ def test_a_tilt_is_found_when_asked_for_here_or_in_another_process():
     assert sequence.segment(image, 1, up=(0, -0.8, -0.6)).tilt is None
 
 
-DIRECTIONS = directions('platonic', 73).astype(np.float32)
+DIRECTIONS = directions(73).astype(np.float32)
 
 
 def patches(seed, height, width, noise):
@@ -254,7 +254,7 @@ def test_normals_are_those_of_the_surfaces(room, method):
 
 def test_method_normals_gives_its_directions(room):
     _, result = segmented(room, method='normals', direction_count=73)
-    known = directions('platonic', 73).astype(np.float32)
+    known = directions(73).astype(np.float32)
     found = np.unique(result.normals[result.labels > 0], axis=0)
     assert all((known == normal).all(axis=1).any() for normal in found)
 

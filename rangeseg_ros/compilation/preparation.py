@@ -130,8 +130,7 @@ def rehearse(
     """
     # The room has a few hundred pixels per plane. Few directions: exact solutions with all of them
     # take minutes, and run the same kernels.
-    count = min(config.direction_count, 9 if config.directions == 'regular' else 4)
-    config = replace(config, min_pixels=min(config.min_pixels, 50), direction_count=count)
+    config = replace(config, min_pixels=min(config.min_pixels, 50), direction_count=4)
     # What is measured in a small frame decides between paths; the stated sensor takes the other.
     stated = replace(config, sensor_model='fixed')
     for kind in kinds:

@@ -11,7 +11,7 @@ from typing import Any
 from rangeseg_ros.core.options import ConfigError, checked, option, unknown_parameter
 
 # Directions of an icosahedron by how often it is subdivided (thesis, table A.3).
-PLATONIC_COUNTS = (4, 17, 73, 305, 1249)
+DIRECTION_COUNTS = (4, 17, 73, 305, 1249)
 VGA = 640 * 480
 """Pixels of the image that numbers of pixels are meant for; others show things as much larger."""
 
@@ -41,13 +41,11 @@ class Config:
         3, 'pixels from a pixel to the neighbours of its cross product; the thesis uses 1', 1, 50
     )
     normal_radius: int = option(2, 'the window of plane_fit has 2 r + 1 rows and columns', 1, 50)
-    directions: str = option(
-        'platonic',
-        'method normals: directions of a subdivided icosahedron, or at regular angles',
-        choices=('platonic', 'regular'),
-    )
     direction_count: int = option(
-        305, 'number of directions: platonic 4, 17, 73, 305, 1249; regular odd squares', 1, 5000
+        305,
+        'method normals: directions of a subdivided icosahedron, 4, 17, 73, 305 or 1249',
+        4,
+        1249,
     )
     jump_edges: str = option(
         'plane',
@@ -189,7 +187,11 @@ class Config:
         for option_field in fields(self):
             value = checked(option_field, getattr(self, option_field.name))
             object.__setattr__(self, option_field.name, value)
-        check_directions(self.directions, self.direction_count)
+        if self.direction_count not in DIRECTION_COUNTS:
+            counts = ', '.join(map(str, DIRECTION_COUNTS))
+            raise ConfigError(
+                f'parameter direction_count must be one of {counts}, not {self.direction_count}'
+            )
         if self.work_budget < 1 and self.method != 'planes':
             raise ConfigError('parameter work_budget is for method planes')
         if self.odometry and not self.odometry_frame:
@@ -243,17 +245,6 @@ def _check_names(kind: type[Config], names: Iterable[object]) -> None:
             raise ConfigError(unknown_parameter(name, known))
 
 
-def check_directions(distribution: str, count: int) -> None:
-    """Raise ConfigError if `distribution`, a choice of `directions`, cannot give `count`."""
-    root, given = math.isqrt(count), f'directions, not {count}'
-    if distribution == 'platonic' and count not in PLATONIC_COUNTS:
-        counts = ', '.join(map(str, PLATONIC_COUNTS))
-        raise ConfigError(f'parameter direction_count: platonic gives {counts} {given}')
-    if distribution == 'regular' and (root * root != count or root % 2 == 0):
-        squares = 'an odd square (1, 9, 25 ... 1225) of'
-        raise ConfigError(f'parameter direction_count: regular gives {squares} {given}')
-
-
 # Former names of parameters, and their names now.
 RENAMED = {
     'track_memory': 'track_time',
@@ -262,8 +253,10 @@ RENAMED = {
 }
 # Former parameters that nothing reads any more, and why.
 DROPPED = {
+    'directions': 'one kind is as good as another',
     'cycles': 'exact goes on until no label helps',
     'flatness': 'plane_probability decides what is a plane',
+    'noise_regions': 'min_pixels leaves out what is small',
     'moves': 'exact expands labels: swaps take as long and leave a higher energy',
     'refits': 'planes are fitted to the final labels',
     'warm_start': 'no frame depends on those before',

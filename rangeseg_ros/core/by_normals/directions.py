@@ -1,43 +1,29 @@
 """The discretised hemisphere of surface normals: what the labels of method `normals` stand for.
 
-Every set faces the sensor: unit vectors with z < 0 in the optical frame (x right, y down,
+They face the sensor: unit vectors with z < 0 in the optical frame (x right, y down,
 z forward). The equator is left out, as a surface seen edge-on does not appear in an image.
 """
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.config import PLATONIC_COUNTS, check_directions
+from rangeseg_ros.core.config import DIRECTION_COUNTS
 
 _EQUATOR = 1e-9  # rounding
 
 
 @lru_cache(maxsize=8)
-def directions(distribution: str, count: int) -> NDArray[np.float64]:
+def directions(count: int) -> NDArray[np.float64]:
     """Unit vectors (count, 3) over the hemisphere, not to be written to.
 
-    Distributions and counts are those of `Config`: platonic has 4, 17, 73, 305 or 1249 (thesis,
-    table A.3), regular an odd square (A.1). `ConfigError` for others.
-    """
-    check_directions(distribution, count)
-    if distribution == 'platonic':
-        found = platonic(PLATONIC_COUNTS.index(count))
-    else:
-        found = regular((math.isqrt(count) + 1) // 2)
-    found.setflags(write=False)
-    return found
-
-
-def platonic(subdivisions: int) -> NDArray[np.float64]:
-    """Vertices of an icosahedron after Loop subdivision (thesis 5.2.2, appendix A.2).
-
-    Those strictly on one side of a plane through an edge and the edge opposite to it.
+    Vertices of an icosahedron after Loop subdivision (thesis 5.2.2, appendix A.2), those strictly
+    on one side of a plane through an edge and the edge opposite to it. `count` is one of
+    `DIRECTION_COUNTS` (table A.3).
     """
     golden = (1 + 5**0.5) / 2
     # The edges between the vertices (+-1, +-golden, 0) lie in the plane z = 0.
@@ -46,18 +32,11 @@ def platonic(subdivisions: int) -> NDArray[np.float64]:
     near = np.linalg.norm(vertices[:, None] - vertices[None], axis=2) < 2.1
     faces = np.array([f for f in combinations(range(12), 3) if near[np.ix_(f, f)].all()])
     vertices /= np.linalg.norm(vertices[0])
-    for _ in range(subdivisions):
+    for _ in range(DIRECTION_COUNTS.index(count)):
         vertices, faces = _subdivide(vertices, faces)
-    return vertices[vertices[:, 2] < -_EQUATOR]
-
-
-def regular(n: int) -> NDArray[np.float64]:
-    """Elevation and azimuth in steps of 90/n degrees (thesis 5.2.1, appendix A.1): (2n-1)^2."""
-    elevation = np.pi / 2 * np.arange(1, n) / n
-    azimuth = np.pi / 2 * np.arange(4 * n) / n
-    phi, theta = (a.ravel() for a in np.meshgrid(elevation, azimuth, indexing='ij'))
-    ring = np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), -np.sin(phi)], 1)
-    return np.vstack([[[0.0, 0.0, -1.0]], ring[::-1]])
+    found = vertices[vertices[:, 2] < -_EQUATOR]
+    found.setflags(write=False)
+    return found
 
 
 def _subdivide(
