@@ -38,8 +38,9 @@ from rangeseg_ros.evaluation.label_files import EvaluationError, Truth, as_truth
 from rangeseg_ros.evaluation.overlap import Overlap
 from rangeseg_ros.evaluation.plane_errors import plane_errors
 from rangeseg_ros.evaluation.terrain import TerrainTask, shares
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room, walk
+from rangeseg_ros.simulation.sensors.kinect import Kinect
 
 ROOT = Path(__file__).parents[1]
 # Commands of `rangeseg simulate`.
@@ -246,7 +247,7 @@ def tracked_room(seed: int, count: int = 12) -> list[Any]:
     """A walk through a room, segmented, at 5 Hz."""
     scene, frames = kinect_room(seed, 6 * count, walk), []
     for k in range(count):
-        view = simulate_kinect(scene, frame=6 * k, seed=seed, sensor_seed=seed)
+        view = simulate(scene, Kinect(seed), frame=6 * k, seed=seed)
         found = Segmenter().segment(RangeImage.from_depth(view.depth, view.camera))
         faces = {plane.label: plane.face for plane in view.planes}
         frames.append((found.labels, found.planes, (k + 5) * 2 * 10**8, view.labels, faces))

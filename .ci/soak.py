@@ -21,9 +21,9 @@ sys.path.insert(0, os.fspath(Path(__file__).parents[1] / 'test'))
 
 from ros_bench import TYPES, Bench, values_of  # noqa: E402
 
-from rangeseg_ros.simulation.kinect import simulate_kinect  # noqa: E402
+from rangeseg_ros.simulation.render import simulate  # noqa: E402
 from rangeseg_ros.simulation.scenes import kinect_room  # noqa: E402
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera  # noqa: E402
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera  # noqa: E402
 
 RATE, FRAMES = 30.0, 20
 
@@ -48,7 +48,7 @@ def main():
     arguments = parser.parse_args()
     camera, draw, report = kinect_camera(*arguments.size), random.Random(0), []
     room = kinect_room(0, FRAMES)
-    depths = [simulate_kinect(room, camera, frame=k, seed=k).depth for k in range(FRAMES)]
+    depths = [simulate(room, Kinect(0), camera, frame=k, seed=k).depth for k in range(FRAMES)]
     begin, sent = time.monotonic(), 0
     due = begin
     with Bench(camera=camera) as bench, bench.listening('labels'), bench.camera_on():

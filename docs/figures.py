@@ -33,11 +33,10 @@ from rangeseg_ros.drawing import colours, grey, overlay
 from rangeseg_ros.evaluation.label_files import read_label_image
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, write_image
-from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Scene, kinect_room, walk
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.kinect import QUANTUM, kinect_camera, sensor_pattern
+from rangeseg_ros.simulation.sensors.kinect import QUANTUM, Kinect, kinect_camera, sensor_pattern
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
 from rangeseg_ros.simulation.terrain.kinds import stated, terrain_scene
 
@@ -202,7 +201,9 @@ def room_map(scene, seed):
     up = poses[0].rotation.T @ (0, 0, 1)
     sequence = SequenceSegmenter(Config(up_x=up[0], up_y=up[1], up_z=up[2]))
     for k in range(0, len(poses), 8):
-        view = simulate_kinect(Scene(room.solids, poses, room.dark), camera, frame=k, seed=scene)
+        view = simulate(
+            Scene(room.solids, poses, room.dark), Kinect(0), camera, frame=k, seed=scene
+        )
         image = RangeImage.from_depth(view.depth, camera)
         pose = Transform(poses[k].rotation, poses[k].position)
         sequence.segment(image, k * 10**9 // 30, poses[k].rotation.T @ (0, 0, 1), pose)

@@ -30,9 +30,9 @@ from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.core.tracking.plane_errors import tangents
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 from rangeseg_ros.simulation.solids import box, cast, half_space
 
 FRAMES, STEP, SECOND = 120, 3, 10**9
@@ -56,7 +56,7 @@ def walked(scene: Scene, seed: int) -> Iterator[Frame]:
     """A walk at 10 Hz, segmented."""
     sequence = SequenceSegmenter(CONFIG)
     for k in range(0, FRAMES * STEP, STEP):
-        view = simulate_kinect(scene, frame=k, seed=seed, sensor_seed=seed)
+        view = simulate(scene, Kinect(seed), frame=k, seed=seed)
         pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
         image = RangeImage.from_depth(view.depth, view.camera)
         stamp = SECOND + k * SECOND // 30
@@ -280,7 +280,7 @@ def measure_mount(count: str, seed: str) -> None:
         scene = Scene(room.solids, poses, room.dark)
         sequence = SequenceSegmenter(Config(pose_noise=0.0, pose_turn_noise=0.0))
         for k in range(5):
-            view = simulate_kinect(scene, camera, frame=k, seed=number, sensor_seed=number)
+            view = simulate(scene, Kinect(number), camera, frame=k, seed=number)
             image = RangeImage.from_depth(view.depth, camera)
             sequence.segment(image, SECOND + k * 10**8, pose=Transform.identity())
         mount = mount_of(sequence.map.planes, 5, CONFIG.role_tolerance)

@@ -10,9 +10,9 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.evaluation.label_files import as_truth
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 
 @pytest.fixture(scope='module')
@@ -29,7 +29,7 @@ def frames(ablate):
 
 @pytest.fixture(scope='module')
 def frame(frames):
-    seen = simulate_kinect(kinect_room(3), kinect_camera(320, 240), noise='none', seed=3)
+    seen = simulate(kinect_room(3), Kinect(0, 'none'), kinect_camera(320, 240), seed=3)
     image = RangeImage.from_depth(seen.depth, seen.camera)
     planes = {plane.label: np.array([*plane.normal, plane.distance]) for plane in seen.planes}
     return frames.Frame('simulated', 'kinect', image, as_truth(seen.labels), planes, 300)

@@ -15,9 +15,9 @@ from rangeseg_ros.core.sensing.binning import STEPS, Bins, bin_side, step_within
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 WALL = np.array([0.1, -0.05, 0.5])
@@ -181,7 +181,7 @@ BUDGETS = (*STEPS, 0.0)
 @pytest.fixture(scope='module')
 def room():
     camera = kinect_camera(321, 241)
-    return simulate_kinect(kinect_room(2), camera, seed=2), camera
+    return simulate(kinect_room(2), Kinect(0), camera, seed=2), camera
 
 
 @pytest.fixture(scope='module')

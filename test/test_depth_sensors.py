@@ -6,12 +6,11 @@ import pytest
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.io.images import read_depth
 from rangeseg_ros.simulation.fields import smooth_field
-from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
 from rangeseg_ros.simulation.sensors.kinect import BASELINE as KINECT_BASELINE
-from rangeseg_ros.simulation.sensors.kinect import NOISES, QUANTUM, kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import NOISES, QUANTUM, Kinect, kinect_camera
 from rangeseg_ros.simulation.sensors.sensor import resize, slopes, unseen_from_the_right
 from rangeseg_ros.simulation.sensors.stereo import BASELINE, STEPS, RealSense, distortion
 from rangeseg_ros.simulation.solids import box, half_space
@@ -170,7 +169,7 @@ def test_rooms_command(tmp_path, name, run):
 @pytest.mark.parametrize('noise', NOISES)
 def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
     near, far = 1.0, 2.0
-    frame = simulate_kinect(in_camera_frame(wall(far), plate(near)), noise=noise)
+    frame = simulate(in_camera_frame(wall(far), plate(near)), Kinect(0, noise))
     row = frame.depth[240] > 0
     row[-8:] = True
     (hole,) = np.nonzero(~row)
@@ -186,7 +185,7 @@ def test_shadow_lies_left_of_the_occluder_and_is_as_wide_as_parallax(noise):
 
 
 def test_without_noise_depth_is_exact():
-    frame = simulate_kinect(in_camera_frame(wall(2.5)), noise='none')
+    frame = simulate(in_camera_frame(wall(2.5)), Kinect(0, 'none'))
     assert frame.depth.dtype == np.float32
     assert (frame.depth == np.float32(2.5)).all()
     assert (frame.labels == 1).all()
@@ -197,7 +196,7 @@ def test_without_noise_depth_is_exact():
 
 @pytest.mark.parametrize('noise', ['measured', 'correlated', 'independent'])
 def test_depth_takes_only_the_values_of_quantised_disparity(noise):
-    frame = simulate_kinect(kinect_room(0), kinect_camera(320, 240), noise=noise)
+    frame = simulate(kinect_room(0), Kinect(0, noise), kinect_camera(320, 240))
     assert frame.depth.dtype == np.uint16
     steps = np.arange(1, 2000)
     possible = np.rint(1000 / (QUANTUM * steps))
@@ -209,8 +208,8 @@ def test_depth_takes_only_the_values_of_quantised_disparity(noise):
 def test_textbook_noise(z, noise):
     # Tilted, so that every phase of the quantisation occurs.
     scene = in_camera_frame(wall(z, 20))
-    true = simulate_kinect(scene, noise='none').depth.astype(float)
-    error = simulate_kinect(scene, noise=noise, seed=3).depth / 1000 - true
+    true = simulate(scene, Kinect(0, 'none')).depth.astype(float)
+    error = simulate(scene, Kinect(0, noise), seed=3).depth / 1000 - true
     quantisation = QUANTUM * true**2 / np.sqrt(12)
     expected = np.hypot(0.0012 + 0.0019 * (true - 0.4) ** 2, quantisation)
     # 300,000 pixels, or 20,000 independent ones when correlated.

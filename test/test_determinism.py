@@ -18,9 +18,9 @@ from rangeseg_ros import Camera, Config, RangeImage, Segmenter
 from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
 from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 CASES = [{}, {'method': 'normals'}, *({'work_budget': step} for step in STEPS[1:])]
 SHAPES = [(1, 1), (1, 2), (2, 1), (1, 97), (97, 1), (2, 2), (3, 3), (5, 64), (17, 33), (37, 49)]
@@ -34,7 +34,7 @@ def digests():
 def all_digests():
     """Of labels, planes, normals, terrain and heights of a room, for each case."""
     scene = kinect_room(903)
-    frame = simulate_kinect(scene, kinect_camera(161, 121), seed=903)
+    frame = simulate(scene, Kinect(0), kinect_camera(161, 121), seed=903)
     image, up = RangeImage.from_depth(frame.depth, frame.camera), scene.poses[0].rotation[2]
     configs = [Config(min_pixels=100, **case) for case in CASES]
     return [digest(SequenceSegmenter(config).segment(image, 0, up)) for config in configs]
@@ -73,7 +73,7 @@ def rooms():
     """Labels and planes of both methods, of the slower one in a smaller image."""
     for method, width in (('planes', 160), ('normals', 64)):
         camera = kinect_camera(width, width * 3 // 4)
-        frame = simulate_kinect(kinect_room(903), camera, seed=903, sensor_seed=903)
+        frame = simulate(kinect_room(903), Kinect(903), camera, seed=903)
         config = Config(method=method, direction_count=73, min_pixels=width * width // 256)
         result = Segmenter(config).segment(RangeImage.from_depth(frame.depth, camera))
         planes = [[p.label, p.count, *p.normal.tolist(), p.distance] for p in result.planes]

@@ -17,9 +17,9 @@ from rangeseg_ros.core.ground.cells import DROP, GROUND, OBSTACLE, UNKNOWN
 from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.messages.make import make_rclpy
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 pytestmark = pytest.mark.ros
 
@@ -84,7 +84,7 @@ def bench():
 
 @pytest.fixture(scope='module')
 def depth(bench):
-    return simulate_kinect(kinect_room(2), bench.camera, seed=2).depth
+    return simulate(kinect_room(2), Kinect(0), bench.camera, seed=2).depth
 
 
 def budget_of(bench, image):

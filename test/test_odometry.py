@@ -22,9 +22,9 @@ from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.recordings import make_rosbags
 from rangeseg_ros.messages.motion import odometry_message
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 from rangeseg_ros.simulation.solids import box, half_space
 
 CAMERA = kinect_camera(160, 120)
@@ -36,7 +36,7 @@ STEP = 4
 
 def planes_of(scene, k, seed):
     """Labels and planes of true faces, their numbers as ids."""
-    view = simulate_kinect(scene, CAMERA, frame=k, seed=seed, sensor_seed=seed)
+    view = simulate(scene, Kinect(seed), CAMERA, frame=k, seed=seed)
     image = RangeImage.from_depth(view.depth, CAMERA)
     faces = {plane.label: plane.face for plane in view.planes}
     planes = fit_planes(view.labels, image, SENSOR)
@@ -114,7 +114,9 @@ def test_the_ends_of_a_box_tell_the_motion_along_two_walls():
         odometry = PlaneOdometry()
         for k in range(0, 13, 2):
             labels, planes = planes_of(scene, k, 5)
-            image = RangeImage.from_depth(simulate_kinect(scene, CAMERA, frame=k).depth, CAMERA)
+            image = RangeImage.from_depth(
+                simulate(scene, Kinect(0), CAMERA, frame=k).depth, CAMERA
+            )
             result = Segmenter().segment(image)
             edges = JumpPoints.of(image, result.jumps if with_edges else None, result.cells)
             held = [plane for plane in planes if abs(plane.normal @ up) < 0.5]
@@ -254,7 +256,7 @@ def test_the_map_is_in_the_frame_of_the_odometry_without_tf(tmp_path):
     sequence = SequenceSegmenter(config)
     stamps = [10**9 + k * 10**9 // 30 for k in range(0, 20, STEP)]
     for k, stamp in zip(range(0, 20, STEP), stamps, strict=True):
-        view = simulate_kinect(scene, camera, frame=k, seed=4)
+        view = simulate(scene, Kinect(0), camera, frame=k, seed=4)
         recording.add_camera(stamp, 160, 120, k=matrix)
         recording.add_image(stamp, view.depth)
         sequence.segment(RangeImage.from_depth(view.depth, camera), stamp)

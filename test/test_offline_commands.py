@@ -14,9 +14,9 @@ from rangeseg_ros.cli import segment
 from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.images import read_labels, write_image
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 
 def files(folder):
@@ -187,7 +187,7 @@ def frames(tmp_path):
     paths = []
     for seed in range(2):
         paths.append(tmp_path / f'{seed}.png')
-        write_image(paths[-1], simulate_kinect(kinect_room(seed), camera, seed=seed).depth)
+        write_image(paths[-1], simulate(kinect_room(seed), Kinect(0), camera, seed=seed).depth)
     return [*map(str, paths), '--camera', str(tmp_path / 'camera.yaml')]
 
 
@@ -218,7 +218,7 @@ def test_figures_of_given_frames(frames, tmp_path, run):
 def test_bad_input_of_bench(frames, tmp_path, run):
     assert 'belong together' in run('bench', frames[0])[2]
     other = tmp_path / 'other.png'
-    write_image(other, simulate_kinect(kinect_room(0), kinect_camera(32, 24)).depth)
+    write_image(other, simulate(kinect_room(0), Kinect(0), kinect_camera(32, 24)).depth)
     # Before and in the process that measures.
     for paths in ((other,), (frames[0], other)):
         code, _, error = run('bench', *paths, *frames[-2:], '--rounds', 1)

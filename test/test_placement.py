@@ -17,9 +17,9 @@ from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.io.bag_writer import DepthBagWriter
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import OPTICAL_IN_BODY, Pose, Scene
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 from rangeseg_ros.simulation.solids import box, half_space
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -138,7 +138,7 @@ def driving(height, pitch, roll, frames=6):
 def test_angles_and_height_are_within_their_errors(height, pitch, roll):
     scene, sequence = driving(height, pitch, roll), SequenceSegmenter(Config(min_pixels=150))
     for k in range(len(scene.poses)):
-        view = simulate_kinect(scene, MOUNTED, frame=k, sensor_seed=int(height * 10))
+        view = simulate(scene, Kinect(int(height * 10)), MOUNTED, frame=k)
         image = RangeImage.from_depth(view.depth, MOUNTED)
         sequence.segment(image, 10**9 + k * 10**8, pose=Transform.identity())
     mount = mount_of(sequence.map.planes, len(scene.poses), 10.0)
@@ -163,7 +163,7 @@ def test_the_command_prints_what_ros_takes_and_says_when_there_is_no_floor(tmp_p
         with DepthBagWriter(tmp_path / name, MOUNTED) as bag:
             for k in range(4):
                 shown = Scene(scene.solids, (pose or scene.poses[k],))
-                bag.write(simulate_kinect(shown, MOUNTED).depth, 10**9 + k * 10**8)
+                bag.write(simulate(shown, Kinect(0), MOUNTED).depth, 10**9 + k * 10**8)
     params = tmp_path / 'params.yaml'
     params.write_text('min_pixels: 150')
     robot, wall = (run('mount', tmp_path / name, '--params', params) for name in ('robot', 'wall'))

@@ -21,9 +21,9 @@ from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.sequence import SequenceSegmenter, with_roles
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import Pose, Scene, kinect_room, walk
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 from rangeseg_ros.simulation.solids import box, half_space
 
 CAMERA = kinect_camera(160, 120)
@@ -94,7 +94,7 @@ def mapped(scene, frames, config=None, seed=0, start=0):
 
 
 def add(plane_map, scene, k, random, start=0, apart=False):
-    view = simulate_kinect(scene, CAMERA, frame=k, seed=seed_of(scene))
+    view = simulate(scene, Kinect(0), CAMERA, frame=k, seed=seed_of(scene))
     image = RangeImage.from_depth(view.depth, CAMERA)
     planes = with_roles(fit_planes(view.labels, image, SENSOR), Config(), (0, -1, 0))
     # Regions of one frame are not followed to the next: no ids are alike.
@@ -166,7 +166,7 @@ def test_what_a_frame_finds_on_two_surfaces_is_not_one_plane():
 
 def test_parts_that_turn_out_to_be_one_surface_become_one_plane():
     pose = Pose.looking((0, 0, 1.2), 0, 0, 0)
-    view = simulate_kinect(Scene((half_space((-1, 0, 0), (2.5, 0, 0)),), (pose,)), CAMERA)
+    view = simulate(Scene((half_space((-1, 0, 0), (2.5, 0, 0)),), (pose,)), Kinect(0), CAMERA)
     labels = view.labels.copy()
     middle = labels.shape[1] // 2
     labels[:, middle:] *= 2
@@ -217,7 +217,7 @@ def test_the_map_follows_a_jump_of_the_fixed_frame(turn):
     )
     sizes = []
     for k in range(0, 48, 4):
-        view = simulate_kinect(scene, kinect_camera(320, 240), frame=k)
+        view = simulate(scene, Kinect(0), kinect_camera(320, 240), frame=k)
         pose = Transform(scene.poses[k].rotation, scene.poses[k].position)
         pose = jump.after(pose) if k >= 24 else pose
         image = RangeImage.from_depth(view.depth, view.camera)
@@ -246,7 +246,7 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
     scene = Scene((half_space((0, 0, 1), (0, 0, 0)), *treads), (pose,) * 8)
     plane_map, told = PlaneMap(), Transform(pose.rotation, pose.position)
     for k in range(8):
-        view = simulate_kinect(scene, CAMERA, frame=k, seed=1)
+        view = simulate(scene, Kinect(0), CAMERA, frame=k, seed=1)
         image = RangeImage.from_depth(view.depth, CAMERA)
         face = {plane.label: plane.face for plane in view.planes}
         planes = fit_planes(view.labels, image, SENSOR)
@@ -268,7 +268,7 @@ def test_a_tread_that_is_taken_for_the_next_is_no_jump():
 
 def test_a_looped_recording_begins_the_map_anew():
     room = kinect_room(4)
-    view = simulate_kinect(Scene(room.solids, room.poses), kinect_camera(320, 240))
+    view = simulate(Scene(room.solids, room.poses), Kinect(0), kinect_camera(320, 240))
     image = RangeImage.from_depth(view.depth, view.camera)
     sequence = SequenceSegmenter(Config(min_pixels=150))
     pose = Transform(room.poses[0].rotation, room.poses[0].position)
@@ -289,7 +289,7 @@ SCENE = Scene(ROOM.solids, walk(ROOM.poses[0], 4, 40), ROOM.dark)
 def seen(k, width=320, sensor=0):
     """Image and pose of frame `k` of a walk."""
     camera = kinect_camera(width, width * 3 // 4)
-    view = simulate_kinect(SCENE, camera, frame=k, sensor_seed=sensor)
+    view = simulate(SCENE, Kinect(sensor), camera, frame=k)
     pose = SCENE.poses[k]
     return RangeImage.from_depth(view.depth, view.camera), Transform(pose.rotation, pose.position)
 
@@ -347,7 +347,7 @@ def test_memory_is_bounded_however_long_one_walks(kind):
     poses = [Pose.looking((x, 0, 1.2), 12 * np.sin(x), 22, 0) for x in along]
     frames = []
     for pose in poses:
-        view = simulate_kinect(Scene(tuple(solids), (pose,)), camera)
+        view = simulate(Scene(tuple(solids), (pose,)), Kinect(0), camera)
         image = RangeImage.from_depth(view.depth, camera)
         planes = fit_planes(view.labels, image, SensorModel.from_config(CONFIG))
         frames.append((view.labels, [p for p in planes if p.count > 40], image))

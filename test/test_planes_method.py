@@ -12,9 +12,9 @@ from rangeseg_ros.core.sensing.range_image import RangeImage, UnitWarning
 from rangeseg_ros.evaluation.hoover import classify
 from rangeseg_ros.evaluation.label_files import as_truth
 from rangeseg_ros.evaluation.overlap import overlap_figures
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 
 def segmented(depth, camera, **config):
@@ -23,7 +23,7 @@ def segmented(depth, camera, **config):
 
 def room(seed, noise='measured', width=640, height=480):
     camera = kinect_camera(width, height)
-    return simulate_kinect(kinect_room(seed), camera, noise=noise, seed=seed, sensor_seed=seed)
+    return simulate(kinect_room(seed), Kinect(seed, noise), camera, seed=seed)
 
 
 def compared(seeds, noise, width=640, height=480):

@@ -24,9 +24,9 @@ from rangeseg_ros.core.sensing.grid import Grid, View, grid_of
 from rangeseg_ros.core.sensing.moments import RATIO
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 NOISE = 0.002
 BLOCK = 2
@@ -219,7 +219,7 @@ def test_expansions_in_larger_images_never_raise_the_energy(seed):
 
 
 def small_room(seed=900):
-    frame = simulate_kinect(kinect_room(seed), kinect_camera(160, 120), seed=seed)
+    frame = simulate(kinect_room(seed), Kinect(0), kinect_camera(160, 120), seed=seed)
     image = RangeImage.from_depth(frame.depth, frame.camera)
     sensor = SensorModel.from_config(Config(pixel_noise=0.0))
     edges = grid_of(image)

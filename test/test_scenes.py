@@ -15,10 +15,9 @@ from rangeseg_ros.io.bags import DepthBag
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import read_depth, read_labels
 from rangeseg_ros.simulation import scenes
-from rangeseg_ros.simulation.kinect import simulate_kinect
-from rangeseg_ros.simulation.render import NOT_PLANAR, visible_regions
+from rangeseg_ros.simulation.render import NOT_PLANAR, simulate, visible_regions
 from rangeseg_ros.simulation.scenes import Pose, Scene, curved_scene
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 from rangeseg_ros.simulation.sensors.stereo import RealSense
 from rangeseg_ros.simulation.solids import Solid, box, cast, cylinder, half_space, prism, sphere
 from rangeseg_ros.simulation.terrain.frame import simulate_terrain
@@ -120,7 +119,7 @@ def test_face_cut_in_two_gives_two_regions_of_one_face():
 @pytest.mark.parametrize('seed', range(3))
 def test_points_of_a_region_lie_on_its_plane(build, seed):
     camera = kinect_camera(320, 240)
-    frame = simulate_kinect(build(seed), camera, noise='none')
+    frame = simulate(build(seed), Kinect(0, 'none'), camera)
     points = frame.depth[..., None].astype(float) * camera.rays
     for plane in frame.planes:
         assert plane.distance > 0
@@ -135,7 +134,7 @@ def test_points_of_a_region_lie_on_its_plane(build, seed):
 def test_truth_ids_persist_while_the_camera_moves():
     room = scenes.kinect_room(5, frames=30)
     camera = kinect_camera(160, 120)
-    first, last = (simulate_kinect(room, camera, frame=k, noise='none') for k in (0, 29))
+    first, last = (simulate(room, Kinect(0, 'none'), camera, frame=k) for k in (0, 29))
     before, after = room.poses[0], room.poses[29]
     turn = after.rotation.T @ before.rotation
     shift = after.rotation.T @ (before.position - after.position)
@@ -195,7 +194,7 @@ def test_kinect_folder_holds_the_scenes(tmp_path, run):
         assert sorted(path.stem for path in (output / kind).iterdir()) == names
 
     camera = read_camera(output / 'camera.yaml')
-    expected = simulate_kinect(curved_scene(8, 2), camera, frame=1, seed=8, sensor_seed=3)
+    expected = simulate(curved_scene(8, 2), Kinect(3), camera, frame=1, seed=8)
     assert camera == kinect_camera(160, 120)
     assert np.array_equal(read_depth(output / 'depth' / f'{names[3]}.png'), expected.depth)
     truth = read_labels(output / 'truth' / f'{names[3]}.png')

@@ -18,9 +18,9 @@ from rangeseg_ros.core.by_normals.labelling import (
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.messages.outputs import OUTPUTS
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 NORMALS = Config(method='normals')
 # Without noise neither a wide baseline nor much smoothing is called for.
@@ -57,7 +57,7 @@ def test_a_bent_wall_of_two_directions_is_two_labels_and_one_plane():
 @pytest.mark.parametrize('seed', range(4))
 def test_every_face_of_a_noise_free_room_is_found(seed):
     """Faces of 500 pixels that are nowhere thinner than the 9 pixels jump edges look at."""
-    frame = simulate_kinect(kinect_room(seed), noise='none', seed=seed)
+    frame = simulate(kinect_room(seed), Kinect(0, 'none'), seed=seed)
     result = segment(frame.depth, NOISE_FREE, frame.camera)
     checked = 0
     for plane in frame.planes:
@@ -172,7 +172,9 @@ def connected(height, width):
 def test_energy_is_close_to_that_of_the_full_expansion():
     """1 % is the package's promise, of rooms."""
     camera = kinect_camera(320, 240)
-    image = RangeImage.from_depth(simulate_kinect(kinect_room(5), camera, seed=5).depth, camera)
+    image = RangeImage.from_depth(
+        simulate(kinect_room(5), Kinect(0), camera, seed=5).depth, camera
+    )
     fast, full = (
         Segmenter(Config(method='normals', direction_count=73, exact=exact)).segment(image).energy
         for exact in (False, True)
@@ -226,7 +228,7 @@ KINECT = kinect_camera(160, 120)
 
 @pytest.fixture(scope='module')
 def room():
-    return simulate_kinect(kinect_room(3), KINECT, noise='none')
+    return simulate(kinect_room(3), Kinect(0, 'none'), KINECT)
 
 
 def segmented(room, **options):

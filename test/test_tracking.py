@@ -15,9 +15,9 @@ from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
 from rangeseg_ros.core.tracking.tracker import Tracker
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 KINECT = SensorModel.from_config(Config())
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -240,7 +240,7 @@ def test_simulated_rooms_keep_their_ids(seed):
     scene = kinect_room(seed, frames=60)
     frames = []
     for k in range(0, 60, 2):  # every other frame, so twice the speed
-        view = simulate_kinect(scene, camera, frame=k, noise='measured')
+        view = simulate(scene, Kinect(0, 'measured'), camera, frame=k)
         planes = fit_planes(view.labels, RangeImage.from_depth(view.depth, camera), KINECT)
         tracked = tracker.track(view.labels, planes, 10**9 + k * 10**9 // 30)
         faces = {plane.label: plane.face for plane in view.planes}

@@ -15,11 +15,10 @@ from rangeseg_ros.core.sensing.verdict import (
     improbable_scale,
     judge,
 )
-from rangeseg_ros.simulation.kinect import simulate_kinect
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import curved_scene, kinect_room
 from rangeseg_ros.simulation.sensors.catalogue import SENSORS
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 SENSOR_NAMES = ['kinect', 'realsense', 'tof']
 FACTORS = [2, 3, 4, 6, 8]
@@ -250,7 +249,7 @@ def test_errors_that_an_image_cannot_tell_are_said():
 
 @pytest.fixture(scope='module')
 def room():
-    return simulate_kinect(kinect_room(731), seed=731, sensor_seed=731)
+    return simulate(kinect_room(731), Kinect(731), seed=731)
 
 
 def disparities(frame, levels=None):

@@ -13,9 +13,9 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.evaluation import benchmark
 from rangeseg_ros.io.cameras import read_camera
 from rangeseg_ros.io.images import write_image
-from rangeseg_ros.simulation.kinect import simulate_kinect
+from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
-from rangeseg_ros.simulation.sensors.kinect import kinect_camera
+from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
 
 
 @click.command()
@@ -73,5 +73,5 @@ def _simulated(folder: Path, size: tuple[int, int], scenes: int) -> benchmark.Fr
     paths = []
     for seed in options.progress(range(scenes), scenes, 'scene'):
         paths.append(folder / f'{seed}.png')
-        write_image(paths[-1], simulate_kinect(kinect_room(seed), camera, seed=seed).depth)
+        write_image(paths[-1], simulate(kinect_room(seed), Kinect(0), camera, seed=seed).depth)
     return benchmark.Frames(tuple(paths), camera)

@@ -1,7 +1,7 @@
 """The discretised hemisphere of surface normals: what the labels of method `normals` stand for.
 
-They face the sensor: unit vectors with z < 0 in the optical frame (x right, y down,
-z forward). The equator is left out, as a surface seen edge-on does not appear in an image.
+They face the sensor: unit vectors with z < 0 in the optical frame. The equator is left out, as a
+surface seen edge-on does not appear in an image.
 """
 
 from __future__ import annotations

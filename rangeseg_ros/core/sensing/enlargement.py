@@ -76,14 +76,11 @@ def _at_centres(depth: NDArray[np.float64], columns: NDArray[np.intp]) -> NDArra
 
     From the two pixels on each side, between which and the centre the depth is linear.
     """
-    near, far = ([depth[:, _within(columns + s, depth)] for s in side] for side in _SIDES)
+    last = depth.shape[1] - 1
+    near, far = ([depth[:, (columns + s).clip(0, last)] for s in side] for side in _SIDES)
     known = [(a > 0) & (b > 0) for a, b in zip(near, far, strict=True)]
     sides = [(1.5 * a - 0.5 * b) * k for a, b, k in zip(near, far, known, strict=True)]
     return np.asarray(sum(sides) / np.maximum(np.sum(known, axis=0), 1))
-
-
-def _within(columns: NDArray[np.intp], lines: NDArray[Any]) -> NDArray[np.intp]:
-    return columns.clip(0, lines.shape[1] - 1)
 
 
 # As long as the camera of the pixels lives: of 12 megapixels, the rays take 150 MB.
@@ -143,8 +140,7 @@ def interpolation(image: RangeImage) -> Cells | None:
     """Cells between whose centres the depth is linear; None where it is not.
 
     Second differences vanish but beside the centres, at every k-th pixel: their mean size per
-    column has a line in its spectrum (Fisher, Tests of significance in harmonic analysis, 1929),
-    for k = 2 that of third differences.
+    column has a line in its spectrum (Fisher 1929), for k = 2 that of third differences.
     """
     amplitude = np.full(len(_PERIODS), np.inf)
     for lines in (image.inverse, image.inverse.T):
