@@ -116,8 +116,7 @@ def _over_scales(
     relative to `noise`, what 8 pixels show; M(8) relative to it; the measured share of most
     blocks; the largest distortion that any scale shows. None where too few blocks are flat.
     """
-    variance = noise.variances(coarse)
-    level = variance.repeat(2, axis=0).repeat(2, axis=1)
+    level = noise.variances(coarse).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
     count = blocks.moments[..., COUNT]
     # Six pixels leave three degrees of freedom.
@@ -147,8 +146,8 @@ def _over_scales(
             between = float(strata.medians(excess / level).mean())
             filled = pixels / BLOCK**2
         expected = shown.variances(larger)
-        bent, known = strata.medians(excess), strata.medians(expected)
-        bend = fit_law(strata, np.maximum(bent, FLOOR), known)
+        bent = np.maximum(strata.medians(excess), FLOOR)
+        bend = fit_law(strata, bent, strata.medians(expected))
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
         typical = 8 / pixels * float(np.median(bend.facing(strata.squared)))
         if typical > most:
