@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rangeseg_ros import Segmenter
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.fitting.error_law import Strata, fit_law
+from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
 from rangeseg_ros.core.fitting.noise import ROUGH, measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -109,17 +110,35 @@ def test_errors_of_direction_are_told_from_others(error):
     assert sensor_of(inverse).direction_noise == pytest.approx(error, rel=0.3)
 
 
+@pytest.mark.parametrize('like', [Law(1.0, 0.0), Law(0.0, 1.0)])
 @pytest.mark.parametrize(('count', 'told'), [(13, False), (200, False), (1000, True)])
-def test_a_few_blocks_tell_no_kind_of_error(count, told):
+def test_a_few_blocks_tell_no_kind_of_error(count, told, like):
     """Of one stratum of blocks either kind explains the median, so that rounding would decide."""
     draw = np.random.default_rng(5)
-    for _ in range(200):
+    for _ in range(100):
         squared, none = draw.uniform(0.04, 4, (1, count)), np.zeros((1, count))
         blocks = Blocks(none, squared, none, none)
         strata = Strata.of(blocks, np.arange(count))
         shown = strata.medians(1e-6 * squared**2 * draw.uniform(0.5, 2, count))
-        law = fit_law(strata, shown, np.zeros(len(shown)))
-        assert (law.quartic > 0) == told and (law.constant > 0) != told
+        law = fit_law(strata, shown, np.zeros(len(shown)), like)
+        in_range = told or like.quartic > 0
+        assert (law.quartic > 0) == in_range and (law.constant > 0) != in_range
+        if not told:
+            np.testing.assert_allclose(law.facing(strata.squared)[0], shown[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize('waves', [0.004, 0.008])
+def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves):
+    """Ten times as much of the inverse range near by, and hardly any noise."""
+    rows, columns = np.mgrid[0 : 1 : 1 / 480, 0 : 1 : 1 / 640]
+    inverse = 0.25 + 1.2 * np.maximum(rows - 0.5, 0) + 2 * np.maximum(0.15 - columns, 0)
+    random = np.random.default_rng(0)
+    field = smooth_field(CAMERA.shape, (12.0, 12.0), random)
+    noise = 6e-4 * random.standard_normal(CAMERA.shape)
+    image = RangeImage.from_depth((1 / inverse + waves * field + noise).astype(np.float32), CAMERA)
+    result = Segmenter().segment(image)
+    assert 0.7 * waves < result.sensor.range_distortion < 2 * waves
+    assert len(result.planes) == 4
 
 
 def test_strata_are_ranges_of_equal_size_and_slopes_in_them():

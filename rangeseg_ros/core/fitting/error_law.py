@@ -82,22 +82,23 @@ def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
     return np.partition(values, rank)[..., rank].copy()
 
 
-def fit_law(strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64]) -> Law:
+def fit_law(
+    strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64], like: Law
+) -> Law:
     """The law that with what is `known` explains the variances (S,) that strata show.
 
     Constant in disparity or, if that explains them better, in range: of both together a few
-    blocks tell nothing. First of surfaces that face the sensor: noise makes slopes
-    of its own, which would explain it. Then slopes explain what is left where that is no chance.
+    blocks tell nothing, and of one stratum it is of the kind of another law, `like`. First of
+    surfaces that face the sensor: noise makes slopes of its own, which would explain it. Then
+    slopes explain what is left where that is no chance.
     """
     facing = np.arange(0, len(shown), strata.slopes)
     quartic = strata.squared[facing] ** 2
     ahead, before = shown[facing], known[facing]
-    factor, deviance = _scale_term(np.ones(len(facing)), ahead, before)
-    law = Law(factor, 0.0)
-    # One stratum is explained by either, and rounding would decide.
-    if len(facing) > 1:
-        factor, other = _scale_term(quartic, ahead, before)
-        law = Law(0.0, factor) if other < deviance else law
+    constant, deviance = _scale_term(np.ones(len(facing)), ahead, before)
+    factor, other = _scale_term(quartic, ahead, before)
+    in_range = other < deviance if len(facing) > 1 else like.quartic > 0
+    law = Law(0.0, factor) if in_range else Law(constant, 0.0)
     known = known + law.facing(strata.squared)
     # A deviation is off by half of what its square is. Strata that differ tell by how much, in the
     # median, as clutter fills some.

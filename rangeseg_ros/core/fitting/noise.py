@@ -80,7 +80,7 @@ def measured_sensor(
     strata = Strata.of(coarse, used)
     shown = quantile(mean_square.ravel()[strata.blocks], _QUANTILE)
     shown = np.maximum(shown, least.facing(strata.squared))
-    noise = fit_law(strata, shown, np.zeros(len(shown)))
+    noise = fit_law(strata, shown, np.zeros(len(shown)), Law(1.0, 0.0))
     found = _over_scales(image.rays, blocks, coarse, noise, least, prior)
     if found is None:
         return prior
@@ -112,9 +112,8 @@ def _over_scales(
 ) -> tuple[list[float], float, float, Law] | None:
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
-    With the rays (H, W, 3), the least noise, and the `prior` of the distortion. V(4), V(8), ...
-    relative to `noise`, what 8 pixels show; M(8) relative to it; the measured share of most
-    blocks; the largest distortion that any scale shows. None where too few blocks are flat.
+    V(4), V(8), ... relative to `noise`, what 8 pixels show; M(8) relative to it; the measured
+    share of most blocks; the largest distortion of any scale. None where too few are flat.
     """
     level = noise.variances(coarse).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]
@@ -130,7 +129,7 @@ def _over_scales(
     shown = noise.times(within[0])
     shown = shown._replace(constant=max(shown.constant, least.constant))
     between, filled, distortion, most = 1.0, 1.0, Law(0.0, 0.0), 0.0
-    side, larger = 2 * BLOCK, coarse
+    side, larger, bend, ranges = 2 * BLOCK, coarse, noise, strata.squared
     while True:
         whole = sum_of_four(flat) == 4
         used = np.flatnonzero(whole)
@@ -147,9 +146,9 @@ def _over_scales(
             filled = pixels / BLOCK**2
         expected = shown.variances(larger)
         bent = np.maximum(strata.medians(excess), FLOOR)
-        bend = fit_law(strata, bent, strata.medians(expected))
+        bend = fit_law(strata, bent, strata.medians(expected), bend)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
-        typical = 8 / pixels * float(np.median(bend.facing(strata.squared)))
+        typical = 8 / pixels * float(np.median(bend.facing(ranges)))
         if typical > most:
             most, distortion = typical, bend.times(8 / pixels)
         # What one surface leaves where the sensor errs by as much as the prior allows. No less: of
