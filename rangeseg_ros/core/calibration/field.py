@@ -69,7 +69,9 @@ def solve(
         return np.asarray(own @ vector - coupling @ planes)
 
     matrix, alone = (LinearOperator(own.shape, f) for f in (product, splu(own).solve))
-    field, _ = cg(matrix, target, rtol=_TOLERANCE, maxiter=_ITERATIONS, M=alone)
+    # The tolerance that is relative has another name before SciPy 1.12.
+    close = _TOLERANCE * np.linalg.norm(target)
+    field, _ = cg(matrix, target, atol=close, maxiter=_ITERATIONS, M=alone)
     return np.asarray(field).reshape(count, size)
 
 

@@ -157,8 +157,8 @@ class Adjustment:
         lasting = sparse.hstack([own, field]) / (1 - LASTING) ** 0.5
         # How much of what lasts is of the field is not known: all of it may be, or none. What no
         # plane shows has to be something.
-        size = field.power(2).sum(axis=1).reshape(-1, 3).mean(axis=1)
-        size = max(float(np.median(size)), 1.0) if len(size) else 1.0
+        sizes = np.asarray(field.power(2).sum(axis=1)).reshape(-1, 3).mean(axis=1)
+        size = max(float(np.median(sizes)), 1.0) if len(sizes) else 1.0
         precision = np.repeat([1.0, size], [own.shape[1], field.shape[1]]) / LASTING
         told = _State(PlaneSet.of(planes), *map(np.array, zip(*self._poses, strict=True)))
         sightings = _Sightings(frame[used], plane[used], seen, root, lasting, precision)
@@ -195,13 +195,13 @@ class Adjustment:
             # Cauchy's weights: things that move by themselves are not to move the camera.
             off = (gap.reshape(-1, 3) ** 2).sum(axis=1)
             scale = np.repeat(1 / np.sqrt(1 + off / GATE), 3)
-            rows = sparse.vstack([sparse.diags_array(scale) @ design, prior]).tocsr()
+            rows = sparse.vstack([sparse.diags(scale) @ design, prior]).tocsr()
             factors = splu((rows.T @ rows).tocsc(), 'MMD_AT_PLUS_A', 0.0, options=_SYMMETRIC)
             step = factors.solve(rows.T @ np.concatenate([scale * gap, -prior @ known]))
             state, rest = state.corrected(step[:first], step[first:last]), rest + step[last:]
         # Of the inverse, what is of the planes and the drift.
         chosen = np.r_[:first, len(step) - 3 : len(step)]
-        unit = sparse.eye_array(len(step), format='csc')
+        unit = sparse.eye(len(step), format='csc')
         blocks = np.split(chosen, range(_COLUMNS, len(chosen), _COLUMNS))
         parts = [factors.solve(unit[:, block].toarray())[chosen] for block in blocks]
         return state, rest, np.hstack(parts)
@@ -219,10 +219,10 @@ class Adjustment:
     def _prior(self, planes: int, precision: NDArray[np.float64], drifts: bool) -> Any:
         """What is known beforehand of all but the planes, as equations of unit variance."""
         frames, way = len(self._poses), self._way()
-        change = sparse.eye_array(frames)
+        change = sparse.eye(frames)
         if self._odometry:
-            change -= sparse.eye_array(frames, k=-1)
-        poses = sparse.kron(change, sparse.diags_array(1 / self._noise))
+            change -= sparse.eye(frames, k=-1)
+        poses = sparse.kron(change, sparse.diags(1 / self._noise))
         shift = np.vstack([np.zeros((3, 3)), np.eye(3)])
         effects, known = [np.kron(way[:, None], shift)], []
         for after, jump in self._jumps:
@@ -234,11 +234,11 @@ class Adjustment:
             whiten = np.linalg.inv(np.linalg.cholesky(jump.covariance))
             known.append(sparse.csr_array(whiten))
         # No drift is longer than the way.
-        known.append(sparse.eye_array(3) / (1.0 if drifts else _LEAST))
+        known.append(sparse.eye(3) / (1.0 if drifts else _LEAST))
         rest = -poses @ sparse.csr_array(np.hstack(effects))
-        rows = sparse.block_array([
+        rows = sparse.bmat([
             [poses, None, rest],
-            [None, sparse.diags_array(np.sqrt(precision)), None],
+            [None, sparse.diags(np.sqrt(precision)), None],
             [None, None, sparse.block_diag(known)],
         ])  # fmt: skip
         return sparse.hstack([sparse.csr_array((rows.shape[0], planes)), rows]).tocsr()
