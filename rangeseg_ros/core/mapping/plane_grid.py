@@ -183,14 +183,12 @@ def in_sight(
 
     They are around what the pyramid of its rays, up to the farthest range measured, has of planes.
     """
-    camera = image.camera
+    camera, corners = image.camera, np.zeros((5, 3))
     assert camera is not None
     nearest = cv2.minMaxLoc(image.inverse, (image.inverse > 0).view(np.uint8))[0]
-    if not nearest:
-        return {}
     sides = [(u, v, 1.0) for u in (-0.5, camera.width - 0.5) for v in (-0.5, camera.height - 0.5)]
-    corners = np.zeros((5, 3))
-    corners[1:] = np.array(sides) @ np.linalg.inv(camera.matrix).T @ camera.axes.T / nearest
+    farthest = np.linalg.inv(camera.matrix).T @ camera.axes.T / (nearest or np.inf)
+    corners[1:] = np.array(sides) @ farthest
     height = corners @ planes.normal.T + planes.distance
     crossed = np.flatnonzero((height.min(axis=0) <= 0) & (height.max(axis=0) >= 0))
     some = planes.where(crossed)
