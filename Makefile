@@ -105,4 +105,4 @@ $(VENV)/writers: $(VENV)/installed
 	touch $@
 
 clean:
-	rm -rf $(VENV) demo site build install log dist *.egg-info
+	rm -rf $(VENV) .venv-oldest demo site build install log dist *.egg-info

@@ -198,7 +198,7 @@ def run(
 ) -> tuple[str, str]:
     """What tests say within `limit` seconds of a copy in `root`, and which failed first."""
     folder = tempfile.mkdtemp(dir=root)
-    left_out = shutil.ignore_patterns('.git', '.venv', 'site', 'demo')
+    left_out = shutil.ignore_patterns('.git', '.venv*', 'site', 'demo')
     shutil.copytree(ROOT, folder, ignore=left_out, dirs_exist_ok=True)
     if mutant:
         target = Path(folder, mutant.path.relative_to(ROOT))
