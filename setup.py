@@ -141,7 +141,7 @@ setup(
         'click>=8.0',
         'mapbox-earcut>=1.0,<3',
         # kernel_cache.py uses what it keeps to itself.
-        f'numba=={metadata.version("numba")}' if cpu else 'numba>=0.58.1,<0.69',
+        f'numba=={metadata.version("numba")}' if cpu else 'numba>=0.61.2,<0.69',
         'numpy>=1.26',
         'opencv-python-headless>=4.6',
         'pillow>=9.4',

@@ -2,6 +2,7 @@
 
 python docs/measure_frames.py map SEED...         walks through simulated rooms, against the truth
 python docs/measure_frames.py lies SEED...        poses that drift or jump
+python docs/measure_frames.py loops SEED...       ends of walks by odometry, and solved
 python docs/measure_frames.py odometry SEED...    the same, without poses
 python docs/measure_frames.py mount COUNT SEED    cameras in simulated rooms
 python docs/measure_frames.py hour FRAMES         a walk along a corridor, 10 frames a second
@@ -156,6 +157,32 @@ def measure_lies(*seeds: str) -> None:
     print('jumps found, mm in all, drift found (%), poses before and after solving (mm): medians')
     for lie, each in rows.items():
         print(f'{lie}:', np.round(np.median(each, axis=0), 1), 'jumps', [int(r[0]) for r in each])
+
+
+def measure_loops(*seeds: str) -> None:
+    """How far the ends of a walk are off each other by odometry, and after solving."""
+    rows = []
+    for seed in map(int, seeds):
+        config = Config(odometry=True)
+        odometry, plane_map = PlaneOdometry(config), PlaneMap(config)
+        adjustment = Adjustment(PoseNoise(0.005, np.radians(0.3)), odometry=True)
+        frames, told = list(walked(kinect_room(seed, FRAMES * STEP, walk), seed)), []
+        for frame in frames:
+            seen = views(frame.labels, frame.planes, CONFIG.distortion_length)
+            up = frames[0].pose.rotation[2]
+            motion = odometry.add(frame.planes, seen, frame.stamp, up, edges=frame.edges)
+            told.append(motion.pose)
+            plane_map.add(frame.labels, frame.planes, frame.image, told[-1], frame.stamp)
+            adjustment.add(plane_map.sighting)
+        solution = adjustment.solve(plane_map.planes, plane_map.successors)
+        truth = frames[0].pose.inverse().after(frames[-1].pose)
+        rows.append([])
+        for poses in (told, solution.poses):
+            error = truth.inverse().after(poses[0].inverse().after(poses[-1]))
+            turn = Rotation.from_matrix(error.rotation).magnitude()
+            rows[-1] += [1e3 * np.linalg.norm(error.shift), np.degrees(turn)]
+    print('ends of the walk: mm and degrees by odometry, then solved; medians')
+    print(np.round(np.median(rows, axis=0), 2), np.round(rows, 1).tolist())
 
 
 def best_fit(frames: list[Frame], poses: list[Transform]) -> float:
