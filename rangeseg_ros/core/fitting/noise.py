@@ -113,7 +113,8 @@ def _over_scales(
     """What blocks of 4, 8, 16, ... pixels show, as long as there are enough of them.
 
     V(4), V(8), ... relative to `noise`, what 8 pixels show; M(8) relative to it; the measured
-    share of most blocks; the largest distortion of any scale. None where too few are flat.
+    share of most blocks; the largest distortion of any scale. None where too few are flat. Noise
+    is the `least` at least; what bends by more than the `prior` allows is more than one surface.
     """
     level = noise.variances(coarse).repeat(2, axis=0).repeat(2, axis=1)
     level = level[: len(blocks.squared), : blocks.squared.shape[1]]

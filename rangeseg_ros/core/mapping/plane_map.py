@@ -275,11 +275,8 @@ class PlaneMap:
             (k, a), (m, b) = sorted(((k, a), (m, b)), key=lambda pair: -pair[1].observations)
             own = filters.planes.where([m]).points(b.grid.centres())
             centres = filters.planes.where([k]).coordinates(own)
-            if (
-                not len(own)
-                or a.grid.distance(centres.mean(axis=0))
-                > np.hypot(*b.grid.odds.shape) * b.grid.side
-            ):
+            across = np.hypot(*b.grid.odds.shape) * b.grid.side
+            if not len(own) or a.grid.distance(centres.mean(axis=0)) > across:
                 continue
             a.grid.absorb(centres, b.grid.odds[b.grid.odds > 0])
             first, second = sorted((a.id, b.id))
