@@ -127,13 +127,14 @@ def test_a_few_blocks_tell_no_kind_of_error(count, told, like):
             np.testing.assert_allclose(law.facing(strata.squared)[0], shown[0], rtol=1e-5)
 
 
+@pytest.mark.parametrize('far', [0.25, 0.6])
 @pytest.mark.parametrize('waves', [0.004, 0.008])
-def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves):
+def test_waves_of_the_range_are_distortion_however_far_a_surface_is(waves, far):
     """Ten times as much of the inverse range near by, and hardly any noise."""
     rows, columns = np.mgrid[0 : 1 : 1 / 480, 0 : 1 : 1 / 640]
-    inverse = 0.25 + 1.2 * np.maximum(rows - 0.5, 0) + 2 * np.maximum(0.15 - columns, 0)
+    inverse = far + np.maximum(rows - 0.5, 0) + 2 * np.maximum(0.15 - columns, 0)
     random = np.random.default_rng(0)
-    field = smooth_field(CAMERA.shape, (12.0, 12.0), random)
+    field = smooth_field(CAMERA.shape, (16.0, 16.0), random)
     noise = 6e-4 * random.standard_normal(CAMERA.shape)
     image = RangeImage.from_depth((1 / inverse + waves * field + noise).astype(np.float32), CAMERA)
     result = Segmenter().segment(image)

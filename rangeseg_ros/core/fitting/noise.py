@@ -41,6 +41,8 @@ _ENOUGH = 2400
 # Errors that simulated images without noise are taken to have, 1/m: 0.4 mm at 2 m, less than
 # sensors have but more than what sums of float32 over windows do.
 _EXACT = 1e-4
+# Largest blocks, pixels: about as wide as distortions look. Most of larger ones hold a corner.
+_WIDEST = 8 * BLOCK
 # Widths of kernels that are told apart, pixels.
 _WIDTHS = (0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 # Rows that tell the quantisation by, and the quantile of steps that is one quantum where there is
@@ -131,7 +133,7 @@ def _over_scales(
     shown = shown._replace(constant=max(shown.constant, least.constant))
     between, filled, distortion, most = 1.0, 1.0, Law(0.0, 0.0), 0.0
     side, larger, bend, ranges = 2 * BLOCK, coarse, noise, strata.squared
-    while True:
+    while side <= _WIDEST:
         whole = sum_of_four(flat) == 4
         used = np.flatnonzero(whole)
         if len(used) < SAMPLES:
