@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as graph_components
 
-from rangeseg_ros.core.regions import connected_components, drop_regions, plane_regions
+from rangeseg_ros.core.regions import connected_components, numbers_of, plane_regions, relabel
 from rangeseg_ros.core.sensing.grid import Grid
 
 
@@ -32,7 +32,7 @@ def test_components_of_random_images(seed):
 
 def test_regions_left_keep_their_order():
     regions = np.array([[1, 1, 1, 1], [2, 2, 2, 3], [3, 4, 0, 0]], np.uint16)
-    found = drop_regions(regions, np.array([True, False, True, False, False]))
+    found = relabel(regions, numbers_of(np.array([False, True, False, True, True])))
     assert found.tolist() == [[1, 1, 1, 1], [0, 0, 0, 2], [2, 3, 0, 0]]
     assert found.dtype == np.uint16
 

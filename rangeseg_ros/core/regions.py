@@ -82,13 +82,10 @@ def region_sizes(regions: NDArray[np.uint16], count: int) -> NDArray[np.intp]:
     return sizes
 
 
-def drop_regions(regions: NDArray[np.uint16], dropped: NDArray[np.bool_]) -> NDArray[np.uint16]:
-    """Number the regions 1...M that are not `dropped` (M + 1,) without gaps; the rest become 0."""
-    if not dropped.any():
-        return regions
-    kept = ~dropped
-    kept[0] = False
-    return relabel(regions, np.where(kept, np.cumsum(kept), 0).astype(np.uint16))
+def numbers_of(kept: NDArray[np.bool_]) -> NDArray[np.uint16]:
+    """New number of each region: 1, 2, ... of those of 1...M that are `kept` (M + 1,), else 0."""
+    kept = kept & (np.arange(len(kept)) > 0)
+    return np.where(kept, np.cumsum(kept), 0).astype(np.uint16)
 
 
 def by_falling_size(area: NDArray[np.integer]) -> NDArray[np.uint16]:

@@ -19,9 +19,9 @@ from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.noise import measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
-from rangeseg_ros.core.regions import least_pixels, plane_regions, relabel
+from rangeseg_ros.core.regions import least_pixels, numbers_of, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
-from rangeseg_ros.core.runtime.threads import submit
+from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -91,13 +91,12 @@ class Segmenter:
             )
         if config.mask and image.body is None:
             raise RangeImageError('mask is not applied yet: segment corrected(image, config)')
-        cells = submit(enlargement, image)
         if shows_disparity(image):
             depth = from_disparity(image)
             result = self._undone(depth, enlargement(depth))
             # Heights in no unit are no ground to drive on.
             return replace(result, image=image, disparity=True, survey=None)
-        return self._undone(image, cells.result())
+        return self._undone(image, enlargement(image))
 
     def _undone(self, image: RangeImage, cells: Cells | None) -> Segmentation:
         """Segment an image, of which a measurement fills several pixels, `cells`, or one."""
@@ -131,29 +130,29 @@ class Segmenter:
         regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
         regions = unite_regions(regions, view, config.plane_smoothness)
-        if config.method == 'planes':
-            regions, curved, probability, fits = by_planes.flat_regions(regions, view, config)
+        pixels: Task[NDArray[np.uint16]] | None = None
+        if isinstance(labelling, by_planes.Labelling):
+            if side > 1:
+                given = regions, labelling.labels, labelling.models, image, side, sensor
+                pixels = submit(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
+            flat, probability, fits = by_planes.flat_regions(regions, view, config)
+            numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
         else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
             probability = plane_probabilities(fits, config.plane_prior)
+            numbers = np.arange(len(probability), dtype=np.uint16)
+        regions = relabel(regions, numbers)
         watch.lap('regions')
         # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
         # or so steep that they have no end.
         known = fits.farthest() > 0
         labels = relabel(regions, (known * np.arange(len(known))).astype(np.uint16))
-        labels, cells = labels * view.image.valid, None
-        if isinstance(labelling, by_planes.Labelling) and side > 1:
-            given = labels, labelling.labels, labelling.models, image, side, sensor
-            pixels = submit(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
-            planes = describe_regions(regions, view.whole, fits, probability, sensor, pixels)
-            labels, cells = pixels.result(), Cells(side, 0, 0)
-        else:
-            planes = describe_regions(regions, view.whole, fits, probability)
-        watch.lap('planes')
-        return Segmentation(
-            labels,
+        errors = sensor if pixels else fits.sensor
+        planes = describe_regions(regions, view.whole, fits, errors, probability)
+        result = Segmentation(
+            labels * view.image.valid,
             planes,
             watch.laps,
             _reason(image, planes),
@@ -163,10 +162,14 @@ class Segmenter:
             upright=(config.role_tolerance, config.role_area, config.ground_slope),
             work_budget=config.work_budget,
             image=image,
-            cells=cells,
             curved_regions=curved,
             identified=view.identified,
         )
+        if pixels:
+            labels = relabel(pixels.result(), known[numbers] * numbers)
+            result = result.of_pixels(labels, image, Cells(side, 0, 0))
+        watch.lap('planes')
+        return result
 
 
 def _preprocessed(
@@ -176,13 +179,12 @@ def _preprocessed(
 
     And the errors of its pixels, and the jump edges between bins.
     """
-    quanta = submit(quantisation, image.inverse)
     least = -(-least_pixels(config.min_pixels, image.shape) // side**2)
     stated = SensorModel.from_config(config, image.shape).binned(side)
     bins = Bins.of(image, side)
     blocks, sensor = Blocks.of(bins.means), stated
     if config.sensor_model == 'measured':
-        sensor = measured_sensor(bins.means, blocks, stated, quanta.result())
+        sensor = measured_sensor(bins.means, blocks, stated, quantisation(image.inverse))
     identified = config.sensor_model != 'measured' or sensor is not stated
     watch.lap('noise')
     # Method normals tells parallel surfaces apart by jump edges alone, so that one too many on

@@ -5,10 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
+from numpy.typing import NDArray
+
 LEVEL = 0.999  # quantile that noise stays below: where it does not, something else is there
 OUTLIER = 4.0  # standard deviations from which an error is no noise: one of 16 000 by chance
 CLEARLY = 2.0  # how many times more must speak for one of two things than for the other
 SAMPLES = 12  # that tell three parameters, those of a plane, or a quantile: four for each
+
+
+def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
+    """Of values (..., N), the one (...,) that a share of them is below."""
+    rank = int(share * (values.shape[-1] - 1))
+    return np.partition(values, rank)[..., rank].copy()
 
 
 def chi2_quantile(freedom: float, level: float = LEVEL) -> float:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import shift_at
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -39,18 +38,12 @@ def with_sharp_borders(
     height, width = image.shape
     labels = regions.repeat(side, axis=1).repeat(side, axis=0)[:height, :width] * image.valid
     pixels = image.inverse, image.rays, image.pinhole
-    given = regions, surfaces, models, *pixels, sensor, prior, side, labels
-    # Rows of bins in turn: those that change at the same time do not touch.
-    for odd in (0, 1):
-        run_rows(_settle, (len(regions) + 1 - odd) // 2, odd, *given)
+    _settle(regions, surfaces, models, *pixels, sensor, prior, side, labels)
     return labels
 
 
 @njit(cache=True, nogil=True)
 def _settle(
-    first: int,
-    after: int,
-    odd: int,
     regions: NDArray[np.uint16],
     surfaces: NDArray[np.int32],
     models: Models,
@@ -62,11 +55,11 @@ def _settle(
     side: int,
     labels: NDArray[np.uint16],
 ) -> None:
-    """Give pixels of bins in every second row the label of the lowest cost, in place."""
+    """Give pixels of bins beside others the label of the lowest cost, in place."""
     (rows, columns), (height, width) = regions.shape, labels.shape
     names, planes = np.empty(_LABELS, np.uint16), np.empty(_LABELS, np.intp)
     nearer, near = np.empty(_LABELS), np.empty(4, np.uint16)
-    for i in range(2 * first + odd, 2 * after + odd - 1, 2):
+    for i in range(rows):
         above, below = regions[max(i - 1, 0)], regions[min(i + 1, rows - 1)]
         for j in range(columns):
             here, left, right = regions[i, j], max(j - 1, 0), min(j + 1, columns - 1)

@@ -16,7 +16,7 @@ from rangeseg_ros.core.by_planes.plane_energy import (
 )
 from rangeseg_ros.core.by_planes.shifts import shifts
 from rangeseg_ros.core.graphcut.expansion import GridLabelling, band, beyond, expand, fronts
-from rangeseg_ros.core.runtime.threads import run_halves, run_rows
+from rangeseg_ros.core.runtime.threads import run_halves
 from rangeseg_ros.core.sensing.sensor import SensorModel
 
 # Pixels from a boundary to cut anew: so far may that of blocks lie from that of pixels.
@@ -46,7 +46,7 @@ def refine(
     labels = np.empty(len(problem.inverse), np.int32)
     # What labels cost is worked out where it is asked for.
     data = np.full(len(labels), np.nan, np.float32)
-    run_rows(_label_block_row, len(surfaces), surfaces, labels, data, problem, models)
+    _label_blocks(surfaces, labels, data, problem, models)
     labelling = GridLabelling.of(labels, data, problem.links, problem.width)
     height = len(labels) // problem.width
     run_halves(_expand_near, height, labelling, problem, models)
@@ -54,23 +54,21 @@ def refine(
 
 
 @njit(cache=True, nogil=True)
-def _label_block_row(
-    first: int,
-    after: int,
+def _label_blocks(
     surfaces: NDArray[np.int32],
     labels: NDArray[np.int32],
     data: NDArray[np.float32],
     problem: Problem,
     models: Models,
 ) -> None:
-    """Label the pixels of some rows of blocks (rows, columns) with the surfaces of these.
+    """Label the pixels of blocks (rows, columns) with the surfaces of these.
 
     The pixels of a block without a surface, most of which a border crosses, get the label of the
     lowest cost among those of the blocks around it: expansions then have less to change.
     """
     width = problem.width
     around = np.empty(9, np.int32)
-    for bi in range(first, after):
+    for bi in range(len(surfaces)):
         for bj in range(surfaces.shape[1]):
             own = surfaces[bi, bj]
             count = 0

@@ -16,8 +16,6 @@ from rangeseg_ros.core.by_planes.surfaces import join_surfaces
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.graphcut.expansion import energy
-from rangeseg_ros.core.regions import drop_regions
-from rangeseg_ros.core.runtime.threads import submit
 from rangeseg_ros.core.sensing.grid import View
 
 
@@ -43,10 +41,9 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
     nodes = Nodes.of(view)
     lap('blocks')
     smoothness = config.plane_smoothness
-    pending = submit(Problem.of, whole, sensor, view.grid, smoothness)
     patches = find_patches(nodes, sensor)
     surface, moments = join_surfaces(*patches, nodes, view, smoothness)
-    problem = pending.result()
+    problem = Problem.of(whole, sensor, view.grid, smoothness)
     lap('surfaces')
     labels, models = refine(problem, surface, nodes.moments, moments, sensor)
     lap('labels')
@@ -55,14 +52,13 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
 
 def flat_regions(
     regions: NDArray[np.uint16], view: View, config: Config
-) -> tuple[NDArray[np.uint16], NDArray[np.uint16], NDArray[np.float64], Fits]:
-    """Regions (H, W) whose probability to be a plane is `plane_probability` at least, and others.
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], Fits]:
+    """Which regions (H, W) are planes with a probability of `plane_probability` at least.
 
-    Numbered anew, with the probabilities (M + 1,) and the fits of the first.
+    For 0...M, with True for 0; and the probabilities and the fits of those that are.
     """
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
     probability = plane_probabilities(fits, config.plane_prior)
-    curved = probability < config.plane_probability
-    curved[0] = False
-    kept = drop_regions(regions, curved), drop_regions(regions, ~curved)
-    return *kept, probability[~curved], fits.without(curved)
+    flat = probability >= config.plane_probability
+    flat[0] = True
+    return flat, probability[flat], fits.without(~flat)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.shifts import Shifts, shift_at
 from rangeseg_ros.core.graphcut.expansion import link_costs
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.grid import Grid
 from rangeseg_ros.core.sensing.moments import COUNT, RATIO, SIZE, SLOPE, add_pixel, fit_all
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -122,24 +121,20 @@ def region_moments(
     labels: NDArray[np.integer], count: int, image: RangeImage, sensor: SensorModel
 ) -> NDArray[np.float64]:
     """Moments (count, 13) of the pixels of each of `count` labels (H, W); zeros for label 0."""
-    given = labels, count, image.inverse, image.rays, sensor
-    upper, lower = map_halves(_sum_moments, len(labels), *given)
-    return upper + lower
+    return _sum_moments(labels, count, image.inverse, image.rays, sensor)
 
 
 @njit(cache=True, nogil=True)
 def _sum_moments(
-    first: int,
-    after: int,
     labels: NDArray[np.integer],
     count: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     sensor: SensorModel,
 ) -> NDArray[np.float64]:
-    """What some rows add to `region_moments`."""
+    """See `region_moments`."""
     total = np.zeros((count, SIZE))
-    for i in range(first, after):
+    for i in range(len(labels)):
         weight = _weights(inverse[i], sensor)
         for j in range(labels.shape[1]):
             label, y, w = labels[i, j], np.float64(inverse[i, j]), np.float64(weight[j])

@@ -13,8 +13,6 @@ from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
-from rangeseg_ros.core.regions import region_sizes
-from rangeseg_ros.core.runtime.threads import Task, submit
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -167,23 +165,20 @@ def describe_regions(
     labels: NDArray[np.uint16],
     image: RangeImage,
     fits: Fits,
+    sensor: SensorModel,
     probability: NDArray[np.float64] | None = None,
-    sensor: SensorModel | None = None,
-    pixels: Task[NDArray[np.uint16]] | None = None,
 ) -> list[Plane]:
     """Planes of the regions 1...M of `labels` (H, W), but of those whose pixels determine none.
 
-    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given. Where the
-    image is of means of pixels, `sensor` is that of the pixels, and `pixels` what finds their
-    labels, which may go on meanwhile.
+    `probability` (M + 1,) is that of the regions to be planes, 1 where it is not given. `sensor`
+    is that of the pixels, of which those of the image may be means.
     """
     theta = fits.theta
     probability = np.ones(len(theta)) if probability is None else probability
     if not theta.any():
         return []
     root = fits.covariance_roots()
-    surfaces = submit(common_surfaces, fits, squares(root))
-    normal, distance, centroid, rms, confidence = _described(fits, sensor or fits.sensor)
+    normal, distance, centroid, rms, confidence = _described(fits, sensor)
     covariance = squares(plane_jacobians(normal, distance) @ root)
     if image.place.any():
         # From the sensor to the frame of the points.
@@ -200,8 +195,8 @@ def describe_regions(
         rays = image.camera or image.rays[crop]
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
-    counts = region_sizes(pixels.result(), len(theta)) if pixels else fits.pixels
-    numbers = surfaces.result(), distance, counts, rms, confidence, probability
+    surfaces = common_surfaces(fits, squares(root))
+    numbers = surfaces, distance, fits.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]
     place, right = image.place, image.axes[:, 0].copy()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.sensor import FLOOR
-from rangeseg_ros.core.significance import chi2_quantile, f_quantile
+from rangeseg_ros.core.significance import chi2_quantile, f_quantile, quantile
 
 # Strata of the inverse range, in each of the slope, and blocks of one at least: the error of a
 # quantile of 40 blocks of 13 degrees of freedom is 7 % of a standard deviation.
@@ -76,12 +76,6 @@ class Strata(NamedTuple):
         return quantile(values.ravel()[self.blocks], 0.5)
 
 
-def quantile(values: NDArray[np.float64], share: float) -> NDArray[np.float64]:
-    """Of values (..., N), the one (...,) that a share of them is below."""
-    rank = int(share * (values.shape[-1] - 1))
-    return np.partition(values, rank)[..., rank].copy()
-
-
 def fit_law(
     strata: Strata, shown: NDArray[np.float64], known: NDArray[np.float64], like: Law
 ) -> Law:
@@ -103,7 +97,7 @@ def fit_law(
     # A deviation is off by half of what its square is. Strata that differ tell by how much, in the
     # median, as clutter fills some.
     ratio = shown / known
-    spread = np.median(np.abs(ratio - np.median(ratio))) / _MEDIAN
+    spread = quantile(np.abs(ratio - quantile(ratio, 0.5)), 0.5) / _MEDIAN
     law = law._replace(error=float(spread / (2 * len(shown) ** 0.5)))
     tilt, deviance = _scale_term(strata.slope, shown, known)
     if _advantage(deviance, _deviance(known, shown), shown) < _SIGNIFICANT:

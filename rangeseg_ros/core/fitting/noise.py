@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law, quantile
+from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks, sum_of_four
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -22,7 +22,7 @@ from rangeseg_ros.core.sensing.sensor import (
     correlated_residuals,
     systematic_variance,
 )
-from rangeseg_ros.core.significance import CLEARLY, OUTLIER, SAMPLES, chi2_quantile
+from rangeseg_ros.core.significance import CLEARLY, OUTLIER, SAMPLES, chi2_quantile, quantile
 
 ROUGH = chi2_quantile(13) / 13
 """Chi-squared of 13 degrees of freedom over its mean: what is rougher is no part of a plane."""
@@ -151,7 +151,7 @@ def _over_scales(
         bent = np.maximum(strata.medians(excess), FLOOR)
         bend = fit_law(strata, bent, strata.medians(expected), bend)
         # M(s) = v + D^2 n / 8, with n pixels in each of the four.
-        typical = 8 / pixels * float(np.median(bend.facing(ranges)))
+        typical = 8 / pixels * float(quantile(bend.facing(ranges), 0.5))
         if typical > most:
             most, distortion = typical, bend.times(8 / pixels)
         # What one surface leaves where the sensor errs by as much as the prior allows. No less: of
@@ -242,9 +242,8 @@ def quantisation(inverse: NDArray[np.float32]) -> tuple[float, float]:
 
 def _common_step(steps: NDArray[np.float64]) -> tuple[float, float]:
     """The step of which the smaller ones of these are multiples, and how clearly they are."""
-    rank = int(_SMALLEST * (len(steps) - 1))
-    small = np.partition(steps, rank)[rank]
+    small = quantile(steps, _SMALLEST)
     # What was rounded twice is off by a little.
     near = steps[np.abs(steps - small) < 0.2 * small]
     others = int(np.count_nonzero(steps < 1.8 * small)) - len(near)
-    return float(np.median(near)), len(near) / max(others, 1)
+    return float(quantile(near, 0.5)), len(near) / max(others, 1)

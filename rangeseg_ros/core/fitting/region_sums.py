@@ -13,7 +13,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.blocks import BLOCK, Blocks
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
@@ -96,9 +95,7 @@ def sum_regions(
     pixels = labels, inside, image.inverse, image.rays, image.pinhole, image.camera is not None
     moments = blocks.moments.reshape(inside.size, -1)
     planes = fit_sums(sum_by_label(inside.ravel(), moments, len(layout.box)))
-    given = *pixels, axis, blocks, sensor, layout, planes
-    upper, lower = map_halves(_accumulate, len(inside), *given)
-    cells, outside = upper + lower
+    cells, outside = _accumulate(*pixels, axis, blocks, sensor, layout, planes)
     owners, count = regions_of(layout.start), len(layout.box)
     total, left_out = (sum_by_label(owners, part, count) for part in (cells, outside))
     outliers = left_out[:, COUNT].astype(np.intp)
@@ -168,8 +165,6 @@ def _cell_of(layout: Layout, label: int, bi: int, bj: int) -> int:
 
 @njit(cache=True, nogil=True)
 def _accumulate(
-    first: int,
-    after: int,
     labels: NDArray[np.uint16],
     inside: NDArray[np.int32],
     inverse: NDArray[np.float32],
@@ -182,13 +177,13 @@ def _accumulate(
     layout: Layout,
     theta: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Sums (2, N, 29) over the pixels in some rows of blocks: of inliers of `theta`, of outliers.
+    """Sums (2, N, 29) over the pixels of regions: of inliers of `theta`, of outliers.
 
     Of regions whose plane (M + 1, 3) is zero there are no outliers.
     """
     height, width = labels.shape
     cells = np.zeros((2, layout.start[-1], RECORD))
-    for bi in range(first, after):
+    for bi in range(len(inside)):
         bottom = min((bi + 1) * BLOCK, height)
         for bj in range(inside.shape[1]):
             right, squared = min((bj + 1) * BLOCK, width), blocks.squared[bi, bj]

@@ -14,12 +14,11 @@ from numba import njit
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import VGA
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.enlargement import Cells, camera_of_cells
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
-from rangeseg_ros.core.significance import chi2_quantile
+from rangeseg_ros.core.significance import chi2_quantile, quantile
 
 # Pixels of an image that needs no bins.
 _BINS = VGA / 4
@@ -54,7 +53,7 @@ class Bins(NamedTuple):
         if side == 1:
             return cls(1, image, image, np.zeros(image.shape, np.float32), area)
         inverse, spread = np.empty((2, *(-(-n // side) for n in image.shape)), np.float32)
-        run_rows(_average, len(inverse), image.inverse, side, inverse, spread)
+        _average(image.inverse, side, inverse, spread)
         means = replace(image, inverse=inverse)
         if image.camera:
             camera = camera_of_cells(Cells(side, 0, 0), image.camera)
@@ -84,7 +83,7 @@ class Bins(NamedTuple):
         if not len(a):
             return 1.0
         expected = random_variance(sensor, ((a + b + c + d) / 4) ** 2)
-        new = np.median((a - b - c + d) ** 2 / expected) / (4 * _MEDIAN)
+        new = quantile((a - b - c + d) ** 2 / expected, 0.5) / (4 * _MEDIAN)
         return float(1 + (1 - 1 / side**2) * new)
 
     def of_one_surface(self, steps: NDArray[np.float32]) -> RangeImage:
@@ -113,18 +112,13 @@ class Bins(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _average(
-    first: int,
-    after: int,
-    pixels: NDArray[np.float32],
-    side: int,
-    means: NDArray[np.float32],
-    spread: NDArray[np.float32],
+    pixels: NDArray[np.float32], side: int, means: NDArray[np.float32], spread: NDArray[np.float32]
 ) -> None:
-    """Means of what was measured in some rows of bins, and the largest difference in each."""
-    columns = means.shape[1]
+    """Fill in the mean of what was measured in each bin, and the largest difference there."""
+    rows, columns = means.shape
     total, count = np.empty(columns), np.empty(columns, np.float32)
     most, least = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    for i in range(first, after):
+    for i in range(rows):
         total[:], count[:], most[:], least[:] = 0, 0, 0, np.inf
         # Along a row, the compiler takes many bins at a time.
         for u in range(i * side, min((i + 1) * side, len(pixels))):

@@ -8,7 +8,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.moments import (
     CHI2,
     COUNT,
@@ -46,8 +45,7 @@ class Blocks(NamedTuple):
         """Blocks of `size` pixels."""
         height, width = image.shape
         blocks = cls._empty(-(-height // size), -(-width // size))
-        pixels = image.inverse, image.rays, image.pinhole
-        run_rows(_sum_pixels, len(blocks.moments), *pixels, size, blocks)
+        _sum_pixels(image.inverse, image.rays, image.pinhole, size, blocks)
         return blocks
 
     def merged(self, rays: NDArray[np.float32], size: int) -> Blocks:
@@ -55,7 +53,7 @@ class Blocks(NamedTuple):
         rows, columns = self.squared.shape
         blocks = self._empty((rows + 1) // 2, (columns + 1) // 2)
         blocks.moments[:] = sum_of_four(self.moments)
-        _fit_planes(0, len(blocks.moments), rays, size, blocks)
+        _fit_planes(rays, size, blocks)
         return blocks
 
     @classmethod
@@ -82,18 +80,16 @@ def for_pixels(values: NDArray, shape: tuple[int, int]) -> NDArray:
 
 @njit(cache=True, nogil=True)
 def _sum_pixels(
-    first: int,
-    after: int,
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
     pinhole: bool,
     size: int,
     blocks: Blocks,
 ) -> None:
-    """Fill in rows of blocks of pixels."""
+    """Fill in blocks of pixels."""
     height, width = inverse.shape
     moments = blocks.moments
-    for bi in range(first, after):
+    for bi in range(moments.shape[0]):
         for bj in range(moments.shape[1]):
             sums, count = NO_PIXEL, 0
             for i in range(bi * size, min((bi + 1) * size, height)):
@@ -107,17 +103,15 @@ def _sum_pixels(
             for k, value in enumerate(sums):
                 moments[bi, bj, k] = value
             moments[bi, bj, COUNT], moments[bi, bj, RATIO], moments[bi, bj, SLOPE] = count, 0, 0
-    _fit_planes(first, after, rays, size, blocks)
+    _fit_planes(rays, size, blocks)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def _fit_planes(
-    first: int, after: int, rays: NDArray[np.float32], size: int, blocks: Blocks
-) -> None:
-    """Fill in the planes of rows of blocks whose moments are known."""
-    columns = blocks.moments.shape[1]
+def _fit_planes(rays: NDArray[np.float32], size: int, blocks: Blocks) -> None:
+    """Fill in the planes of blocks whose moments are known."""
+    rows, columns = blocks.squared.shape
     m = blocks.moments.reshape(-1, SIZE)
-    for bi in range(first, after):
+    for bi in range(rows):
         for bj in range(columns):
             k = bi * columns + bj
             x, y, z, left = plane_of(sums_of(m, k))

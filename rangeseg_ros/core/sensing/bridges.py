@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
 from rangeseg_ros.core.sensing.blocks import BLOCK
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
@@ -36,14 +35,12 @@ def bridge_holes(
     inverse = image.inverse.copy()
     # A camera has rays everywhere; those of a cloud lie between its points.
     rays = (image.rays if image.camera is None else image.rays[:0]).copy()
-    run_rows(_bridge, len(inverse), holes, image.inverse, steps, slopes, inverse, rays)
+    _bridge(holes, image.inverse, steps, slopes, inverse, rays)
     return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
 
 
 @njit(cache=True, nogil=True)
 def _bridge(
-    first: int,
-    after: int,
     holes: NDArray[np.bool_],
     measured: NDArray[np.float32],
     steps: NDArray[np.float32],
@@ -51,8 +48,8 @@ def _bridge(
     inverse: NDArray[np.float32],
     rays: NDArray[np.float32],
 ) -> None:
-    """Bridge the holes of some rows."""
-    for i in range(first, after):
+    """Fill in the holes that are bridged."""
+    for i in range(len(measured)):
         for j in range(measured.shape[1]):
             if not holes[i, j]:
                 continue

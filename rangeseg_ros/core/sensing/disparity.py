@@ -12,7 +12,7 @@ from rangeseg_ros.core.config import VGA
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.verdict import ODDS, SPREAD
-from rangeseg_ros.core.significance import CLEARLY
+from rangeseg_ros.core.significance import CLEARLY, quantile
 
 # Pixels of VGA along the side of a block, wide enough to show the bend, and those that tell it.
 _SIDE, _SAMPLES = 48, 8
@@ -48,7 +48,7 @@ def shows_disparity(image: RangeImage) -> bool:
     noise += (np.finfo(np.float32).eps * inverse.max(axis=(1, 2))) ** 2
     # What is rougher than most, as where surfaces meet, is no part of a plane.
     rough = noise / inverse.max(axis=(1, 2)) ** 2
-    flat = rough <= CLEARLY * np.median(rough)
+    flat = rough <= CLEARLY * quantile(rough, 0.5)
     # Real planes differ by more than their noise tells.
     variance = noise / square + SPREAD**2
     odds = np.log1p(share**2 / variance) - np.log1p((share - 1) ** 2 / variance)

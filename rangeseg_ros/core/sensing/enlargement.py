@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
+from rangeseg_ros.core.significance import quantile
 
 SIGNIFICANT = 5.0
 """Standard errors that a statistic of an image must differ by, not to be chance in any image."""
@@ -190,7 +191,7 @@ def _spectrum(
     if not len(changes) or len(columns) < 2 * _LARGEST:
         return np.zeros(len(waves))
     # Edges of objects are no part of it.
-    typical = np.median(changes[::_FEW])
+    typical = quantile(changes[::_FEW], 0.5)
     size = np.where(known, np.minimum(size, 2 * typical), 0)
     means = size.sum(axis=0, dtype=float)[columns] / known.sum(axis=0)[columns]
     spread = means.std() * len(columns) ** 0.5
