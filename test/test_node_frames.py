@@ -17,7 +17,7 @@ from rclpy.time import Time
 from recordings import Recording
 from ros_bench import FRAME, Bench, assert_replayed, values_of
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Imu, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from rangeseg_ros import Config, planes_from_message
@@ -186,7 +186,7 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
 
     Nor ground where tf has the camera higher than it is.
     """
-    options = {'gravity_frame': 'odom', 'tf_timeout': 0.1, 'track_time': 20.0}
+    options = {'gravity_frame': 'odom', 'tf_timeout': 0.1, 'up_drift': 0.2}
     topics = 'terrain', 'obstacles', 'grid'
 
     def published(bench, pitch=PITCH, robot=None, ahead=0, z=0.0):
@@ -228,6 +228,17 @@ def test_without_an_up_there_is_no_terrain(tf_messages):
         assert (0, 0) in {(ground, free) for ground, _, free in found}
         assert published(bench, PITCH + np.radians(25), robot, ahead=60) == (0, 0, 0)
         bench.status(lambda s: s.level == DiagnosticStatus.ERROR and 'up is off by' in s.message)
+        assert bench.set_parameters(use_imu=True)[0].successful
+        level = Imu(header=bench.header())
+        level.header.frame_id, level.linear_acceleration.y = FRAME, -9.8
+        with bench.advertised(Imu, '/imu') as publisher:
+            bench.until(publisher.get_subscription_count)
+            publisher.publish(level)
+            contradiction = bench.reported(
+                lambda s: 'degrees apart' in s.message,
+                lambda: found.append(published(bench, robot=robot, ahead=60)),
+            )
+        assert contradiction.level == DiagnosticStatus.ERROR and found[-1] == (0, 0, 0)
 
 
 @pytest.fixture(scope='module')

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.map_planes import moved_planes
 from rangeseg_ros.core.mapping.mount import mount_of
-from rangeseg_ros.core.mapping.placement import HeldUp, Placement, find_placement
+from rangeseg_ros.core.mapping.placement import Placement, Up, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -40,24 +40,28 @@ def known(**frames):
 def test_up_and_height_come_from_the_gravity_frame():
     lookup = known(pairs={('base_footprint', 'camera'): MOUNT})
     found = find_placement(Config(gravity_frame='base_footprint'), 'camera', lookup)
-    np.testing.assert_allclose(found.up, UP, atol=1e-12)
+    (up,) = found.ups
+    np.testing.assert_allclose(up.direction, UP, atol=1e-12)
+    assert up.sd == Config().up_sd and found.asked
     assert found.height == 1 and found.sources == {'up': 'base_footprint'}
     assert not found.missing and not found.may_come
 
 
-def test_the_accelerometer_takes_its_place_and_then_the_parameters():
+def test_without_it_the_accelerometer_tells_up_and_then_the_parameters():
     config = Config(gravity_frame='base_footprint', fixed_frame='odom')
     turned = Transform(Rotation.from_euler('z', 90, degrees=True).as_matrix(), np.ones(3))
     lookup = known(pairs={('camera', 'imu'): turned})
     found = find_placement(config, 'camera', lookup, ('imu', np.array([0, 9.8, 0])))
-    np.testing.assert_allclose(found.up, (-9.8, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(found.ups[0].direction, (-1, 0, 0), atol=1e-12)
+    # A tenth of gravity across it, even spread: 3.3 degrees.
+    assert found.ups[0].sd == pytest.approx(np.hypot(1.5, 3.3), abs=0.01)
     assert found.sources['up'].startswith('imu in imu; no base_footprint')
     assert found.may_come and found.height is None and found.pose is None
     assert set(found.missing) == {'up', 'fixed frame'}
     # In the frame of the images no transform is needed; in an unknown one, parameters hold.
-    assert find_placement(Config(), 'camera', known(), ('camera', np.ones(3))).up is not None
+    assert len(find_placement(Config(), 'camera', known(), ('camera', np.ones(3))).ups) == 1
     found = find_placement(Config(), 'camera', known(), ('elsewhere', np.ones(3)))
-    assert found.up is None and not found.may_come
+    assert not found.ups and not found.may_come
     assert found.sources['up'].startswith('the parameters up_x, up_y, up_z; no imu in elsewhere')
 
 
@@ -109,18 +113,55 @@ def test_the_height_counts_where_the_parameter_does_not(parameter, expected):
     assert result.survey.sensor_height == expected
 
 
-def test_the_last_up_is_held_for_seconds_and_then_lost():
-    """tf stops: what was up stays so for a while, and is not taken for a level camera's."""
-    up, held = np.array([0.0, -0.8, -0.6]), HeldUp()
-    assert 'not known' in held.hold(Placement(sources={'up': 'no tf'}), 0, 3.0)
-    assert held.hold(Placement(up=up, height=0.8), 10**9, 3.0) == ''
-    later = Placement(sources={'up': 'no tf'})
-    assert held.hold(later, 3 * 10**9, 3.0) == ''
-    assert (later.up == up).all() and later.height == 0.8
-    assert later.sources['up'] == 'held for 2.0 s: no tf'
-    lost = Placement(sources={'up': 'no tf'})
-    assert held.hold(lost, 5 * 10**9, 3.0) == 'no terrain, as up is not known: no tf'
-    assert lost.up is None
+def test_the_last_up_is_held_while_a_slope_can_be_told_from_level_ground():
+    """tf stops: the error of what was up grows, and it is not taken for a level camera's."""
+    up, config, filtered = np.array([0.0, -0.8, -0.6]), Config(up_drift=2.0), UpFilter()
+    silent = Placement(asked=True, sources={'up': 'no tf'})
+
+    def settle(seconds, found=silent, config=config):
+        return filtered.settle(found, round(seconds * 1e9), config)
+
+    assert settle(0).lost == 'no terrain, as up is not known: no tf'
+    told = settle(
+        1, Placement(ups=[Up(up, 1.5, 'tf')], asked=True, height=0.8, sources={'up': ''})
+    )
+    assert (told.up_sd, told.height, told.lost) == (1.5, 0.8, '')
+    held = settle(3)
+    np.testing.assert_allclose(held.up, up, atol=1e-12)
+    assert held.height == 0.8 and held.up_sd == pytest.approx(np.hypot(1.5, 2 * 2.0))
+    assert held.sources['up'] == 'held for 2.0 s, +- 4.3 degrees: no tf'
+    # Twice the error is more than the steepest ground, 12 degrees.
+    limit = 1 + np.sqrt(6**2 - 1.5**2) / 2
+    assert not settle(limit - 0.01).lost and settle(limit + 0.01).lost
+    assert settle(limit + 0.01).up is None and settle(0.9).lost
+    assert not settle(100, config=replace(config, up_drift=0.0)).lost
+    # Where nobody asks, the parameters hold.
+    nobody = Placement()
+    assert filtered.settle(nobody, 0, config) is nobody
+
+
+@pytest.mark.parametrize('sd', [(1.5, 1.5), (1.5, 3.6), (4.0, 0.5)])
+def test_directions_are_weighted_by_their_precision_unless_they_contradict(sd):
+    """The mean of 4000 pairs of such errors has the error told; one of 1000 contradicts."""
+    draw, filtered, config = np.random.default_rng(1), UpFilter(), Config()
+    found, lost, ahead = [], 0, np.array([0.0, 0, 1])
+    for _ in range(4000):
+        errors = [np.append(draw.normal(0, np.radians(s), 2), 0) for s in sd]
+        ups = [
+            Up((e + ahead) / np.linalg.norm(e + ahead), s, name)
+            for e, s, name in zip(errors, sd, ('tf', 'imu'), strict=True)
+        ]
+        placed = filtered.settle(Placement(ups=ups, asked=True, sources={'up': ''}), 0, config)
+        lost += bool(placed.lost)
+        if not placed.lost:
+            found.append([*np.degrees(placed.up[:2]), placed.up_sd])
+    x, y, told = np.array(found).T
+    assert told[0] == pytest.approx(np.prod(sd) / np.hypot(*sd)) and np.ptp(told) == 0
+    assert np.std([x, y]) == pytest.approx(told[0], rel=0.05)
+    assert 0 < lost < 12
+    apart = [Up(ahead, sd[0], 'tf'), Up(np.array([0, 0.6, 0.8]), sd[1], 'imu')]
+    placed = filtered.settle(Placement(ups=apart, asked=True, sources={'up': ''}), 1, config)
+    assert 'tf and imu are 37 degrees apart' in placed.lost and placed.up is None
 
 
 MOUNTED = kinect_camera(320, 240)

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import Placement, find_placement
+from rangeseg_ros.core.mapping.placement import Placement, UpFilter, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.io.transforms import RecordedTransforms
 from rangeseg_ros.messages.frames import DepthFrame
@@ -24,6 +24,7 @@ class Locator(RecordedTransforms):
         self._config = config
         self.problems: Counter[str] = Counter()
         self.last = Placement()
+        self._up = UpFilter()
 
     def place(self, frame: DepthFrame) -> Placement:
         """Where the camera was."""
@@ -31,6 +32,7 @@ class Locator(RecordedTransforms):
         def lookup(target: str, source: str) -> Transform:
             return self.lookup(target, source, frame.stamp, frame.time)
 
-        self.last = found = find_placement(self._config, frame.frame_id, lookup)
+        found = find_placement(self._config, frame.frame_id, lookup)
         self.problems.update(f'{what} {why}' for what, why in found.missing.items())
-        return found
+        self.last = self._up.settle(found, frame.stamp, self._config)
+        return self.last

@@ -239,7 +239,9 @@ def segment_frames(
                 continue
             image = corrected(image, sequence.config)
             at = place(frame)
-            result = sequence.segment(image, frame.stamp, at.up, at.pose, at.height)
+            result = sequence.segment(image, frame.stamp, at.up, at.pose, at.height, at.up_sd)
+            if at.lost:
+                result = replace(result, survey=None)
             yield done + source.lost.total(), frame, image, result
             done += 1
     except DamagedBagError as error:

@@ -161,6 +161,9 @@ class Config:
         0.015, 'standard deviation of sensor_height, metres', 0.001, 10.0
     )
     up_sd: float = option(1.5, 'standard deviation of up, degrees', 0.01, 45.0)
+    up_drift: float = option(
+        2.0, 'turning of up while nothing tells it, degrees per second', 0.0, 360.0
+    )
     obstacle_height: float = option(0.05, 'least height of an obstacle, metres', 0.005, 10.0)
     drop_height: float = option(0.05, 'least depth of a drop, metres', 0.005, 10.0)
     ground_gap: float = option(0.15, 'widest gap that the robot crosses, metres', 0.0, 10.0)

@@ -83,6 +83,7 @@ class SequenceSegmenter:
         up: ArrayLike | None = None,
         pose: Transform | None = None,
         height: float | None = None,
+        up_sd: float | None = None,
     ) -> Segmentation:
         """Label the next frame; ids and roles of its planes are set.
 
@@ -99,8 +100,11 @@ class SequenceSegmenter:
         height : float, optional
             Of the origin of the frame of the image above the ground, metres, where the parameter
             `sensor_height` is 0.
+        up_sd : float, optional
+            Standard deviation of `up`, degrees, where it is not the parameter `up_sd`.
         """
-        return self.follow(self._segmenter.segment(image), image, stamp, up, pose, height)
+        placed = stamp, up, pose, height, up_sd
+        return self.follow(self._segmenter.segment(image), image, *placed)
 
     def follow(
         self,
@@ -110,12 +114,15 @@ class SequenceSegmenter:
         up: ArrayLike | None = None,
         pose: Transform | None = None,
         height: float | None = None,
+        up_sd: float | None = None,
     ) -> Segmentation:
         """Find the planes of the frames before in the `result` of a `Segmenter` for the next one.
 
         As `segment` does, for segmenters that work on several frames at once.
         """
         config = self.config
+        if up_sd not in (None, config.up_sd):
+            config = replace(config, up_sd=up_sd)
         if stamp < self._stamp:
             self._tracker.reset()
             self.map = self.map.anew('time has gone back')
@@ -150,6 +157,7 @@ class SequenceSegmenter:
             above = 0.0 if height is None else max(float(height + up @ image.place), 0.0)
             survey = replace(
                 survey,
+                config=config,
                 up=up,
                 sensor_height=survey.sensor_height or above,
                 memory=self._ground,

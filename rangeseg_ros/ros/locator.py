@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import Placement, find_placement
+from rangeseg_ros.core.mapping.placement import AT_REST, Placement, find_placement
 from rangeseg_ros.core.mapping.transforms import Transform, TransformBuffer, TransformError
 from rangeseg_ros.messages.frames import DepthFrame
 from rangeseg_ros.messages.make import TRANSFORMS, message_class, nanoseconds
@@ -29,8 +29,6 @@ TIME_CONSTANT = 0.5
 """Of the low-pass filter, seconds: motions of a robot are shorter, its tilting is slower."""
 
 STANDARD_GRAVITY = 9.80665
-TOLERANCE = 0.1
-"""Relative difference to standard gravity from which an acceleration is not that of rest."""
 
 NO_MESSAGES = (
     'tf is not read: the package tf2_msgs is not installed; it is part of every ROS installation '
@@ -117,7 +115,9 @@ class Locator:
             problem = f'{imu.topic}: no acceleration of rest yet'
             self._node.get_logger().warning(problem, throttle_duration_sec=5.0)
         known = (reading.frame, reading.acceleration) if reading else None
-        return find_placement(config, frame.frame_id, lookup, known)
+        found = find_placement(config, frame.frame_id, lookup, known)
+        found.asked |= imu is not None
+        return found
 
     def delay(self, config: Config, frame: DepthFrame, waited: float) -> float:
         """Seconds for which a frame is to wait for transforms after `waited` seconds."""
@@ -137,7 +137,7 @@ class Locator:
         acceleration = np.array([measured.x, measured.y, measured.z])
         size = float(np.linalg.norm(acceleration))
         # The first covariance is -1 where there is no accelerometer. What is not finite differs.
-        at_rest = abs(size / STANDARD_GRAVITY - 1) <= TOLERANCE
+        at_rest = abs(size / STANDARD_GRAVITY - 1) <= AT_REST
         if message.linear_acceleration_covariance[0] == -1 or not at_rest:
             return
         stamp = nanoseconds(message.header.stamp)

@@ -38,7 +38,7 @@ class NodeConfig(Config):
     use_imu: bool = option(
         False,
         'take up from the accelerometer on the topic imu, in the frame of the images or one that '
-        'tf knows, where gravity_frame gives none, instead of up_x, up_y, up_z',
+        'tf knows, with gravity_frame or alone, instead of up_x, up_y, up_z',
     )
     managed: bool = option(
         False,

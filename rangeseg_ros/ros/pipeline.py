@@ -12,7 +12,7 @@ import cv2
 from rclpy.node import Node
 
 from rangeseg_ros.core.config import Config
-from rangeseg_ros.core.mapping.placement import HeldUp, Placement
+from rangeseg_ros.core.mapping.placement import Placement, UpFilter
 from rangeseg_ros.core.runtime.threads import sharing_cores
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.segmenter import Segmenter
@@ -66,7 +66,7 @@ class Pipeline:
         self._sequence: SequenceSegmenter | None = None
         self._jumps = 0
         self._ended = 0.0
-        self._up = HeldUp()
+        self._up = UpFilter()
         self._size = 0
         self._threads = [
             Thread(target=self._work_all, name='segmentation', daemon=True)
@@ -161,15 +161,16 @@ class Pipeline:
 
     def _follow(self, work: Work, segmented: Segmented) -> tuple[Segmented, SequenceSegmenter]:
         """Find the planes of the frames before in a frame."""
-        config, at, stamp = work.segmenter.config, segmented.at, work.frame.stamp
+        config, stamp = work.segmenter.config, work.frame.stamp
         if self._sequence is None:
             self._sequence = SequenceSegmenter(config)
         elif config is not self._sequence.config:
             self._sequence.config = config
         sequence = self._sequence
-        lost = self._up.hold(at, stamp, config.track_time) if config.gravity_frame else ''
-        placed = stamp, at.up, at.pose, at.height
+        at = self._up.settle(segmented.at, stamp, config)
+        placed = stamp, at.up, at.pose, at.height, at.up_sd
         found = sequence.follow(segmented.found, segmented.image, *placed)
+        lost = at.lost
         if not lost and found.tilt:
             lost = f'no terrain: {found.tilt}'
         self._statistics.no_terrain = lost
@@ -177,7 +178,7 @@ class Pipeline:
             found = replace(found, survey=None)
         self._tell(sequence, at)
         segmented.ticks.append(time.perf_counter())
-        return segmented._replace(found=found), sequence
+        return segmented._replace(found=found, at=at), sequence
 
     def _set_pace(self, work: Work, found: Segmentation) -> None:
         """Take up how long a frame took, after the one before if they were worked on at once."""

@@ -2,35 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.transforms import Transform, TransformError
+from rangeseg_ros.core.significance import CLEARLY, chi2_quantile
 
 Lookup = Callable[[str, str], Transform]
 """(target, source) -> the motion between two frames at the stamp of an image; TransformError."""
 
 PARAMETERS = 'the parameters up_x, up_y, up_z'
 
+AT_REST = 0.1
+"""Relative difference to standard gravity below which an acceleration counts as that of rest."""
+
+# Squared angle between two directions, in variances, that is no chance: an error about two axes.
+_CONTRADICTION = chi2_quantile(2)
+
+
+class Up(NamedTuple):
+    """A direction (3,) that is up, in the frame of an image, and what tells it.
+
+    `sd` is its standard deviation about either axis across it, degrees.
+    """
+
+    direction: NDArray[np.float64]
+    sd: float
+    source: str
+
 
 @dataclass
 class Placement:
     """What is known of a camera at the stamp of an image.
 
-    `pose` and `target` take the frame of the image to `fixed_frame` and `target_frame`. `up` (3,)
-    is in the frame of the image, None for that of the parameters; `height`, metres, is that of its
-    origin above z = 0 of `gravity_frame`. `sources` tell what 'up', 'fixed frame' and 'target
-    frame' come from, or why they are not known; `missing` why frames that parameters name are not,
-    without times, and `may_come` whether they may be known later.
+    `pose` and `target` take the frame of the image to `fixed_frame` and `target_frame`. `ups` are
+    all directions that are told to be up, and `asked` whether any is asked for. `up` (3,), a unit
+    vector in the frame of the image with the standard deviation `up_sd`, degrees, is what
+    `UpFilter` makes of them: None for that of the parameters, or where `lost` says why it is not
+    known. `height`, metres, is that of the image's origin above z = 0 of `gravity_frame`.
+    `sources` tell what 'up', 'fixed frame' and 'target frame' come from, or why they are not
+    known; `missing` why frames that parameters name are not, without times, and `may_come` whether
+    they may be known later.
     """
 
     pose: Transform | None = None
     target: Transform | None = None
+    ups: list[Up] = field(default_factory=list)
+    asked: bool = False
     up: NDArray[np.float64] | None = None
+    up_sd: float | None = None
+    lost: str = ''
     height: float | None = None
     sources: dict[str, str] = field(default_factory=dict)
     missing: dict[str, str] = field(default_factory=dict)
@@ -45,10 +73,10 @@ def find_placement(
 ) -> Placement:
     """Look up what the parameters ask for at an image in `frame`.
 
-    Up is that of `gravity_frame`; where it is not known, that of an accelerometer at rest, its
-    frame and measurement (3,), whatever frame it is, or else that of the parameters.
+    Up is told by `gravity_frame` and by the `acceleration` of an accelerometer at rest, its frame
+    and measurement (3,).
     """
-    found = Placement()
+    found = Placement(asked=bool(config.gravity_frame) or acceleration is not None)
 
     def ask(what: str, target: str, source: str = frame) -> Transform | None:
         try:
@@ -66,43 +94,68 @@ def find_placement(
         found.pose = ask('fixed frame', config.fixed_frame)
     if config.target_frame:
         found.target = ask('target frame', config.target_frame)
-    if config.gravity_frame and (motion := ask('up', config.gravity_frame)):
-        found.up, found.height = motion.rotation[2], float(motion.shift[2])
-        return found
-    why = found.sources.pop('up', '')
-    tried = [f'no {why}'] if why else []
+    tried = []
+    if config.gravity_frame:
+        if motion := ask('up', config.gravity_frame):
+            found.ups.append(Up(motion.rotation[2], config.up_sd, config.gravity_frame))
+            found.height = float(motion.shift[2])
+        else:
+            tried.append(f'no {found.sources["up"]}')
     if acceleration:
         if motion := ask('up', frame, acceleration[0]):
-            found.up = motion.rotation @ acceleration[1]
-            found.sources['up'] = '; '.join([f'imu in {acceleration[0]}', *tried])
-            return found
-        found.missing['up'] = why = f'imu in {acceleration[0]}: {found.sources.pop("up")}'
-        tried.append(f'no {why}')
-    found.sources['up'] = '; '.join([PARAMETERS, *tried])
+            measured = motion.rotation @ acceleration[1]
+            # Accelerations of up to so much of gravity, evenly spread, pass for rest.
+            sd = math.hypot(config.up_sd, math.degrees(AT_REST / math.sqrt(3)))
+            upwards = measured / np.linalg.norm(measured)
+            found.ups.append(Up(upwards, sd, f'imu in {acceleration[0]}'))
+        else:
+            found.missing['up'] = why = f'imu in {acceleration[0]}: {found.sources["up"]}'
+            tried.append(f'no {why}')
+    names = ' and '.join(up.source for up in found.ups)
+    found.sources['up'] = '; '.join([names or PARAMETERS, *tried])
     return found
 
 
-class HeldUp:
-    """The last direction that was known to be up: a camera on a robot keeps it for seconds."""
+class UpFilter:
+    """Up by all that tells it; while nothing does, the last one, with an error that grows."""
 
     def __init__(self) -> None:
-        self._last: tuple[int, NDArray[np.float64], float | None] | None = None
+        self._last: tuple[int, Up, float | None] | None = None
 
-    def hold(self, found: Placement, stamp: int, patience: float) -> str:
-        """Where up is not known, take the last one; why there is none, or empty.
+    def settle(self, found: Placement, stamp: int, config: Config) -> Placement:
+        """What was `found` at a stamp, nanoseconds, with its up, or why that is lost.
 
-        The up and height of what was `found` at a stamp, nanoseconds, are set to those known up to
-        `patience` seconds before.
+        What is told is weighted by its precision. It is lost where two directions contradict each
+        other, and where the steepest ground may be level as well.
         """
-        if found.up is not None:
-            self._last = stamp, found.up, found.height
-            return ''
-        why = found.sources.get('up', '')
-        if self._last is not None:
+        if not found.asked:
+            return found
+        why = _contradiction(found.ups)
+        if found.ups and not why:
+            weight = np.array([up.sd**-2 for up in found.ups])
+            direction = weight @ [up.direction for up in found.ups]
+            direction /= np.linalg.norm(direction)
+            sd = found.ups[0].sd if len(weight) == 1 else float(weight.sum() ** -0.5)
+            self._last = stamp, Up(direction, sd, found.sources['up']), found.height
+            return replace(found, up=direction, up_sd=sd)
+        why = why or found.sources['up'].removeprefix(f'{PARAMETERS}; ')
+        if self._last is not None and not found.ups:
             then, up, height = self._last
             age = (stamp - then) / 1e9
-            if 0 <= age <= patience:
-                found.up, found.height = up, height
-                found.sources['up'] = f'held for {age:.1f} s: {why}'
-                return ''
-        return f'no terrain, as up is not known: {why}'
+            sd = math.hypot(up.sd, config.up_drift * age)
+            if age >= 0 and CLEARLY * sd <= config.ground_slope:
+                held = f'held for {age:.1f} s, +- {sd:.1f} degrees: {why}'
+                sources = found.sources | {'up': held}
+                return replace(found, up=up.direction, up_sd=sd, height=height, sources=sources)
+        return replace(found, lost=f'no terrain, as up is not known: {why}')
+
+
+def _contradiction(ups: Sequence[Up]) -> str:
+    """Which two directions differ by more than their errors; empty where none do."""
+    for one, other in combinations(ups, 2):
+        angle = math.degrees(math.acos(np.clip(one.direction @ other.direction, -1, 1)))
+        sd = math.hypot(one.sd, other.sd)
+        if angle > math.sqrt(_CONTRADICTION) * sd:
+            names = f'{one.source} and {other.source}'
+            return f'{names} are {angle:.0f} degrees apart, {angle / sd:.0f} sd'
+    return ''
