@@ -16,7 +16,7 @@ def plane(number, normal, at, sigma, size=2.0):
     jacobian = np.zeros((4, 3))
     jacobian[:3, :2], jacobian[3, :2], jacobian[3, 2] = axes.T, -axes @ at, 1
     covariance = jacobian @ np.diag([sigma**2, sigma**2, 1e-6]) @ jacobian.T
-    shape = Shape(size**2, np.array([size, size]), np.array(at), np.array([0, 0, 0, 1.0]))
+    shape = Shape(size**2, np.array([size, size]), np.array(at), np.eye(3))
     return MapPlane(
         label=number,
         id=number,

@@ -18,7 +18,7 @@ def fit_planes(labels, image, sensor):
 
 def stated_plane(label, hull=SQUARE, holes=()):
     """A region of the plane z = 2 m."""
-    centre, orientation = np.array([0.0, 0.25, 2.0]), np.array([1.0, 0.0, 0.0, 0.0])
+    centre, frame = np.array([0.0, 0.25, 2.0]), np.diag([1.0, -1.0, -1.0])
     return Plane(
         label=label,
         id=label + 100,
@@ -32,6 +32,6 @@ def stated_plane(label, hull=SQUARE, holes=()):
         rms=0.003,
         confidence=0.9,
         probability=0.75,
-        shape=Shape(4.0, np.array([2.0, 1.5]), centre, orientation),
+        shape=Shape(4.0, np.array([2.0, 1.5]), centre, frame),
         outline=MapOutline([[np.array(ring, float).reshape(-1, 3) for ring in (hull, *holes)]]),
     )

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.stairs import Stairs
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.io.files import replacing
 
@@ -48,7 +49,7 @@ _PARTS: dict[str, tuple[list[str], Callable[[Any], Iterable[Any]]]] = {
     ),
     'shape': (
         ['area', 'length', 'width', *_axes('centre'), *_axes('orientation', 'xyzw')],
-        lambda shape: [shape.area, *shape.extents, *shape.centre, *shape.orientation],
+        lambda shape: [shape.area, *shape.extents, *shape.centre, *quaternions(shape.frame)],
     ),
     'outline': (
         ['hull', 'holes'],

@@ -13,6 +13,7 @@ from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
 from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
+from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, systematic_variance
@@ -139,7 +140,7 @@ class Plane:
 
         Its x axis runs along the length, pointing to the image's right, its z axis is the normal.
         """
-        return self.shape.orientation
+        return quaternions(self.shape.frame)
 
     @property
     def hull(self) -> NDArray[np.float64]:

@@ -13,7 +13,6 @@ from mapbox_earcut import triangulate_float64
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.camera import Camera
 
 # Distance of the polygon from the outline at most, pixels: what segmentation leaves open.
@@ -132,12 +131,12 @@ class Outline:
 
 
 class Shape(NamedTuple):
-    """Size and place of a region, see `Plane`."""
+    """Size and place of a region, see `Plane`; columns of `frame` are length, width, normal."""
 
     area: float
     extents: NDArray[np.float64]
     centre: NDArray[np.float64]
-    orientation: NDArray[np.float64]
+    frame: NDArray[np.float64]
 
 
 class RegionShape:
@@ -160,7 +159,7 @@ class RegionShape:
         # Contours cut the corners between pixels, and those of clouds run through the middles of
         # pixels: all pixels of a region have the mean area of those that its contours enclose.
         area = footprint * cv2.countNonZero(outline.mask.view(np.uint8))
-        return Shape(area, extents, centre + self._place, quaternions(frame))
+        return Shape(area, extents, centre + self._place, frame)
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._shape, name)

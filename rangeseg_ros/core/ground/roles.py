@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.description.planes import Plane
 from rangeseg_ros.core.ground.stairs import RISE
-from rangeseg_ros.core.rotations import rotation_matrix
 from rangeseg_ros.core.significance import CLEARLY
 
 ROLES = ('other', 'floor', 'ceiling', 'wall', 'table', 'ramp', 'step', 'lower')
@@ -118,7 +117,7 @@ def _offsets(planes: Sequence[Plane], level: Plane) -> NDArray[np.float64]:
 
 def corners_of(plane: Plane) -> NDArray[np.float64]:
     """(4, 3) corners of the rectangle around a plane."""
-    axes = rotation_matrix(plane.orientation)[:, :2]
+    axes = plane.shape.frame[:, :2]
     half = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * plane.extents / 2
     corners: NDArray[np.float64] = plane.centre + half @ axes.T
     return corners

@@ -16,7 +16,7 @@ from rangeseg_ros.core.description.shapes import Shape
 from rangeseg_ros.core.mapping.observations import PlaneSet
 from rangeseg_ros.core.mapping.plane_grid import PlaneGrid
 from rangeseg_ros.core.mapping.transforms import Transform
-from rangeseg_ros.core.rotations import quaternions, rotation_matrix, turn_between
+from rangeseg_ros.core.rotations import turn_between
 from rangeseg_ros.core.tracking.plane_errors import moved_plane
 
 AnyPlane = TypeVar('AnyPlane', bound=Plane)
@@ -141,7 +141,7 @@ def describe(record: Record, plane: PlaneSet, covariance: NDArray[np.float64]) -
             area=grid.area,
             extents=np.sort(size)[::-1] + grid.side,
             centre=plane.points(np.array([middle]))[0],
-            orientation=quaternions(frame),
+            frame=frame,
         ),
         outline=MapOutline([list(part) for part in grid.polygons()]).moved(plane.points),
         role=record.roles.most_common(1)[0][0],
@@ -163,7 +163,7 @@ def moved_planes(planes: Sequence[AnyPlane], motion: Transform) -> list[AnyPlane
             area=plane.area,
             extents=plane.extents,
             centre=turn @ plane.centre + shift,
-            orientation=quaternions(turn @ rotation_matrix(plane.orientation)),
+            frame=turn @ plane.shape.frame,
         )
         outline = MapOutline(plane.outline.parts).moved(lambda ring: ring @ turn.T + shift)
         moved.append(

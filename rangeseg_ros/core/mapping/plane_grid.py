@@ -9,6 +9,7 @@ A. Hornung et al., "OctoMap", Autonomous Robots 2013: log-odds with bounds.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 
 import cv2
 import numpy as np
@@ -110,16 +111,12 @@ class PlaneGrid:
             if self._whole:
                 self._whole._counts += self._counts - before
 
-    def part(self, least: NDArray[np.float64], most: NDArray[np.float64]) -> PlaneGrid:
-        """The cells of a rectangle, from its least to its greatest coordinates (2,), shared."""
-        size = self.odds.shape[::-1]
-        ends = np.floor(least / self.side), np.floor(most / self.side) + 1
-        start, end = (np.clip(cell - self.first, 0, size).astype(np.intp) for cell in ends)
-        part = PlaneGrid(self.side, self._most)
+    def part(self, start: NDArray[np.intp], end: NDArray[np.intp]) -> PlaneGrid:
+        """The cells from the column and row `start` (2,) to before `end` (2,), shared."""
+        part = copy(self)
         part.odds = self.odds[start[1] : end[1], start[0] : end[0]]
         part.first, part._whole = self.first + start, self
-        if part.odds.size:
-            part._measure()
+        part._measure()
         return part
 
     def absorb(self, centres: NDArray[np.float64], odds: NDArray[np.float32]) -> None:
@@ -161,8 +158,10 @@ class PlaneGrid:
         if np.prod(last + after - self.first + before) > self._most:
             self._coarsen()
             return self.reach(points)
-        self.odds = np.pad(self.odds, list(zip(before[::-1], after[::-1], strict=True)))
-        self.first = self.first - before
+        (height, width), (left, top) = self.odds.shape, before
+        odds = np.zeros((height + top + after[1], width + left + after[0]), np.float32)
+        odds[top : top + height, left : left + width] = self.odds
+        self.odds, self.first = odds, self.first - before
         self._measure()
 
     def _coarsen(self) -> None:
@@ -193,9 +192,14 @@ def in_sight(
     crossed = np.flatnonzero((height.min(axis=0) <= 0) & (height.max(axis=0) >= 0))
     some = planes.where(crossed)
     at = (corners - some.point[:, None]) @ np.swapaxes(some.axes, 1, 2)
-    ends = zip(crossed.tolist(), at.min(axis=1), at.max(axis=1), strict=True)
-    parts = {k: grids[k].part(least, most) for k, least, most in ends}
-    return {k: part for k, part in parts.items() if part.odds.size}
+    known = [grids[k] for k in crossed.tolist()]
+    first = np.array([grid.first for grid in known]).reshape(-1, 2)
+    size = np.array([grid.odds.shape[::-1] for grid in known]).reshape(-1, 2)
+    side = np.array([grid.side for grid in known])[:, None]
+    ends = np.floor(at.min(axis=1) / side), np.floor(at.max(axis=1) / side) + 1
+    start, end = (np.clip(cell - first, 0, size).astype(np.intp) for cell in ends)
+    inside = np.flatnonzero((start < end).all(axis=1)).tolist()
+    return {int(crossed[n]): known[n].part(start[n], end[n]) for n in inside}
 
 
 def seen_cells(

@@ -36,8 +36,9 @@ _UNSEEN_OVERLAP = 0.1
 # Seconds between frames that stamps which do not tell (the same, or none) stand for; and what that
 # speed is kept up for, as hands and heads change their minds about that often.
 NOMINAL, PERSISTENCE = 1 / 30, 0.5
-# The equations of the motion are linear in it.
-_MOTION_ROUNDS = 3
+# The equations of the motion are nearly linear in it: rounds at most, and the squared step, in
+# variances of the motion, that changes nothing any more.
+_MOTION_ROUNDS, _SETTLED = 3, 0.01
 # Rows or columns, whichever are fewer, at which overlap is looked at: a plane of the least size
 # has about eight samples in a 640 x 480 image.
 _SAMPLES = 60
@@ -257,6 +258,8 @@ def _camera_motion(
         step = np.linalg.solve(left, -np.einsum('kia,ki->a', weighted, gap))
         twist = rotation_by(step[:3])
         rotation, shift = twist @ rotation, twist @ shift + step[3:]
+        if step @ left @ step < _SETTLED:
+            break
     return rotation, shift
 
 
