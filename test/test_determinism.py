@@ -15,7 +15,7 @@ import pytest
 from processes import python
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.runtime.threads import map_halves, run_rows, sharing_cores, submit
+from rangeseg_ros.core.runtime.threads import Task, map_halves, sharing_cores
 from rangeseg_ros.core.sensing.binning import STEPS
 from rangeseg_ros.core.sequence import SequenceSegmenter
 from rangeseg_ros.simulation.render import simulate
@@ -146,29 +146,17 @@ def threads(request):
     cv2.setNumThreads(before)
 
 
-@pytest.mark.parametrize('rows', [0, 1, 15, 16, 33, 100, 1000])
-def test_every_row_is_in_one_strip(threads, rows):
-    visits = np.zeros(rows, int)
-
-    def kernel(first, after, step):
-        visits[first:after] += step
-
-    run_rows(kernel, rows, 3)
-    assert (visits == 3).all()
-
-
 def test_halves_do_not_depend_on_the_number_of_threads(threads):
-    assert map_halves(lambda first, after, name: (first, after, name), 9, 'x') == (
-        (0, 4, 'x'),
-        (4, 9, 'x'),
-    )
+    for rows in range(10):
+        upper, lower = map_halves(lambda *given: given, rows, 'x')
+        assert upper == (0, rows // 2, 'x') and lower == (rows // 2, rows, 'x')
 
 
 @pytest.mark.parametrize('threads', [2, 7], indirect=True)
-def test_strips_are_worked_on_at_the_same_time(threads):
-    """As many as there are threads wait for each other; alone they would for ever."""
-    barrier = threading.Barrier(min(threads, 4), timeout=20)
-    run_rows(lambda first, after: barrier.wait(), 1000)
+def test_halves_are_worked_on_at_the_same_time(threads):
+    """They wait for each other; alone they would for ever."""
+    barrier = threading.Barrier(2, timeout=20)
+    map_halves(lambda first, after: barrier.wait(), 1000)
 
 
 @pytest.mark.parametrize('threads', [2], indirect=True)
@@ -176,7 +164,7 @@ def test_frames_with_a_core_each_have_no_helpers(threads):
     def worker():
         """Who does a task: another thread, given the time to begin it."""
         begun = threading.Event()
-        task = submit(lambda: (threading.get_ident(), begun.set()))
+        task = Task(lambda: (threading.get_ident(), begun.set()))
         begun.wait(0.5)
         return task.result()[0]
 
@@ -195,9 +183,9 @@ def test_frames_with_a_core_each_have_no_helpers(threads):
 def test_a_task_that_waits_for_a_helper_is_done_by_who_needs_it(threads):
     """The only helper is at work for as long as the other task is not done."""
     begun, free = threading.Event(), threading.Event()
-    busy = submit(lambda: (begun.set(), free.wait(20)))
+    busy = Task(lambda: (begun.set(), free.wait(20)))
     assert begun.wait(20)
-    assert submit(threading.get_ident).result() == threading.get_ident()
+    assert Task(threading.get_ident).result() == threading.get_ident()
     free.set()
     assert busy.result() == (None, True)
 
@@ -207,7 +195,7 @@ def test_tasks_may_have_tasks(threads):
     """Also where no helper is free for them."""
 
     def depth(left):
-        return 1 + max(submit(depth, left - 1).result() for _ in range(2)) if left else 0
+        return 1 + max(Task(depth, left - 1).result() for _ in range(2)) if left else 0
 
     assert depth(5) == 5
 
@@ -215,8 +203,8 @@ def test_tasks_may_have_tasks(threads):
 def test_a_program_ends_after_its_tasks():
     """A kernel that is at work when the interpreter is gone may bring down the process."""
     program = (
-        'import time, cv2; from rangeseg_ros.core.runtime.threads import submit\n'
-        'cv2.setNumThreads(2); submit(lambda: (time.sleep(0.5), print("over", flush=True)))\n'
+        'import time, cv2; from rangeseg_ros.core.runtime.threads import Task\n'
+        'cv2.setNumThreads(2); Task(lambda: (time.sleep(0.5), print("over", flush=True)))\n'
         'time.sleep(0.1)'
     )
     ended = python(program)
@@ -228,9 +216,9 @@ def test_errors_come_back():
         raise ValueError(str(first))
 
     with pytest.raises(ValueError, match='0'):
-        run_rows(kernel, 100)
+        map_halves(kernel, 100)
     with pytest.raises(ValueError, match='late'):
-        submit(lambda: (time.sleep(0.05), int('late'))).result()
+        Task(lambda: (time.sleep(0.05), int('late'))).result()
 
 
 def total(queue):

@@ -21,7 +21,7 @@ from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.ground.survey import Survey
 from rangeseg_ros.core.regions import least_pixels, numbers_of, plane_regions, relabel
 from rangeseg_ros.core.runtime.kernels import with_kernels
-from rangeseg_ros.core.runtime.threads import Task, submit
+from rangeseg_ros.core.runtime.threads import Task
 from rangeseg_ros.core.segmentation import Segmentation
 from rangeseg_ros.core.sensing.binning import Bins, bin_side
 from rangeseg_ros.core.sensing.blocks import Blocks
@@ -134,7 +134,7 @@ class Segmenter:
         if isinstance(labelling, by_planes.Labelling):
             if side > 1:
                 given = regions, labelling.labels, labelling.models, image, side, sensor
-                pixels = submit(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
+                pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
             flat, probability, fits = by_planes.flat_regions(regions, view, config)
             numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
         else:

@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.runtime.threads import map_halves
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +54,8 @@ def cast(
     face = np.full(len(directions), -1, np.int32)
     first = 0
     for solid in solids:
-        run_rows(_enter, len(directions), origins, directions, solid.faces, first, distance, face)
+        given = origins, directions, solid.faces, first, distance, face
+        map_halves(_enter, len(directions), *given)
         first += len(solid.faces)
     return distance.reshape(shape), face.reshape(shape)
 

@@ -197,7 +197,7 @@ def describe_regions(
         outlines.append(Outline(labels[crop], k, box[0], box[1], theta[k], float(far), rays))
     # Numbers of Python, all at once: taken out of the arrays one by one they take longer.
     surfaces = common_surfaces(fits, squares(root))
-    numbers = surfaces, distance, fits.pixels, rms, confidence, probability
+    numbers = surfaces, distance, fits.sums.pixels, rms, confidence, probability
     group, offset, *figures = (column[found].tolist() for column in numbers)
     equations = normal[found], offset, covariance[found]
     place, right = image.place, image.axes[:, 0].copy()
@@ -237,6 +237,6 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     expected = across(random + systematic_variance(fits.sensor, squared))
     hidden = across(random_variance(sensor, squared) - random)
     explained = np.minimum(1, expected / np.maximum(square, 1e-18))
-    confidence = (1 - fits.outlier_share()) * explained
+    confidence = (1 - fits.sums.outliers / np.maximum(fits.sums.pixels, 1)) * explained
     rms = np.sqrt(np.maximum(square, 0) + hidden)
     return normal, distance, centroid, rms, confidence

@@ -31,7 +31,7 @@ def common_surfaces(fits: Fits, covariance: NDArray[np.float64]) -> NDArray[np.i
     neighbours are alike and cancel in it. Returns the label (M + 1,) of the largest region of each
     one's group, 0 where there is no plane.
     """
-    order = np.argsort(-fits.pixels, kind='stable')
+    order = np.argsort(-fits.sums.pixels, kind='stable')
     order = order[fits.theta[order].any(axis=1)]
     cells = Cells.of(fits.sums, fits.level, distortion_field(fits.sensor))
     return _surfaces(order, fits.sums.start, fits.theta, fits.inverses(), covariance, cells)

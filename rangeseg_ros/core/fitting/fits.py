@@ -59,20 +59,11 @@ class Fits(NamedTuple):
         level = self.level[kept[self.sums.owners]]
         return Fits(sums, self.total[kept], self.theta[kept], self.sensor, level)
 
-    @property
-    def pixels(self) -> NDArray[np.intp]:
-        """Number of measured pixels of each region, (M + 1,)."""
-        return self.sums.pixels
-
     def farthest(self) -> NDArray[np.float64]:
         """Least inverse range (M + 1,) of planes in their regions; 0 or less where none ends."""
         least = np.where(np.diff(self.sums.start) > 0, np.inf, 0.0)
         np.minimum.at(least, self.sums.owners, self.level)
         return least
-
-    def outlier_share(self) -> NDArray[np.float64]:
-        """Share of the pixels (M + 1,) beyond four standard deviations of the sensor's errors."""
-        return self.sums.outliers / np.maximum(self.sums.pixels, 1)
 
     def inverses(self) -> NDArray[np.float64]:
         """Inverses (M + 1, 3, 3) of the sums of w r r^T; zeros where there is no plane."""

@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.runtime.threads import run_rows
+from rangeseg_ros.core.runtime.threads import map_halves
 from rangeseg_ros.core.sensing.moments import cofactors, ray_of
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
@@ -90,7 +90,7 @@ def cells_of(image: RangeImage, up: NDArray[np.float64], sensor: SensorModel) ->
     values = np.empty((6, *shape), np.float32)
     ray, inverse, scatter = values[:3], values[3], values[4:]
     means = ray, inverse, scatter
-    run_rows(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
+    map_halves(_means, shape[0], image.inverse, image.rays, image.pinhole, size, *means)
     with np.errstate(divide='ignore', invalid='ignore'):
         place = np.tensordot(axes.astype(np.float32), ray, 1) / inverse
         place[:, inverse == 0] = np.nan
@@ -251,8 +251,9 @@ def classify(
     """
     classes, heights = np.empty(image.shape, np.uint8), np.empty(image.shape, np.float32)
     rise = np.tensordot(field.up.astype(np.float32), field.theta, 1)
-    run_rows(_classify, bounds.shape[1], image.inverse, image.rays, image.pinhole, field.theta,
-             rise, field.size, bounds, classes, heights)  # fmt: skip
+    pixels = image.inverse, image.rays, image.pinhole
+    cells = field.theta, rise, field.size, bounds
+    map_halves(_classify, bounds.shape[1], *pixels, *cells, classes, heights)
     return classes, heights
 
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache, partial
-from itertools import pairwise
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
@@ -23,7 +22,6 @@ T = TypeVar('T')
 
 # More would wait for the memory.
 _MAX_THREADS = 4
-_ROWS = 16  # that are worth the handing over
 # Rows on either side of the middle of the image that are looked at again.
 _SEAM = 8
 
@@ -34,7 +32,7 @@ class Task(Generic[T]):
     def __init__(self, function: Callable[..., T], *arguments: Any) -> None:
         self._call = partial(function, *arguments)
         self._future: Future[T] | None = None
-        if _threads() > 1:
+        if cv2.getNumThreads() // max(_sharing, 1) > 1:
             count = min(cv2.getNumThreads(), _MAX_THREADS) - 1
             self._future = _pool(count).submit(self._call)
 
@@ -80,25 +78,6 @@ def sharing_cores() -> Iterator[None]:
             _sharing -= 1
 
 
-def _threads() -> int:
-    return min(cv2.getNumThreads() // max(_sharing, 1), _MAX_THREADS)
-
-
-def run_rows(kernel: Callable[..., None], rows: int, *arguments: Any) -> None:
-    """Run kernel(first, after, *arguments) on strips of the rows at the same time.
-
-    What one strip writes no other may touch.
-    """
-    count = max(min(_threads(), rows // _ROWS), 1)
-    bounds = [rows * part // count for part in range(count + 1)]
-    others = [Task(kernel, *strip, *arguments) for strip in pairwise(bounds[1:])]
-    kernel(0, bounds[1], *arguments)
-    for other in others:
-        other.run()
-    for other in others:
-        other.result()
-
-
 def map_halves(kernel: Callable[..., T], rows: int, *arguments: Any) -> tuple[T, T]:
     """Results of kernel(first, after, *arguments) for the upper and the lower half of the rows.
 
@@ -119,8 +98,3 @@ def run_halves(kernel: Callable[..., None], height: int, *arguments: Any) -> Non
     kernel((0, max(middle - 1, 0)), *arguments)
     lower.result()
     kernel((max(middle - _SEAM, 0), min(middle + _SEAM, height)), *arguments)
-
-
-def submit(function: Callable[..., T], *arguments: Any) -> Task[T]:
-    """Start a call beside what the caller does; with one core, `result()` makes it."""
-    return Task(function, *arguments)
