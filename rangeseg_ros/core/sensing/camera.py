@@ -181,8 +181,9 @@ class Camera:
             x = (np.asarray(u, float) - self.cx - self.skew * y) / self.fx
         if self.distortion_model:
             x, y = undistort(x, y, self.distortion_model, self.d)
-        rays = np.stack(np.broadcast_arrays(x, y, 1.0), axis=-1)
-        rays[~((np.abs(x) <= _STEEPEST) & (np.abs(y) <= _STEEPEST))] = np.nan
+        rays = np.ones((*np.broadcast(x, y).shape, 3))
+        rays[..., 0], rays[..., 1] = x, y
+        rays[~(np.maximum(np.abs(x), np.abs(y)) <= _STEEPEST)] = np.nan
         return rays if self.turn == OPTICAL else rays @ self.axes.T
 
 

@@ -62,9 +62,8 @@ class Cells(NamedTuple):
 
     def enlarged(self, array: NDArray, shape: tuple[int, int]) -> NDArray:
         """Values (h, w, ...) of the cells for all pixels of an image (H, W)."""
-        v = (np.arange(shape[0]) + self.rows) // self.factor
-        u = (np.arange(shape[1]) + self.columns) // self.factor
-        return array[np.ix_(v, u)]
+        pixels = array.repeat(self.factor, axis=1).repeat(self.factor, axis=0)
+        return pixels[self.rows : self.rows + shape[0], self.columns : self.columns + shape[1]]
 
 
 def _depth(inverse: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -173,7 +173,8 @@ def _share_of_range(
     terms = np.column_stack([rays, bend])
     kept = np.ones(len(rays), np.bool_)
     for _ in range(2):
-        covariance = np.linalg.pinv(terms[kept].T @ terms[kept], hermitian=True)
+        square = terms[kept].T @ terms[kept]
+        covariance = np.linalg.inv(square + np.finfo(float).eps * np.trace(square) * np.eye(4))
         solution = covariance @ (terms[kept].T @ inverse[kept])
         left = np.abs(inverse - terms @ solution)
         variance = np.mean(left[kept] ** 2) * covariance[3, 3]
