@@ -117,10 +117,8 @@ class Outline:
     def _rays(self, corners: NDArray[np.int32]) -> NDArray[np.float64]:
         """Places (x, y) in the image and rays (N, 5) of corners (x, y) of pixels in the box."""
         if isinstance(self.rays, Camera):
-            places = np.empty((len(corners), 5))
-            places[:, 0], places[:, 1] = (corners + (self.column - 0.5, self.row - 0.5)).T
-            places[:, 2:] = self.rays.rays_at(places[:, 0], places[:, 1])
-            return places
+            places = corners + np.array([self.column - 0.5, self.row - 0.5])
+            return np.concatenate([places, self.rays.rays_at(*places.T)], axis=1)
         total = np.zeros((len(corners), 6))
         height, width = self.mask.shape
         for i in (0, -1):
