@@ -53,9 +53,9 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
 def flat_regions(
     regions: NDArray[np.uint16], view: View, config: Config
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], Fits]:
-    """Which regions (H, W) are planes with a probability of `plane_probability` at least.
+    """Which of the regions 0...M are 0 or planes, with `plane_probability` at least.
 
-    For 0...M, with True for 0; and the probabilities and the fits of those that are.
+    And the probabilities and the fits of these.
     """
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
     probability = plane_probabilities(fits, config.plane_prior)

@@ -12,7 +12,7 @@ from rangeseg_ros.core.description.shapes import Outline, RegionShape, Shape, tr
 from rangeseg_ros.core.fitting.coplanar import common_surfaces
 from rangeseg_ros.core.fitting.fits import Fits
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER
-from rangeseg_ros.core.fitting.uncertainty import plane_jacobians, squares
+from rangeseg_ros.core.fitting.uncertainty import covariance_roots, plane_jacobians, squares
 from rangeseg_ros.core.rotations import quaternions
 from rangeseg_ros.core.sensing.moments import COUNT
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -20,6 +20,9 @@ from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance, syste
 
 # A border is taken seriously up to this many times the range of the farthest part of its plane.
 _FAR = 2.0
+# The upper triangle of a symmetric matrix, and how often the matrix has each of its entries.
+_ROW, _COLUMN = np.triu_indices(3)
+_TWICE = np.where(_ROW == _COLUMN, 1, 2)
 
 Own = TypeVar('Own', bound='Plane')
 
@@ -178,7 +181,7 @@ def describe_regions(
     probability = np.ones(len(theta)) if probability is None else probability
     if not theta.any():
         return []
-    root = fits.covariance_roots()
+    root = covariance_roots(fits.sums, fits.level, fits.inverses(), fits.sensor)
     normal, distance, centroid, rms, confidence = _described(fits, sensor)
     covariance = squares(plane_jacobians(normal, distance) @ root)
     if image.place.any():
@@ -219,8 +222,7 @@ def _described(fits: Fits, sensor: SensorModel) -> tuple[NDArray[np.float64], ..
     centroid = total[:, POINT : POINT + 3] / inliers
     offset = (normal * centroid).sum(axis=1)
     # The scatter matrix between the normals: its upper triangle, with the rest of it.
-    rows, columns = np.triu_indices(3)
-    twice = np.where(rows == columns, 1, 2) * normal[:, rows] * normal[:, columns]
+    twice = _TWICE * normal[:, _ROW] * normal[:, _COLUMN]
     square = (twice * total[:, SCATTER : SCATTER + 6] / inliers).sum(axis=1)
     square += distance * (2 * offset + distance)
     centroid -= (offset + distance)[:, None] * normal

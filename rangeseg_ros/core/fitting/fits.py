@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.fitting.region_sums import POINT, SCATTER, RegionSums, fit_sums, sum_regions
-from rangeseg_ros.core.fitting.uncertainty import covariance_roots, levels
+from rangeseg_ros.core.fitting.uncertainty import levels
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.moments import COUNT, cofactors
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -72,10 +72,6 @@ class Fits(NamedTuple):
         inverse = np.stack(entries, axis=1)[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]]
         inverse = np.where(known[:, None], inverse, 0) / np.where(known, determinant, 1)[:, None]
         return inverse.reshape(-1, 3, 3)
-
-    def covariance_roots(self) -> NDArray[np.float64]:
-        """Roots R of the covariances R R^T of theta, (M + 1, 3, 3)."""
-        return covariance_roots(self.sums, self.level, self.inverses(), self.sensor)
 
 
 def _total_least_squares(

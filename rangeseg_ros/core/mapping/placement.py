@@ -119,8 +119,7 @@ def find_placement(
 class UpFilter:
     """Up by all that tells it; while nothing does, the last one, with an error that grows."""
 
-    def __init__(self) -> None:
-        self._last: tuple[int, Up, float | None] | None = None
+    _last: tuple[int, Up, float | None] | None = None
 
     def settle(self, found: Placement, stamp: int, config: Config) -> Placement:
         """What was `found` at a stamp, nanoseconds, with its up, or why that is lost.

@@ -58,14 +58,13 @@ def compiled_by(ahead: Callable[[], None], run: Callable[[], T]) -> T:
 @contextmanager
 def nothing_compiled() -> Iterator[None]:
     """Raise `NotCompiledError` where a kernel of the package would be compiled."""
-
-    class Refuse(event.Listener):
-        def on_start(self, event: Any) -> None:
-            if event.data['dispatcher'].py_func.__module__.startswith(_PACKAGE):
-                raise NotCompiledError(event.data['dispatcher'], event.data['args'])
-
-        def on_end(self, event: Any) -> None:
-            pass
-
-    with event.install_listener('numba:compile', Refuse()):
+    with event.install_listener('numba:compile', _Refusal()):
         yield
+
+
+class _Refusal(event.Listener):
+    def on_start(self, event: Any) -> None:
+        if event.data['dispatcher'].py_func.__module__.startswith(_PACKAGE):
+            raise NotCompiledError(event.data['dispatcher'], event.data['args'])
+
+    def on_end(self, event: Any) -> None: ...

@@ -66,7 +66,7 @@ def sum_of_four(values: NDArray[Any]) -> NDArray[np.float64]:
     """Sums over 2 x 2 of values (rows, columns, ...), of fewer at the border."""
     rows, columns, *rest = values.shape
     result = np.zeros(((rows + 1) // 2, (columns + 1) // 2, *rest))
-    for i, j in np.ndindex(2, 2):
+    for i, j in (0, 0), (0, 1), (1, 0), (1, 1):
         part = values[i::2, j::2]
         result[: len(part), : part.shape[1]] += part
     return result

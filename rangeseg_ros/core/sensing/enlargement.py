@@ -126,7 +126,7 @@ def replication(image: RangeImage) -> Cells | None:
 
 def _period(lines: NDArray[np.float32]) -> tuple[int, int]:
     """Distance of the columns at which values change, and what the first one lacks; 0 for none."""
-    lines = lines[:: max(len(lines) // _LINES, 1)]
+    lines = np.ascontiguousarray(lines[:: max(len(lines) // _LINES, 1)])
     before, after = lines[:, :-1], lines[:, 1:]
     changes = np.flatnonzero(((before != after) & (before > 0) & (after > 0)).any(axis=0)) + 1
     period = int(np.gcd.reduce(np.diff(changes)))

@@ -181,8 +181,12 @@ def sobel(image: RangeImage) -> GridEdges:
 
 def pixels_beside(edges: GridEdges) -> NDArray[np.bool_]:
     """Pixels (H, W) that a jump separates from one of their four neighbours or more."""
-    right, below = np.pad(edges[0], ((0, 0), (1, 1))), np.pad(edges[1], ((1, 1), (0, 0)))
-    pixels: NDArray[np.bool_] = right[:, 1:] | right[:, :-1] | below[1:] | below[:-1]
+    right, below = edges
+    pixels = np.zeros((len(right), below.shape[1]), np.bool_)
+    pixels[:, :-1] = right
+    pixels[:, 1:] |= right
+    pixels[:-1] |= below
+    pixels[1:] |= below
     return pixels
 
 
