@@ -7,6 +7,7 @@ import pytest
 
 pytest.importorskip('rclpy')
 
+from diagnostic_msgs.msg import DiagnosticStatus
 from recordings import Recording
 from ros_bench import DEPTH, FRAME, Bench, assert_replayed
 from sensor_msgs.msg import Imu
@@ -179,6 +180,11 @@ def test_up_is_that_of_the_accelerometer_in_the_frame_of_the_images(bench):
         # Nothing measured yet, then nothing that could be used.
         planes, _ = planes_of(bench, room(bench.camera))
         assert planes['floor']['distance'] == level
+        missing = bench.reported(
+            lambda s: 'no acceleration of rest yet' in s.message,
+            lambda: planes_of(bench, room(bench.camera)),
+        )
+        assert missing.level == DiagnosticStatus.ERROR and 'no terrain' in missing.message
         for fields in ({'frame': 'imu_link'}, {'covariance': -1.0}):
             assert roles_while(bench, measure, 0, 0, -GRAVITY, **fields) == level
         for pushed in ((0, 0, -1.2 * GRAVITY), (np.nan, 0, 0), (0, 0, 0)):

@@ -111,12 +111,12 @@ class Locator:
                 return self._buffer.lookup(target, source, frame.stamp)
 
         imu, reading = self._imu, self._reading
+        known = (reading.frame, reading.acceleration) if reading else None
+        found = find_placement(config, frame.frame_id, lookup, known)
         if imu and not reading:
             problem = f'{imu.topic}: no acceleration of rest yet'
             self._node.get_logger().warning(problem, throttle_duration_sec=5.0)
-        known = (reading.frame, reading.acceleration) if reading else None
-        found = find_placement(config, frame.frame_id, lookup, known)
-        found.asked |= imu is not None
+            found.asked, found.sources['up'] = True, f'{found.sources["up"]}; {problem}'
         return found
 
     def delay(self, config: Config, frame: DepthFrame, waited: float) -> float:
