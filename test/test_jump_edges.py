@@ -11,7 +11,13 @@ from rangeseg_ros.core.segmenter import Segmenter
 from rangeseg_ros.core.sensing.bridges import bridge_holes
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.grid import grid_of
-from rangeseg_ros.core.sensing.jump_edges import bridge_edges, jump_edges, plane_deviation, sobel
+from rangeseg_ros.core.sensing.jump_edges import (
+    bridge_edges,
+    jump_edges,
+    pixels_beside,
+    plane_deviation,
+    sobel,
+)
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.simulation.solids import box, cast, half_space
 
@@ -329,3 +335,14 @@ def test_an_image_without_holes_is_itself():
     image = RangeImage(VIEW.rays, crease()[0].astype(np.float32), VIEW)
     some = np.ones((30, 40), np.float32)
     assert bridge_holes(image, some, some) is image
+
+
+def test_pixels_beside_edges_are_those_on_either_side():
+    right, below = np.zeros((3, 4), bool), np.zeros((2, 5), bool)
+    right[0, 1] = right[2, 3] = below[0, 4] = below[1, 2] = True
+    found = pixels_beside((right, below))
+    assert np.argwhere(found).tolist() == [
+        *([0, 1], [0, 2], [0, 4]),
+        *([1, 2], [1, 4]),
+        *([2, 2], [2, 3], [2, 4]),
+    ]

@@ -205,6 +205,11 @@ def test_terrain_of_every_frame_is_that_of_the_messages(done):
     # Two walls: no ground, and no stairs.
     assert {row['found'] for row in rows} == {'0'}
     assert len((folder / 'stairs.csv').read_text().splitlines()) == 1
+    # Where the recording does not tell which way is up, nothing is an obstacle either.
+    assert all(read_labels(picture).any() for picture in pictures)
+    config, lost = Config(gravity_frame='base_footprint'), done / 'lost'
+    Replay(done / 'recording', lost, config, terrain=True).run()
+    assert not any(read_labels(picture).any() for picture in lost.glob('*_terrain.png'))
     # Without terrain, none of it stays behind.
     replay(done / 'recording', folder)
     assert not list(folder.glob('*_terrain.png')) and not (folder / 'ground.csv').exists()
