@@ -143,16 +143,16 @@ class Segmenter:
             fits = Fits.of(regions, view.image, stated, view.blocks)
             probability = plane_probabilities(fits, config.plane_prior)
             numbers = np.arange(len(probability), dtype=np.uint16)
-        regions = relabel(regions, numbers)
         watch.lap('regions')
-        # Bridged pixels were not measured, and of some regions no plane is known: a pixel or two,
-        # or so steep that they have no end.
-        known = fits.farthest() > 0
-        labels = relabel(regions, (known * np.arange(len(known))).astype(np.uint16))
         errors = sensor if pixels else fits.sensor
-        planes = describe_regions(regions, view.whole, fits, errors, probability)
+        numbered = relabel(regions, numbers)
+        planes = describe_regions(numbered, view.whole, fits, errors, probability)
+        # Bridged pixels were not measured; some regions have no plane, or one without an end.
+        known = fits.farthest() > 0
+        labels = pixels.result() if pixels else regions * view.image.valid
+        labels = relabel(labels, known[numbers] * numbers)
         result = Segmentation(
-            labels * view.image.valid,
+            labels,
             planes,
             watch.laps,
             _reason(image, planes),
@@ -166,7 +166,6 @@ class Segmenter:
             identified=view.identified,
         )
         if pixels:
-            labels = relabel(pixels.result(), known[numbers] * numbers)
             result = result.of_pixels(labels, image, Cells(side, 0, 0))
         watch.lap('planes')
         return result

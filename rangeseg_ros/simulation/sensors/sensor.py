@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -12,7 +13,7 @@ from rangeseg_ros.core.sensing.camera import Camera
 
 
 @dataclass(frozen=True)
-class Sensor:
+class Sensor(ABC):
     """A depth camera: how it errs, and what it does not see.
 
     Sizes in pixels that come from matching windows and filters are those of the image at hand;
@@ -29,6 +30,7 @@ class Sensor:
     seed: int = 0
     camera: ClassVar[Camera]
 
+    @abstractmethod
     def measure(
         self, depth: NDArray[np.float64], camera: Camera, random: np.random.Generator
     ) -> NDArray[np.uint16] | NDArray[np.float32]:
@@ -37,7 +39,6 @@ class Sensor:
         Both the image, where 0 stands for no measurement, and the true `depth` (metres, inf where
         there is nothing) are along the optical axis; `random` gives what is new in every frame.
         """
-        raise NotImplementedError
 
 
 class Ideal(Sensor):
