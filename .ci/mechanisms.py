@@ -135,7 +135,8 @@ MECHANISMS = (
               {'by_planes.method.join_surfaces': _given(4, _NO_BORDER),
                'segmenter.unite_regions': _given(2, _NO_BORDER)}),
     Mechanism('regions that touch unite', 'by_planes/surfaces.py:unite_regions',
-              {'segmenter.unite_regions': _unchanged}),
+              {'segmenter.unite_regions': lambda _: lambda regions, *rest:
+               (regions, np.zeros((0, 2), np.uint16))}),
     Mechanism('planes shifted by the distortion', 'by_planes/shifts.py',
               {'by_planes.labelling.shifts':
                lambda _: lambda surfaces, blocks, theta, *rest: Shifts.none(len(theta))}),
@@ -158,6 +159,8 @@ MECHANISMS = (
                side, *rest: regions.repeat(side, 0).repeat(side, 1)[
                    : image.shape[0], : image.shape[1]] * image.valid}),
     Mechanism('curved regions told', 'by_planes/posterior.py', {'plane_probability': 0.0}),
+    Mechanism('facets of curved surfaces told', 'by_planes/posterior.py:_evidence,_solution',
+              {'by_planes.method.plane_probabilities': _given(1, np.zeros((0, 2), np.uint16))}),
     Mechanism('method normals', ' '.join(f'by_normals/{name}.py' for name in _NORMALS),
               {'method': 'normals'}, option=True),
     # Planes.

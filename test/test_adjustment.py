@@ -6,10 +6,10 @@ import numpy as np
 from map_squares import plane as map_plane
 from scipy.spatial.transform import Rotation
 
-from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.adjustment import Adjustment
 from rangeseg_ros.core.mapping.observations import (
     LASTING,
+    RESIDUE,
     PlaneSet,
     PoseNoise,
     cell_rays,

@@ -5,11 +5,12 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from rangeseg_ros import Camera, Config, RangeImage, Segmenter
-from rangeseg_ros.core.by_planes.posterior import _explained, plane_probabilities
+from rangeseg_ros.core.by_planes.posterior import _evidence, _explained, plane_probabilities
 from rangeseg_ros.core.by_planes.shifts import shift_at, shifts
 from rangeseg_ros.core.fitting.fits import Fits
-from rangeseg_ros.core.sensing.moments import RATIO
-from rangeseg_ros.core.sensing.sensor import SensorModel
+from rangeseg_ros.core.fitting.region_sums import INVERSE, PLACE, RAY, WEIGHT
+from rangeseg_ros.core.sensing.moments import COUNT, RATIO
+from rangeseg_ros.core.sensing.sensor import SensorModel, random_variance
 from rangeseg_ros.simulation.fields import smooth_field
 from rangeseg_ros.simulation.sensors.kinect import QUANTUM
 
@@ -28,13 +29,19 @@ def cylinder(radius, distance=2.0):
     return np.where(root > 0, 1 / depth, 0)
 
 
-def probabilities(inverse, regions, seed=0):
+NO_PAIRS = np.zeros((0, 2), np.uint16)
+
+
+def fitted(inverse, regions, seed=0):
     random = np.random.default_rng(seed)
     error = 0.45 * smooth_field(CAMERA.shape, (2.0, 2.0), random)
     error += 0.5 * smooth_field(CAMERA.shape, (13.0, 22.0), random)
     seen = np.where(inverse > 0, inverse + QUANTUM * error, 0).astype(np.float32)
-    fits = Fits.of(regions.astype(np.uint16), RangeImage(CAMERA.rays, seen, CAMERA), SENSOR)
-    return plane_probabilities(fits, 0.5)
+    return Fits.of(regions.astype(np.uint16), RangeImage(CAMERA.rays, seen, CAMERA), SENSOR)
+
+
+def probabilities(inverse, regions, seed=0, pairs=NO_PAIRS):
+    return plane_probabilities(fitted(inverse, regions, seed), np.array(pairs, np.uint16), 0.5)
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -52,7 +59,9 @@ def test_rows_and_columns_are_alike(bend):
     sensor, rays = SensorModel.from_config(Config(), camera.shape), camera.rays.astype(float)
     inverse = rays @ np.array([0.5, 0.1, 0.5]) + bend * (rays[..., :2] ** 2 @ np.array([1, 0.5]))
     one, other = (
-        plane_probabilities(Fits.of(np.ones(camera.shape, np.uint16), image, sensor), 0.5)[1]
+        plane_probabilities(
+            Fits.of(np.ones(camera.shape, np.uint16), image, sensor), NO_PAIRS, 0.5
+        )[1]
         for values in (inverse, inverse.T.copy())
         for image in [RangeImage(camera.rays, values.astype(np.float32), camera)]
     )
@@ -64,6 +73,73 @@ def test_rows_and_columns_are_alike(bend):
 def test_cylinders_are_none(radius, seed):
     inverse = cylinder(radius)
     assert probabilities(inverse, inverse > 0, seed)[1] < 0.3
+
+
+def folded(angle, column=160):
+    """Two walls, 2 m away, that meet at an angle in a column; regions 1 and 2."""
+    x = CAMERA.rays[..., 0].astype(float)
+    crease, half = x[0, column], np.tan(np.radians(angle / 2))
+    left, right = (0.5 * (1 + sign * half * (x - crease)) for sign in (1, -1))
+    return np.minimum(left, right), np.where(x < crease, 1, 2)
+
+
+@pytest.mark.parametrize('angle', [8, 20, 60, 120])
+@pytest.mark.parametrize('column', [60, 160])
+def test_walls_that_meet_are_planes(angle, column):
+    inverse, regions = folded(angle, column)
+    alone, beside = probabilities(inverse, regions), probabilities(inverse, regions, 0, [[1, 2]])
+    np.testing.assert_allclose(beside, alone, atol=1e-6)
+    assert (alone[1:] > 0.5).all()
+
+
+@pytest.mark.parametrize(('radius', 'distance'), [(0.3, 1.5), (0.5, 1.5), (1.0, 2.0)])
+def test_facets_of_a_cylinder_are_no_planes_together(radius, distance):
+    """Each of three strips by itself may be a plane."""
+    inverse, columns = cylinder(radius, distance), np.arange(320)
+    seen = np.flatnonzero(inverse[0])
+    regions = np.where(inverse > 0, 1 + (columns - seen[0]) * 3 // len(seen), 0)
+    alone = probabilities(inverse, regions)
+    together = probabilities(inverse, regions, 0, [[1, 2], [2, 3]])
+    assert (alone[1:] > 0.5).all() and (together[1:] < 0.2).all()
+
+
+def test_a_wall_that_goes_on_as_a_fillet_is_a_plane():
+    """A wall, the quarter of a cylinder that touches it, and a wall at a right angle."""
+    x, radius, depth = CAMERA.rays[..., 0].astype(float), 0.5, 2.0
+    # z = depth up to X = 0; (X - 0)^2 + (z - depth + radius)^2 = radius^2 beyond.
+    centre = depth - radius
+    root = centre**2 - (1 + x**2) * (centre**2 - radius**2)
+    bent = (centre + np.sqrt(np.maximum(root, 0))) / (1 + x**2)
+    inverse = np.where(x < 0, 1 / depth, 1 / bent)
+    regions = np.where(x < 0, 1, np.where(x < 0.13, 2, 0))
+    alone, beside = probabilities(inverse, regions), probabilities(inverse, regions, 0, [[1, 2]])
+    assert beside[1] == pytest.approx(alone[1], abs=0.01) and beside[1] > 0.5
+
+
+def test_the_evidence_is_that_of_residuals_along_the_crease():
+    """Against least squares of all cells at once."""
+    x, y = np.moveaxis(CAMERA.rays[..., :2].astype(float), -1, 0)
+    inverse = 0.5 + 0.05 * x - 0.2 * x**2 - 0.05 * x * y
+    sums, _, theta, *_ = fitted(inverse, np.where(x < 0.1, 1, 2))
+    found = _evidence(sums, 1, 2, theta, SENSOR, SENSOR.correlated)
+    parts = [sums.cells[sums.start[k] : sums.start[k + 1]] for k in (1, 2)]
+    cells, part = np.vstack(parts), np.repeat([0, 1], [len(one) for one in parts])
+    root = np.sqrt(cells[:, COUNT])
+    level = cells[:, RAY:INVERSE] @ theta[1:].T / cells[:, WEIGHT, None]
+    deviation = np.sqrt(random_variance(SENSOR, level**2))
+    residual = (cells[:, INVERSE] / cells[:, WEIGHT])[:, None] - level
+    residual *= root[:, None] / deviation
+    own, other = residual[np.arange(len(part)), part], residual[:, 0]
+    planes = np.where(part == 0, 0, other - own)
+    v, u = (cells[:, PLACE + k] / cells[:, COUNT] / 100 for k in range(2))
+    terms = root[:, None] * np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=1)
+    crease = planes - terms @ np.linalg.lstsq(terms, planes, rcond=None)[0]
+    for k in range(2):
+        mine = part == k
+        noise = max(SENSOR.correlated, own[mine] @ own[mine] / (mine.sum() - 3))
+        ratio = own[mine] @ own[mine] - ((own + crease)[mine] ** 2).sum()
+        assert found[k] == pytest.approx(ratio / (2 * noise), rel=1e-5)
+    assert min(found) > 0
 
 
 @pytest.mark.parametrize('seed', range(2))

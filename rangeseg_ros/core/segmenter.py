@@ -129,19 +129,19 @@ class Segmenter:
             valid = view.whole.valid
         regions = plane_regions(labelling.labels, valid, view.grid, view.least)
         # Parts of a plane that holes cut, or that have either of two directions it lies between.
-        regions = unite_regions(regions, view, config.plane_smoothness)
+        regions, pairs = unite_regions(regions, view, config.plane_smoothness)
         pixels: Task[NDArray[np.uint16]] | None = None
         if isinstance(labelling, by_planes.Labelling):
             if side > 1:
                 given = regions, labelling.labels, labelling.models, image, side, sensor
                 pixels = Task(with_sharp_borders, *given, config.plane_smoothness * sensor.patch)
-            flat, probability, fits = by_planes.flat_regions(regions, view, config)
+            flat, probability, fits = by_planes.flat_regions(regions, pairs, view, config)
             numbers, curved = numbers_of(flat), relabel(regions, numbers_of(~flat))
         else:
             # Its labels know no noise: their regions spill by more than a precise sensor errs.
             stated = SensorModel.from_config(config, image.shape)
             fits = Fits.of(regions, view.image, stated, view.blocks)
-            probability = plane_probabilities(fits, config.plane_prior)
+            probability = plane_probabilities(fits, pairs, config.plane_prior)
             numbers = np.arange(len(probability), dtype=np.uint16)
         watch.lap('regions')
         errors = sensor if pixels else fits.sensor
@@ -199,8 +199,9 @@ def _preprocessed(
     if side > 1:
         image = bins.of_one_surface(steps.pixels * np.float32(excess**0.5))
         blocks = Blocks.of(image)
-    # Planes are fitted to what was measured; where they end is found with small holes bridged.
-    whole = bridge_holes(image, steps.windows, steps.slopes)
+    # Planes are fitted to what was measured; where they end is found with small holes bridged,
+    # which bins of several pixels do not have.
+    whole = bridge_holes(image, steps.windows, steps.slopes) if side == 1 else image
     jumps = jump_edges(whole, config.jump_edges, steps.windows, steps.slopes, steps.pixels)
     grid = grid_of(whole, jumps)
     watch.lap('edges')

@@ -51,14 +51,14 @@ def segment(view: View, config: Config, lap: Callable[[str], None]) -> Labelling
 
 
 def flat_regions(
-    regions: NDArray[np.uint16], view: View, config: Config
+    regions: NDArray[np.uint16], pairs: NDArray[np.uint16], view: View, config: Config
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64], Fits]:
     """Which of the regions 0...M are 0 or planes, with `plane_probability` at least.
 
-    And the probabilities and the fits of these.
+    And the probabilities and the fits of these. `pairs` (E, 2) of regions touch.
     """
     fits = Fits.of(regions, view.image, view.sensor, view.blocks)
-    probability = plane_probabilities(fits, config.plane_prior)
+    probability = plane_probabilities(fits, pairs, config.plane_prior)
     flat = probability >= config.plane_probability
     flat[0] = True
     return flat, probability[flat], fits.without(~flat)

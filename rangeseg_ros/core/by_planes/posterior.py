@@ -2,8 +2,8 @@
 
 What a quadratic explains of the residuals of a plane, its bend, has three terms. Noise, the smooth
 distortion of the sensor and the bend of the surface itself make it, and each term is Gaussian with
-the sum of their variances. The last two are log-normal; the posterior compares planes with curved
-surfaces, the likelihood of each integrated over these (Gauss-Hermite quadrature).
+the sum of their variances. The last is log-normal; the posterior compares planes with curved
+surfaces, the likelihood of each integrated over it (Gauss-Hermite quadrature).
 """
 
 from __future__ import annotations
@@ -33,68 +33,95 @@ from rangeseg_ros.core.sensing.sensor import (
 
 # Medians and logarithmic standard deviations, by maximum likelihood over 96 planes and curved
 # regions of 17 annotated frames of 12 sensors: bend over width of planes and of curved surfaces,
-# root mean square; and the deviation of the distortion's share. The curved ones are wider spread
-# than those of the frames, which were cut in pieces (0.013, 0.5): whole curved objects of
-# simulated scenes bend by up to 0.1.
+# root mean square. The curved ones are wider spread than those of the frames, which were cut in
+# pieces (0.013, 0.5): whole curved objects of simulated scenes bend by up to 0.1.
 PLANE_BEND = 0.0023
-_PLANE, _CURVED, _SPREAD = (PLANE_BEND, 0.5), (0.02, 0.9), 0.32
+_PLANE, _CURVED = (PLANE_BEND, 0.5), (0.02, 0.9)
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
-_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+
+Floats = NDArray[np.float64]
 
 
-def plane_probabilities(fits: Fits, prior: float) -> NDArray[np.float64]:
+def plane_probabilities(fits: Fits, pairs: NDArray[np.uint16], prior: float) -> Floats:
     """Posterior probability (M + 1,) of each region to be a plane and no curved surface.
 
-    `prior` is the share of planes among regions: the result where nothing tells. 0 for region 0.
+    `pairs` (E, 2) of regions touch. They may be parts of one surface, as facets of a cylinder are,
+    and then each is as probably a plane as both together. `prior` is the share of planes among
+    regions: the result where nothing tells. 0 for region 0.
     """
     sums, sensor = fits.sums, fits.sensor
-    around, alike = float(max(sensor.distortion_pixels, 1)), float(sensor.correlated)
     # The planes of least squares in inverse range: what those of clouds leave, which are of total
     # least squares, is no bend to a scanner, whose planes are not linear in the pixels.
-    theta = fit_sums(fits.total)
-    return _probabilities(sums, fits.total, theta, sensor, around, alike, prior)
+    total = np.concatenate([fits.total, fits.total[pairs].sum(axis=1)])
+    known = fit_sums(total), sensor, sensor.correlated, prior
+    # Of a pair the larger region first, whose numbers are lower: places are told from its middle.
+    return _probabilities(sums, np.sort(pairs).astype(np.intp), total, *known)
+
+
+@njit(cache=True, nogil=True)
+def _probabilities(
+    sums: RegionSums,
+    pairs: NDArray[np.intp],
+    total: Floats,
+    theta: Floats,
+    sensor: SensorModel,
+    alike: float,
+    prior: float,
+) -> Floats:
+    """Probabilities of regions; `total` and `theta` are of these and then of the pairs."""
+    count = len(theta) - len(pairs)
+    alone, shared = np.zeros(count), np.zeros(count)
+    for k in range(1, count):
+        alone[k] = _probability(sums, k, k, total[k], theta[k], sensor, alike, prior)
+    result = alone.copy()
+    for e in range(len(pairs)):
+        a, b = pairs[e, 0], pairs[e, 1]
+        if not (theta[a].any() and theta[b].any()):
+            continue
+        one, other = _evidence(sums, a, b, theta, sensor, alike)
+        for k, own, further in ((a, one, other), (b, other, one)):
+            # Against two planes, and against a plane beside a surface that goes on as its own.
+            share, p = 1 / (1 + np.exp(-own) + np.exp(-own - further)), count + e
+            if share > shared[k]:
+                both = _probability(sums, a, b, total[p], theta[p], sensor, alike, prior)
+                shared[k], result[k] = share, alone[k] + share * (both - alone[k])
+    return result
 
 
 # Divisions by zero give inf: cells through which the plane passes edge on.
-@njit(cache=True, nogil=True, error_model='numpy')
-def _probabilities(
+@njit(cache=True, error_model='numpy')
+def _probability(
     sums: RegionSums,
-    total: NDArray[np.float64],
-    theta: NDArray[np.float64],
+    a: int,
+    b: int,
+    total: Floats,
+    theta: Floats,
     sensor: SensorModel,
-    around: float,
     alike: float,
     prior: float,
-) -> NDArray[np.float64]:
-    result = np.zeros(len(theta))
-    for k in range(1, len(theta)):
-        result[k] = prior
-        if not theta[k].any():
-            continue
-        cells = sums.cells[sums.start[k] : sums.start[k + 1]]
-        shown = _residuals(cells, theta[k], sensor, sums.box[k])
-        size, square, linear, bend, scale, ratio = shown
-        if size == 0:  # all its pixels are too far from the plane
-            continue
-        # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
-        noise = alike * max((square - linear - bend) / size, 1.0)
-        distortion = ratio * distortion_share(size, around) * size / 3
-        # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
-        width = _area(total[k]) * size / (3 * scale**2)
-        plane = prior * _likelihood(bend, noise, distortion, width, _PLANE)
-        curved = (1 - prior) * _likelihood(bend, noise, distortion, width, _CURVED)
-        result[k] = plane / (plane + curved) if plane + curved > 0 else 0.0
-    return result
+) -> float:
+    """Posterior probability of a region, or of two as one, to be a plane."""
+    if not theta.any():
+        return prior
+    size, square, linear, bend, scale, ratio = _residuals(sums, a, b, theta, sensor)
+    if size == 0:  # all its pixels are too far from the plane
+        return prior
+    # Noise as the region itself shows it: at a grazing angle it is more than the sensor's.
+    noise = alike * max((square - linear - bend) / size, 1.0)
+    around = max(sensor.distortion_length**2, 1.0)
+    distortion = ratio * distortion_share(size, around) * size / 3
+    # Sum of squares, for each of the three terms, of a bend as large as the region is wide.
+    width = _area(total) * size / (3 * scale**2)
+    plane = prior * _likelihood(bend, noise, distortion, width, _PLANE)
+    curved = (1 - prior) * _likelihood(bend, noise, distortion, width, _CURVED)
+    return plane / (plane + curved) if plane + curved > 0 else 0.0
 
 
 @njit(cache=True, error_model='numpy')
 def _residuals(
-    cells: NDArray[np.float64],
-    theta: NDArray[np.float64],
-    sensor: SensorModel,
-    box: NDArray[np.intp],
+    sums: RegionSums, a: int, b: int, theta: Floats, sensor: SensorModel
 ) -> tuple[float, float, float, float, float, float]:
-    """What a plane leaves of a region, in standard deviations of the noise of a pixel.
+    """What a plane leaves of regions a and b, in standard deviations of the noise of a pixel.
 
     Number of pixels, sum of the squared residuals, of what a linear fit to the means of cells
     explains of them, and of what the other terms of a quadratic add; mean standard deviation
@@ -103,35 +130,86 @@ def _residuals(
     system = np.zeros((7, 6))
     size = square = scale = ratio = 0.0
     slope = np.sqrt(theta[0] ** 2 + theta[1] ** 2 + theta[2] ** 2)
-    half = max(box[2] - box[0], box[3] - box[1]) / 2
-    for cell in cells:
-        count, level, mean = cell[COUNT], 0.0, cell[INVERSE]
-        for a in range(3):
-            level += theta[a] * cell[RAY + a]
-            mean -= theta[a] * cell[RAY + a]
-        level /= cell[WEIGHT]
-        variance = random_variance(sensor, level**2)
-        # Weights of a cloud are not those of its errors.
-        unit = count / (variance * cell[WEIGHT])
-        mean /= cell[WEIGHT] * np.sqrt(variance)
-        v = (cell[PLACE] / count - (box[0] + box[2]) / 2) / half
-        u = (cell[PLACE + 1] / count - (box[1] + box[3]) / 2) / half
-        terms = 1.0, u, v, u * u, u * v, v * v
-        for a in range(6):
-            system[6, a] += count * terms[a] * mean
-            for b in range(a + 1):
-                system[a, b] += count * terms[a] * terms[b]
-        size += count
-        square += max(squares_left(cell, theta), 0.0) * unit
-        # An error of the inverse leaves the plane by distance / inverse times as much.
-        scale += count * np.sqrt(variance) / (slope * abs(level))
-        ratio += count * systematic_variance(sensor, level**2) / variance
+    for part in range(1 if a == b else 2):
+        k = (a, b)[part]
+        for cell in sums.cells[sums.start[k] : sums.start[k + 1]]:
+            count = cell[COUNT]
+            mean, level, variance = _mean(cell, theta, sensor)
+            _add_terms(system, _terms(cell, sums.box[a]), mean, count)
+            size += count
+            # Weights of a cloud are not those of its errors.
+            unit = count / (variance * cell[WEIGHT])
+            square += max(squares_left(cell, theta), 0.0) * unit
+            # An error of the inverse leaves the plane by distance / inverse times as much.
+            scale += count * np.sqrt(variance) / (slope * abs(level))
+            ratio += count * systematic_variance(sensor, level**2) / variance
     linear, bend = _explained(system)
     return size, square, linear, bend, scale / size, ratio / size
 
 
+@njit(cache=True, error_model='numpy')
+def _evidence(
+    sums: RegionSums, a: int, b: int, theta: Floats, sensor: SensorModel, alike: float
+) -> tuple[float, float]:
+    """Log-likelihood ratios that regions a and b follow one quadratic, against planes of each.
+
+    The quadratic that is nearest to both planes differs from these by a crease. Regions that
+    follow it leave their planes by the crease, planes by noise, as large as the plane leaves it;
+    whatever else bends them, like the distortion, is not along the crease.
+    """
+    system, odds = np.zeros((7, 6)), np.zeros(2)
+    for cell in sums.cells[sums.start[b] : sums.start[b + 1]]:
+        apart = _mean(cell, theta[a], sensor)[0] - _mean(cell, theta[b], sensor)[0]
+        _add_terms(system, _terms(cell, sums.box[a]), apart, cell[COUNT])
+    for cell in sums.cells[sums.start[a] : sums.start[a + 1]]:
+        _add_terms(system, _terms(cell, sums.box[a]), 0.0, cell[COUNT])
+    _explained(system)
+    quadratic = _solution(system)
+    for part in range(2):
+        k, cells, square, along, left = (a, b)[part], 0, 0.0, 0.0, 0.0
+        for cell in sums.cells[sums.start[k] : sums.start[k + 1]]:
+            own, count = _mean(cell, theta[k], sensor)[0], cell[COUNT]
+            terms = _terms(cell, sums.box[a])
+            crease = part * (_mean(cell, theta[a], sensor)[0] - own)
+            for c in range(6):
+                crease -= quadratic[c] * terms[c]
+            cells, left = cells + 1, left + count * own**2
+            square, along = square + count * crease**2, along - count * crease * own
+        odds[part] = (2 * along - square) / (2 * max(alike, left / max(cells - 3, 1)))
+    return odds[0], odds[1]
+
+
 @njit(cache=True)
-def _explained(root: NDArray[np.float64]) -> tuple[float, float]:
+def _terms(cell: Floats, box: NDArray[np.intp]) -> tuple[float, ...]:
+    """Terms of a quadratic at the mean place of a cell; about 1 within a bounding box."""
+    half = max(box[2] - box[0], box[3] - box[1]) / 2
+    v = (cell[PLACE] / cell[COUNT] - (box[0] + box[2]) / 2) / half
+    u = (cell[PLACE + 1] / cell[COUNT] - (box[1] + box[3]) / 2) / half
+    return 1.0, u, v, u * u, u * v, v * v
+
+
+@njit(cache=True, error_model='numpy')
+def _mean(cell: Floats, theta: Floats, sensor: SensorModel) -> tuple[float, float, float]:
+    """Mean residual of a cell from a plane, in standard deviations; its level and variance."""
+    level = 0.0
+    for a in range(3):
+        level += theta[a] * cell[RAY + a]
+    variance = random_variance(sensor, (level / cell[WEIGHT]) ** 2)
+    mean = (cell[INVERSE] - level) / (cell[WEIGHT] * np.sqrt(variance))
+    return mean, level / cell[WEIGHT], variance
+
+
+@njit(cache=True)
+def _add_terms(system: Floats, terms: tuple[float, ...], value: float, weight: float) -> None:
+    """Add an equation to the normal equations of a fit, in place; see `_explained`."""
+    for a in range(6):
+        system[6, a] += weight * terms[a] * value
+        for b in range(a + 1):
+            system[a, b] += weight * terms[a] * terms[b]
+
+
+@njit(cache=True)
+def _explained(root: Floats) -> tuple[float, float]:
     """Sums of squares that the linear terms of a fit explain, and that its quadratic ones add.
 
     Of the normal equations A = L L^T (Cholesky) with b below, where b^T A^-1 b is |L^-1 b|^2, and
@@ -152,7 +230,19 @@ def _explained(root: NDArray[np.float64]) -> tuple[float, float]:
 
 
 @njit(cache=True)
-def _area(total: NDArray[np.float64]) -> float:
+def _solution(root: Floats) -> Floats:
+    """Coefficients (6,) of the fit, of what `_explained` leaves."""
+    result = np.zeros(6)
+    for a in range(5, -1, -1):
+        value = root[6, a]
+        for b in range(a + 1, 6):
+            value -= root[b, a] * result[b]
+        result[a] = value / root[a, a]
+    return result
+
+
+@njit(cache=True)
+def _area(total: Floats) -> float:
     """Area of the rectangle whose points have the same covariance, square metres."""
     n, s = total[COUNT], SCATTER
     x, y, z = total[POINT] / n, total[POINT + 1] / n, total[POINT + 2] / n
@@ -170,9 +260,7 @@ def _likelihood(
     """Density of three squared Gaussian terms that sum to `bend`, but for a common factor."""
     total = 0.0
     for a in range(len(_NODES)):
-        shown = distortion * np.exp(_SPREAD * _NODES[a])
-        for b in range(len(_NODES)):
-            own = surface[0] * np.exp(surface[1] * _NODES[b])
-            variance = noise + shown + width * own * own
-            total += _WEIGHTS[a] * _WEIGHTS[b] * variance**-1.5 * np.exp(-bend / (2 * variance))
+        own = surface[0] * np.exp(surface[1] * _NODES[a])
+        variance = noise + distortion + width * own * own
+        total += _WEIGHTS[a] * variance**-1.5 * np.exp(-bend / (2 * variance))
     return total

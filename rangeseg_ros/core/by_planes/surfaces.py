@@ -77,7 +77,7 @@ def join_surfaces(
     four blocks, are clutter.
     """
     expected = Expected.of(view, NODE, smoothness)
-    roots = _agglomerate(patches, nodes.right, nodes.below, moments, expected)
+    roots, _ = _agglomerate(patches, nodes.right, nodes.below, moments, expected)
     least = max(view.least**0.5 - NODE, 2 * NODE) ** 2
     surface, moments = renumbered(roots, moments, least)
     return surface[patches], moments
@@ -85,17 +85,19 @@ def join_surfaces(
 
 def unite_regions(
     regions: NDArray[np.uint16], view: View, smoothness: float
-) -> NDArray[np.uint16]:
+) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
     """Unite regions (H, W) whose pixels touch, for the reasons for which patches are.
 
-    Where holes or jumps leave no blocks beside each other, their pixels may still touch.
+    Where holes or jumps leave no blocks beside each other, their pixels may still touch. Also
+    returns the pairs (E, 2) of regions that touch.
     """
     moments = region_moments(regions, int(regions.max(initial=0)) + 1, view.whole, view.sensor)
     touching = view.grid.right > 0, view.grid.below > 0
     expected = Expected.of(view, 1, smoothness)
-    roots = _agglomerate(regions.astype(np.int32), *touching, moments, expected)
+    roots, pairs = _agglomerate(regions.astype(np.int32), *touching, moments, expected)
     pixels = np.bincount(roots, moments[:, COUNT], len(moments)).astype(np.intp)
-    return relabel(regions, by_falling_size(pixels)[roots])
+    numbers = by_falling_size(pixels)[roots]
+    return relabel(regions, numbers), numbers[pairs]
 
 
 @njit(cache=True, nogil=True)
@@ -105,10 +107,10 @@ def _agglomerate(
     below: NDArray[np.bool_],
     moments: NDArray[np.float64],
     expected: Expected,
-) -> NDArray[np.intp]:
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
     """Merge the parts 1...P of an image of labels, those that are likeliest one surface first.
 
-    Returns the root (P + 1,) of each.
+    Returns the root (P + 1,) of each, and the pairs (E, 2) of parts that touch and are not merged.
     """
     contacts = find_contacts(labels, right, below, len(moments))
     moments, parent = moments.copy(), singles(len(moments))
@@ -141,7 +143,7 @@ def _agglomerate(
             c, e = int(np.intp(target[h])), h // 2
             apart[e] = _apart(moments, residual, a, c, strips, 2 * e, length[e], expected)
             h = contacts.link[h]
-    return find_roots(parent)
+    return find_roots(parent), target.reshape(-1, 2)[length > 0]
 
 
 @njit(cache=True)

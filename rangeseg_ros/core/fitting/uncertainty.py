@@ -23,10 +23,6 @@ _FAR = 5.0
 _ROW, _COLUMN, _FULL = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2), (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
-# Width of a field, see `Cells`, and the constant and quartic term of its variance.
-Field = tuple[float, float, float]
-
-
 class Cells(NamedTuple):
     """Cells of regions as a Gaussian field sees them; see `RegionSums` for which are whose."""
 
@@ -37,7 +33,9 @@ class Cells(NamedTuple):
     width: float  # of the kernel that it looks smoothed with, pixels
 
     @classmethod
-    def of(cls, sums: RegionSums, level: NDArray[np.float64], field: Field) -> Cells:
+    def of(
+        cls, sums: RegionSums, level: NDArray[np.float64], field: tuple[float, float, float]
+    ) -> Cells:
         """Cells whose planes are at inverse ranges y (N,); of variance constant + quartic y^4."""
         width, constant, quartic = field
         cells = sums.cells
@@ -50,11 +48,6 @@ class Cells(NamedTuple):
         return cls(np.hstack([mean[:, :2], spread]), count, ray, deviation, float(width))
 
 
-def distortion_field(sensor: SensorModel) -> Field:
-    """The smooth systematic errors of a sensor."""
-    return sensor.distortion_length, sensor.distortion**2, sensor.range_distortion**2
-
-
 def covariance_roots(
     sums: RegionSums, level: NDArray[np.float64], inverse: NDArray[np.float64], sensor: SensorModel
 ) -> NDArray[np.float64]:
@@ -64,7 +57,8 @@ def covariance_roots(
     (M + 1, 3, 3) is A^-1. Zeros where there is no plane.
     """
     smooth = 1 - sensor.white if sensor.correlation > 0 else 0.0
-    variances = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
+    noise = smooth * (FLOOR + sensor.noise**2), smooth * sensor.range_noise**2
+    distortion = sensor.distortion**2, sensor.range_distortion**2
     weight, ray = sums.cells[:, WEIGHT], sums.cells[:, RAY : RAY + 3]
     mean, scatter = weight / sums.cells[:, COUNT], sums.cells[:, :6]
     centred = scatter - ray[:, _ROW] * ray[:, _COLUMN] / weight[:, None]
@@ -72,7 +66,7 @@ def covariance_roots(
     white = (1 - smooth) * random_variance(sensor, level**2) * mean
     own = white[:, None] * scatter
     middle = np.zeros((len(inverse), 3, 3))
-    for field in ((sensor.correlation, *variances), distortion_field(sensor)):
+    for field in ((sensor.correlation, *noise), (sensor.distortion_length, *distortion)):
         if field[1] + field[2] > 0:
             cells = Cells.of(sums, level, field)
             own += (_within(cells) * mean)[:, None] * centred
@@ -128,42 +122,28 @@ def _within(cells: Cells) -> NDArray[np.float64]:
 
 @njit(cache=True, nogil=True)
 def _between(start: NDArray[np.intp], cells: Cells) -> NDArray[np.float64]:
-    """Half the sums over pairs of cells (M + 1, 3, 3) of regions."""
+    """Half the sums over pairs of cells (M + 1, 3, 3) of regions: but for the transposes."""
     result = np.zeros((len(start) - 1, 3, 3))
-    for k in range(len(result)):
-        own = start[k], start[k + 1]
-        add_common_errors(cells, own, own, result[k])
-    return result
-
-
-@njit(cache=True)
-def add_common_errors(
-    cells: Cells, one: tuple[int, int], other: tuple[int, int], result: NDArray[np.float64]
-) -> None:
-    """Add the sum over pairs of pixels, of the means of cells, to `result` (3, 3).
-
-    `one` and `other` are the first cell of either pixel and the one after the last. Where they are
-    the same, half of the sum, which is it but for the transpose.
-    """
-    same = one[0] == other[0]
     variance = 2 * cells.width**2
     place, count, ray = cells.place, cells.pixels, cells.ray
-    for i in range(*one):
-        x = y = z = 0.0
-        for j in range(i if same else other[0], other[1]):
-            down = variance + place[i, 2] + place[j, 2]
-            across = variance + place[i, 3] + place[j, 3]
-            lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
-            lag += (place[i, 1] - place[j, 1]) ** 2 / max(across, 1e-300)
-            if lag > _FAR**2:
-                continue
-            alike = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
-            if lag == 0:
-                # A pixel agrees with itself.
-                alike = max(alike, 1 / min(count[i], count[j]))
-            alike /= 1 + (same and i == j)
-            x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
-        for p in range(3):
-            result[p, 0] += ray[i, p] * x
-            result[p, 1] += ray[i, p] * y
-            result[p, 2] += ray[i, p] * z
+    for k in range(len(result)):
+        for i in range(start[k], start[k + 1]):
+            x = y = z = 0.0
+            for j in range(i, start[k + 1]):
+                down = variance + place[i, 2] + place[j, 2]
+                across = variance + place[i, 3] + place[j, 3]
+                lag = (place[i, 0] - place[j, 0]) ** 2 / max(down, 1e-300)
+                lag += (place[i, 1] - place[j, 1]) ** 2 / max(across, 1e-300)
+                if lag > _FAR**2:
+                    continue
+                alike = variance / np.sqrt(max(down * across, 1e-300)) * np.exp(-lag / 2)
+                if lag == 0:
+                    # A pixel agrees with itself.
+                    alike = max(alike, 1 / min(count[i], count[j]))
+                alike /= 1 + (i == j)
+                x, y, z = x + alike * ray[j, 0], y + alike * ray[j, 1], z + alike * ray[j, 2]
+            for p in range(3):
+                result[k, p, 0] += ray[i, p] * x
+                result[k, p, 1] += ray[i, p] * y
+                result[k, p, 2] += ray[i, p] * z
+    return result

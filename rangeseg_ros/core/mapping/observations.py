@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rangeseg_ros.core.description.planes import Plane
-from rangeseg_ros.core.fitting.coplanar import RESIDUE
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.sensing.distortion import in_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
@@ -32,6 +31,9 @@ from rangeseg_ros.core.tracking.plane_errors import (
 # distortion, nearly all of the error of a plane, 55 % was found to be one pattern in eight real
 # frames of a sequence, and 80 % is one in the simulated sensor.
 LASTING = 0.8
+# What the parts of a face differ by beyond their errors, as factor of variances: the residue of
+# bands, of grazing views and of ragged borders, from 239 pairs in simulated rooms (median 2.9).
+RESIDUE = 2.5
 # Samples along a side of a cell of the image, see `views`.
 _SAMPLES = 16
 

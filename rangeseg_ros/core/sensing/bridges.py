@@ -1,4 +1,4 @@
-"""Small holes in the measurements, bridged where the surfaces around them go on."""
+"""Small holes in the measurements, bridged where the surface around them goes on."""
 
 from __future__ import annotations
 
@@ -6,84 +6,42 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
-from rangeseg_ros.core.sensing.blocks import BLOCK
+from rangeseg_ros.core.sensing.blocks import for_pixels
 from rangeseg_ros.core.sensing.range_image import RangeImage
 
-# Pixels from one side of a hole to the other, at most: gaps of three, as random holes in a third
-# of the pixels make them, and less than the shadow of any step that is not small itself.
-SPAN = 4
-_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # rows and columns from one pixel to the next
+# Of the eight pixels around a hole: a straight border of what was measured has three.
+_MEASURED = 4
+_WINDOW = np.ones((3, 3), np.uint8)
 
 
 def bridge_holes(
     image: RangeImage, steps: NDArray[np.float32], slopes: NDArray[np.float32]
 ) -> RangeImage:
-    """The image with small holes interpolated.
+    """The image with missing pixels as the mean of those around them.
 
-    A missing pixel lies between two measured ones in its row, column or diagonals. All such pairs
-    must continue each other: their inverse ranges differ by no more than a jump and the slope of
-    the surface over their distance, which the two sides of a shadow do not. The closest pair is
-    interpolated. `steps` and `slopes`, from pixel to pixel, are those of every block, 1/m.
+    At least half of these are measured, and they continue each other: their inverse ranges differ
+    by no more than a jump and the slope of the surface across the window, which the two sides of a
+    shadow do not. `steps` and `slopes`, from pixel to pixel, are those of every block, 1/m.
     """
-    known = image.valid.view(np.uint8)
-    holes = cv2.dilate(known, np.ones((2 * SPAN - 1, 2 * SPAN - 1), np.uint8)) > known
-    if not holes.any():
+    valid, inverse = image.valid, image.inverse
+    if valid.all():
         return image
-    inverse = image.inverse.copy()
-    # A camera has rays everywhere; those of a cloud lie between its points.
-    rays = (image.rays if image.camera is None else image.rays[:0]).copy()
-    _bridge(holes, image.inverse, steps, slopes, inverse, rays)
-    return replace(image, inverse=inverse, rays=rays if rays.size else image.rays)
+    nearest = cv2.dilate(inverse, _WINDOW)
+    farthest = cv2.erode(np.where(valid, inverse, np.float32(np.inf)), _WINDOW)
+    continued = nearest - farthest <= for_pixels(steps + 2 * slopes, image.shape)
+    count, seen = _sum(valid.astype(np.float32)), valid[..., None]
+    bridged = ~valid & (count >= _MEASURED) & continued
+    values = _sum(np.where(seen, np.dstack([inverse, image.rays]), np.float32(0)))
+    means = values / np.maximum(count, 1)[..., None]
+    rays = image.rays
+    if image.camera is None:  # those of a cloud lie between its points, a camera's are everywhere
+        rays = np.where(bridged[..., None], means[..., 1:], rays)
+    return replace(image, inverse=np.where(bridged, means[..., 0], inverse), rays=rays)
 
 
-@njit(cache=True, nogil=True)
-def _bridge(
-    holes: NDArray[np.bool_],
-    measured: NDArray[np.float32],
-    steps: NDArray[np.float32],
-    slopes: NDArray[np.float32],
-    inverse: NDArray[np.float32],
-    rays: NDArray[np.float32],
-) -> None:
-    """Fill in the holes that are bridged."""
-    for i in range(len(measured)):
-        for j in range(measured.shape[1]):
-            if not holes[i, j]:
-                continue
-            step, slope = steps[i // BLOCK, j // BLOCK], slopes[i // BLOCK, j // BLOCK]
-            best = 2 * SPAN
-            for di, dj in _DIRECTIONS:
-                back = _distance(measured, i, j, (-di, -dj), SPAN - 1)
-                ahead = _distance(measured, i, j, (di, dj), SPAN - back) if back > 0 else 0
-                if ahead == 0:
-                    continue
-                span, share = back + ahead, np.float32(back / (back + ahead))
-                bi, bj, ai, aj = i - back * di, j - back * dj, i + ahead * di, j + ahead * dj
-                one, other = measured[bi, bj], measured[ai, aj]
-                if abs(one - other) > step + slope * span:
-                    inverse[i, j] = 0
-                    break
-                if span < best:
-                    best = span
-                    inverse[i, j] = one + share * (other - one)
-                    for k in range(3 if rays.size > 0 else 0):
-                        here, there = rays[bi, bj, k], rays[ai, aj, k]
-                        rays[i, j, k] = here + share * (there - here)
-
-
-@njit(cache=True, inline='always')
-def _distance(
-    measured: NDArray[np.float32], i: int, j: int, direction: tuple[int, int], most: int
-) -> int:
-    """Steps to the nearest measured pixel in a direction; 0 where `most` lead to none."""
-    height, width = measured.shape
-    for k in range(1, most + 1):
-        u, v = i + k * direction[0], j + k * direction[1]
-        if not (0 <= u < height and 0 <= v < width):
-            return 0
-        if measured[u, v] > 0:
-            return k
-    return 0
+def _sum(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sum of the window around every pixel."""
+    result = cv2.boxFilter(values, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    return np.asarray(result, np.float32)

@@ -96,7 +96,10 @@ def judge(
             f'The steps of the depth are those of a Kinect whose image is read {times}: '
             'check the depth scale (TUM: 0.0002).'
         )
-    if curved is not None and np.count_nonzero(curved) > np.count_nonzero(labels):
+    # A range that is read as z bends all planes.
+    if curved is None or 'range instead of z' in found:
+        curved = np.zeros_like(labels)
+    if np.count_nonzero(curved) > np.count_nonzero(labels):
         found['curved scene'] = (
             'More pixels are on curved surfaces than on planes: a part of the planes may be '
             'curved, too.'
