@@ -8,6 +8,7 @@ from clouds import cloud_of
 
 from rangeseg_ros import Config, RangeImage, Segmenter
 from rangeseg_ros.core.by_planes.borders import with_sharp_borders
+from rangeseg_ros.core.by_planes.patches import NODE
 from rangeseg_ros.core.by_planes.plane_energy import CAP, NO_PLANE, Models
 from rangeseg_ros.core.by_planes.shifts import Shifts
 from rangeseg_ros.core.options import ConfigError
@@ -123,7 +124,12 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
     coarse = draw.integers(0, 4, (4, 4), np.uint16).repeat(3, 0).repeat(3, 1)
     regions = np.ascontiguousarray(coarse[: bins[0], : bins[1]])
     theta = np.array([[0, 0, 0], [0.1, 0, 0.5], [0, 0.1, 0.52], [-0.1, 0, 0.49]])
-    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), Shifts.none(4))
+    # Shifts of every plane at every block of 2 x 2 bins.
+    blocks = -(-bins[0] // NODE), -(-bins[1] // NODE)
+    values = draw.normal(0, 0.05, (4, *blocks)).astype(np.float32)
+    box, start = np.tile([0, 0, *blocks], (4, 1)), np.arange(4) * blocks[0] * blocks[1]
+    shifts = Shifts(box, start, values.ravel())
+    models = Models(theta, np.array([0, 0.5, 0.4, 0.3]), shifts)
     truth = draw.integers(1, 4, camera.shape)
     inverse = (theta[truth] * camera.rays).sum(axis=2) + draw.normal(0, 0.01, camera.shape)
     inverse[draw.random(camera.shape) < 0.1] = 0
@@ -140,7 +146,8 @@ def test_pixels_beside_borders_take_the_label_of_the_lowest_cost(side):
                 continue
             near = [(u - 1, v), (u, v - 1), (u + 1, v), (u, v + 1)]
             near = [at for at in near if 0 <= at[0] < 17 and 0 <= at[1] < 21 and image.valid[at]]
-            off = image.inverse[u, v] - theta[names] @ camera.rays[u, v]
+            moved = 1 + np.where(np.equal(names, 0), 0, values[names, i // NODE, j // NODE])
+            off = image.inverse[u, v] - moved * (theta[names] @ camera.rays[u, v])
             costs = np.minimum(models.half_precision[names] * off**2 / 1e-4, CAP)
             costs[np.equal(names, 0)] = NO_PLANE
             costs += [prior * sum(expected[at] != name for at in near) for name in names]

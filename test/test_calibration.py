@@ -8,6 +8,7 @@ from message_classes import cloud
 from rosbags.typesys import Stores
 
 from rangeseg_ros import Camera, Config, RangeImage
+from rangeseg_ros.batch.calibration import ResidualsOfFrame, Source
 from rangeseg_ros.core.calibration.calibrate import (
     CalibrationError,
     _blocks,
@@ -17,6 +18,7 @@ from rangeseg_ros.core.calibration.calibrate import (
 )
 from rangeseg_ros.core.calibration.field import _roughness, residuals, robust_weights, solve
 from rangeseg_ros.core.calibration.sightings import cell_grid, concatenate, find_sightings
+from rangeseg_ros.core.sensing.distortion import DistortionMap
 from rangeseg_ros.io.bag_writer import BagWriter, DepthBagWriter
 from rangeseg_ros.io.cameras import write_camera
 from rangeseg_ros.io.distortion import read_distortion
@@ -301,6 +303,16 @@ def folder(tmp_path_factory):
             write_image(path / 'depth' / f'frame-{3 * number:06d}.depth.png', depth)
             bag.write(depth, 10**9 + number * 10**8)
     return path
+
+
+def test_the_true_map_takes_the_residuals_away(folder):
+    """What planes leave of a frame before and after it, in the places that either has."""
+    distortion = DistortionMap(true_map(0.004).astype(np.float32), camera=CAMERA)
+    source = Source(folder / 'depth', CAMERA)
+    images, planes = ResidualsOfFrame(source, Config(), 5, distortion).run()
+    assert planes[1] == 2 and images.shape == (2, *CAMERA.shape)
+    before, after = (np.sqrt(np.nanmean(image**2)) for image in images)
+    assert np.isfinite(images[1]).mean() > 0.8 and 0.0003 < after < 0.0012 < before
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from rangeseg_ros import (
     camera_from_matrices,
 )
 from rangeseg_ros.core.sensing.camera import CameraWarning
-from rangeseg_ros.core.sensing.lens import undistort
+from rangeseg_ros.core.sensing.lens import _lens, undistort
 
 K = [[500, 0, 320], [0, 510, 240], [0, 0, 1]]
 P = [[450, 0, 310, 0], [0, 460, 235, 0], [0, 0, 1, 0]]
@@ -185,6 +185,23 @@ def test_opencv_sees_the_rays_at_their_pixels(model, d):
     v, u = np.indices(camera.shape)
     np.testing.assert_allclose(columns, u.ravel(), atol=2e-4)
     np.testing.assert_allclose(rows, v.ravel(), atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ('model', 'd', 'imaginary'),
+    [
+        ('rational_polynomial', (0.1, -0.2, 0.01, -0.02, 0.05, 0.3, -0.1, 0.02), 1j),
+        ('rational_polynomial', (0.1, -0.2, 0.01, -0.02, 0, 0, 0, 0, 0.01, -0.03, 0.02, 0.04), 1j),
+        ('equidistant', (0.1, -0.05, 0.02, -0.01), 0),  # of angles, which are real
+    ],
+)
+def test_derivatives_of_a_lens_are_its_differences(model, d, imaginary):
+    draw = np.random.default_rng(0).normal(size=(4, 50))
+    z, step = (draw[:2] + imaginary * draw[2:]) * [[0.3], [1e-6]]
+    lens = _lens(model, d)
+    _, along, across = lens(z)
+    difference = (lens(z + step)[0] - lens(z - step)[0]) / 2
+    np.testing.assert_allclose(difference, along * step + across * np.conj(step), rtol=1e-5)
 
 
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])

@@ -1,6 +1,7 @@
 """Clouds in frames of any axes: found as in an optical frame, told in their own."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rangeseg_ros import Camera, Config, RangeImage, Segmenter, SequenceSegmente
 from rangeseg_ros.core.ground.cells import GROUND
 from rangeseg_ros.core.ground.points import drops, outlines
 from rangeseg_ros.core.rotations import rotation_by, rotation_matrix
+from rangeseg_ros.core.sensing.clouds import depth_of
 from rangeseg_ros.messages.outputs import OUTPUTS
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.solids import cast
@@ -32,6 +34,15 @@ FRAMES = {
     'any, moved': (rotation_by((1.3, -0.7, 2.1)), np.array([-7.0, 3, 2])),
 }
 CAMERA = Camera(320, 240, 290.0, 291.0, 158.5, 121.0)
+
+
+def test_depth_is_from_the_camera_wherever_it_is():
+    points = np.array([[[1.0, 2.0, 3.0]]])
+    for place in ((0.0, 0.0, 0.0), (0.5, 0.0, 1.0)):
+        moved = replace(CAMERA, place=place)
+        assert depth_of(points, moved) == pytest.approx(3 - place[2])
+    turned = replace(CAMERA, turn=(0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)), place=(0.0, 0.0, 1.0))
+    assert depth_of(points, turned) == pytest.approx(1.0)  # it looks along x
 
 
 def room(seed=5, camera=CAMERA, frame=0):

@@ -1,6 +1,7 @@
 """Odometry from planes: true motions, what planes leave open, no jumps, files and messages."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from rangeseg_ros.batch.replay import Replay
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.mapping.edges import JumpPoints
 from rangeseg_ros.core.mapping.observations import views
-from rangeseg_ros.core.mapping.odometry import PlaneOdometry
+from rangeseg_ros.core.mapping.odometry import _POSES, PlaneOdometry
 from rangeseg_ros.core.mapping.transforms import Transform
 from rangeseg_ros.core.options import ConfigError
 from rangeseg_ros.core.segmenter import Segmenter
@@ -152,6 +153,21 @@ def test_points_at_jump_edges_tell_a_known_motion_as_well_as_is_said():
         values.append(error @ np.linalg.solve(np.linalg.inv(information)[:6, :6], error) / 6)
     # Independent points, which these are, tell more than is said of points along an edge.
     assert 0.005 < np.mean(values) < 1 and np.median(shifts) < 0.01
+
+
+def test_edges_are_taken_in_as_a_filter_does():
+    """Against the information form: inverse covariances add up."""
+    draw, odometry = np.random.default_rng(3), PlaneOdometry()
+    root, told, values = draw.normal(size=(18, 18)), draw.normal(size=(5, 12)), draw.normal(size=5)
+    prior = root @ root.T / 18
+    odometry._covariance = prior.copy()
+    edges = SimpleNamespace(motion=lambda last, before, pose, own: (told, values))
+    odometry._align(Transform.identity(), edges)
+    design = np.zeros((5, 18))
+    design[:, _POSES] = told
+    expected = np.linalg.inv(np.linalg.inv(prior) + design.T @ design)
+    np.testing.assert_allclose(odometry._covariance, expected, atol=1e-9)
+    np.testing.assert_allclose(odometry._velocity, (expected @ design.T @ values)[6:12])
 
 
 def test_a_straight_edge_tells_nothing_along_itself_and_few_points_nothing():

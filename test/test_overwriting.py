@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from replays import record_walls, results
 
-from rangeseg_ros.cli.options import check_replaceable
-from rangeseg_ros.io.files import FileError, replacing
+from rangeseg_ros.cli.options import check_new, check_replaceable
+from rangeseg_ros.io.files import FileError, NotReplacedError, replacing
 from rangeseg_ros.io.images import write_image
 from rangeseg_ros.report.page import page_kind
 
@@ -22,6 +22,17 @@ pytestmark = pytest.mark.slow
 def write(path, text='new'):
     with replacing(path) as partial:
         partial.write_text(text)
+
+
+def test_what_is_there_is_kept_unless_told_and_inputs_always(tmp_path):
+    there, new = tmp_path / 'there', tmp_path / 'new'
+    there.write_text('old')
+    check_new([new], [there], overwrite=False)
+    check_new([there, new], [], overwrite=True)
+    with pytest.raises(NotReplacedError, match='--overwrite'):
+        check_new([new, there], [], overwrite=False)
+    with pytest.raises(NotReplacedError, match='is an input'):
+        check_new([there], [there], overwrite=True)
 
 
 def test_links_are_followed(tmp_path):

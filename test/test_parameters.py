@@ -39,6 +39,7 @@ from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from std_msgs.msg import Empty
 
+from rangeseg_ros.ros.depth_input import PROFILE_VARIABLE, SEGMENT_SIZE, DepthInput
 from rangeseg_ros.ros.throttled_events import ThrottledCallbackGroup
 
 pytest.importorskip('rclpy')
@@ -302,6 +303,20 @@ def test_the_interval_is_kept(monkeypatch):
         group.message_came()
         looked.append(group.can_execute(event))
     assert looked == [True, False, False, True, False, True]
+
+
+@pytest.mark.ros
+def test_what_may_help_against_losses_follows_the_size_of_the_messages(monkeypatch):
+    source = DepthInput.__new__(DepthInput)
+    monkeypatch.delenv(PROFILE_VARIABLE, raising=False)
+    told = {}
+    for size in (0, SEGMENT_SIZE, SEGMENT_SIZE + 1):
+        source._largest = size
+        told[size] = source.loss_hint()
+    assert told[0].startswith('if they are over') and told[SEGMENT_SIZE] == ''
+    assert told[SEGMENT_SIZE + 1].startswith('messages over')
+    monkeypatch.setenv(PROFILE_VARIABLE, 'profile.xml')
+    assert 'publisher needs it' in source.loss_hint()
 
 
 def status(**found):

@@ -56,6 +56,18 @@ def rotation(quaternion):
     )
 
 
+@pytest.mark.parametrize('degrees', range(0, 180, 20))
+def test_the_length_points_to_the_right_of_the_image(degrees):
+    turn = np.radians(degrees)
+    way = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    corners = np.array([[90, 30], [-90, 30], [-90, -30], [90, -30]]) @ way + [320, 240]
+    labels = cv2.fillPoly(np.zeros(CAMERA.shape, np.uint8), [corners.round().astype(int)], 1)
+    (plane,) = fit_planes(labels.astype(np.uint16), plane_image(), KINECT)
+    length, width, normal = plane.shape.frame.T
+    assert length[0] > 0 and np.cross(length, width) == pytest.approx(normal)
+    assert plane.extents[0] > 2 * plane.extents[1]
+
+
 @pytest.mark.parametrize('form', [lambda image: image, as_cloud], ids=['camera', 'cloud'])
 def test_exact_planes_come_back(form):
     labels = boxes((50, 60, 250, 300), (300, 400, 316, 420))

@@ -116,6 +116,18 @@ def test_a_wall_that_goes_on_as_a_fillet_is_a_plane():
     assert beside[1] == pytest.approx(alone[1], abs=0.01) and beside[1] > 0.5
 
 
+@pytest.mark.parametrize('slope', [0.02, 0.1, 0.2])
+def test_a_bowed_wall_beside_what_does_not_go_on_is_a_plane(slope):
+    """The wall bends towards its neighbour, which is flat."""
+    x = CAMERA.rays[..., 0].astype(float)
+    beyond, columns = x - x[0, 270], np.arange(320)
+    inverse = 0.5 + np.where(beyond < 0, 0.04 * beyond**2, slope * beyond)
+    regions = np.where(beyond < 0, 1, 2) * (columns < 310)
+    alone, beside = probabilities(inverse, regions), probabilities(inverse, regions, 0, [[1, 2]])
+    np.testing.assert_allclose(beside, alone, atol=0.01)
+    assert alone[1] > 0.5
+
+
 def test_the_evidence_is_that_of_residuals_along_the_crease():
     """Against least squares of all cells at once."""
     x, y = np.moveaxis(CAMERA.rays[..., :2].astype(float), -1, 0)

@@ -67,6 +67,13 @@ def test_the_floor_is_the_surface_at_the_stated_height():
     assert roles(planes(table), known) == ['other']
 
 
+def test_without_a_height_the_floor_is_what_reaches_below_the_sensor():
+    """As seen: a table begins nearer than the floor does, but not as steeply below."""
+    table = slice(64, 74), slice(0, 80)
+    floor = slice(90, 120), slice(80, 160)
+    assert roles(planes((table, UP, 0.05), (floor, UP, 1.2)), LEVEL)[1] == 'floor'
+
+
 def test_parts_of_the_floor_steps_and_what_lies_beneath_it():
     scrap = slice(100, 106)
     found = planes(

@@ -14,7 +14,7 @@ from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.sensing.camera import Camera
 from rangeseg_ros.core.sensing.range_image import RangeImage
 from rangeseg_ros.core.sensing.sensor import SensorModel
-from rangeseg_ros.core.tracking.tracker import Tracker
+from rangeseg_ros.core.tracking.tracker import Tracker, Tracks, _camera_motion
 from rangeseg_ros.simulation.render import simulate
 from rangeseg_ros.simulation.scenes import kinect_room
 from rangeseg_ros.simulation.sensors.kinect import Kinect, kinect_camera
@@ -85,6 +85,19 @@ def test_a_hidden_plane_moves_along_with_the_camera():
     decoy = (*box[:3], box[3] + 0.2)
     right = slice(50, 80), slice(20, 48)
     assert ids(tracker, frame(*view, (*right, decoy), (*MIDDLE, box))) == [1, 2, 3, 5, 4]
+
+
+def test_what_moves_by_itself_does_not_move_the_camera():
+    """Three planes stand, a box before them comes nearer: the farther, the less it counts."""
+    shifts = []
+    for nearer in (0.1, 0.3, 0.6):
+        box = (*MIDDLE, (*BOX[:3], BOX[3] - nearer))
+        first, second = frame(*stay(), (*MIDDLE, BOX)), frame(*stay(), box)
+        then, now = (Tracks.of(planes, labels) for labels, planes in (first, second))
+        pairs = np.arange(4), np.arange(4)
+        rotation, shift = _camera_motion(then, now, pairs, np.full(6, 1.0), None)
+        shifts.append(np.linalg.norm(shift) + np.linalg.norm(rotation - np.eye(3)))
+    assert shifts[2] < shifts[1] < shifts[0] < 0.25 and shifts[2] < 0.06
 
 
 def test_another_plane_in_the_same_pixels_is_new():
