@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from rangeseg_ros.core.sensing.enlargement import SIGNIFICANT, enlargement
 from rangeseg_ros.core.sensing.range_image import FAR, RangeImage
+from rangeseg_ros.core.significance import quantile
 
 ODDS = float(np.log(1e4))
 """Logarithm of the odds at which one reading of an image is believed and not the other."""
@@ -181,7 +182,7 @@ def _share_of_range(
         solution = covariance @ (terms[kept].T @ inverse[kept])
         left = np.abs(inverse - terms @ solution)
         variance = np.mean(left[kept] ** 2) * covariance[3, 3]
-        kept = left < 3 * 1.4826 * np.median(left) + 1e-9
+        kept = left < 3 * 1.4826 * quantile(left, 0.5) + 1e-9
     return float(solution[3]), float(variance)
 
 
