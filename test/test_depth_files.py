@@ -156,6 +156,7 @@ def test_intrinsics_of_numbers():
         (['xyzzy'], 'rangeseg --help'),
         (['segment', __file__, '--camra', 'x', '--output', 'y'], "'--camera'"),
         (['segment', __file__, '--fov', '50', '--fx', '3', '--output', 'y'], 'one of --camera'),
+        (['segment', __file__, '--fov', '50', '--camera', __file__, '--output', 'y'], 'one of'),
         (['segment', __file__, '--cx', '3', '--output', 'y'], 'need --fx'),
         (['segment', __file__, '--fov', 'nan', '--output', 'y'], 'not finite'),
     ],
