@@ -168,6 +168,10 @@ def test_what_tells_nothing_has_the_prior():
     regions = np.zeros(CAMERA.shape, int)
     regions[100, 100] = 1
     assert probabilities(WALL, regions).tolist() == [0.0, 0.5]
+    # Nor does it tell anything of what it touches.
+    regions[100:140, 101:160] = 2
+    alone, beside = probabilities(WALL, regions), probabilities(WALL, regions, 0, [[1, 2]])
+    assert beside.tolist() == alone.tolist()
 
 
 def test_what_a_quadratic_explains_is_what_least_squares_explain():

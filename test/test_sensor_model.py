@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from rangeseg_ros import Segmenter
 from rangeseg_ros.core.config import Config
 from rangeseg_ros.core.fitting.error_law import Law, Strata, fit_law
-from rangeseg_ros.core.fitting.noise import ROUGH, measured_sensor, quantisation
+from rangeseg_ros.core.fitting.noise import ROUGH, _random, measured_sensor, quantisation
 from rangeseg_ros.core.fitting.steps import jump_steps
 from rangeseg_ros.core.sensing.blocks import Blocks
 from rangeseg_ros.core.sensing.camera import Camera
@@ -294,6 +294,18 @@ def test_what_blocks_leave_of_correlated_noise(width):
         left[side] = (rest**2).sum(axis=1).mean()
     expected = left[4] / 13, left[8] / 61, left[16] / 253, (left[8] - 4 * left[4]) / 9
     np.testing.assert_allclose(correlated_residuals(width), expected, rtol=0.15, atol=0.01)
+
+
+@pytest.mark.parametrize('filled', [1.0, 0.6])
+@pytest.mark.parametrize(('white', 'width'), [(0.3, 1.4), (1.0, 1.0), (0.0, 2.8)])
+def test_white_and_correlated_noise_are_told_from_blocks_of_several_sizes(white, width, filled):
+    """Of holes, planes of four blocks miss so much of the field as its residuals have."""
+    small, larger, largest, apart = correlated_residuals(width)
+    apart = filled * apart + (1 - filled) * small
+    shown = [3 * (white + (1 - white) * v) for v in (small, larger, largest, apart)]
+    total, share, length = _random(shown[:3], shown[3], filled)
+    assert (total, share) == pytest.approx((3, white), abs=1e-6)
+    assert white == 1 or length == width
 
 
 @pytest.mark.parametrize(('white', 'width'), [(1.0, 2.0), (0.33, 2.0), (0.0, 0.7), (0.5, 0.0)])
