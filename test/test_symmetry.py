@@ -1,0 +1,127 @@
+"""What a result may not depend on: the unit of length, which axis is x, the frame of a map."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planes_of_labels import fit_planes
+from scipy.spatial.transform import Rotation
+
+from rangeseg_ros import Config, RangeImage, Segmenter
+from rangeseg_ros.core.by_planes.posterior import plane_probabilities
+from rangeseg_ros.core.fitting.fits import Fits
+from rangeseg_ros.core.mapping.adjustment import Adjustment
+from rangeseg_ros.core.mapping.observations import PoseNoise
+from rangeseg_ros.core.mapping.plane_map import PlaneMap
+from rangeseg_ros.core.mapping.transforms import Transform
+from rangeseg_ros.core.sequence import SequenceSegmenter
+from rangeseg_ros.simulation.render import simulate
+from rangeseg_ros.simulation.scenes import kinect_room, walk
+from rangeseg_ros.simulation.sensors.kinect import Kinect
+
+LENGTHS = 'distance', 'rms', 'centroid', 'extents'
+SWAPPED = [1, 0, 2]
+
+
+@pytest.fixture(scope='module')
+def seen():
+    """A room, and what is found in it."""
+    frame = simulate(kinect_room(5), Kinect(5))
+    image = RangeImage.from_depth(frame.depth, frame.camera)
+    return image, Segmenter().segment(image)
+
+
+@pytest.mark.parametrize('factor', [2, 8])
+def test_a_larger_world_looks_the_same(seen, factor):
+    """No rule has a length in it, but for floors of errors, which change them by a millionth."""
+    image, result = seen
+    large = Segmenter().segment(replace(image, inverse=image.inverse / np.float32(factor)))
+    np.testing.assert_array_equal(large.labels, result.labels)
+    for error in 'noise', 'distortion', 'quantum':
+        found = factor * getattr(large.sensor, error)
+        assert found == pytest.approx(getattr(result.sensor, error), rel=1e-4), error
+    units = factor ** np.array([0, 0, 0, 1.0])
+    for plane, other in zip(result.planes, large.planes, strict=True):
+        for name in LENGTHS:
+            scaled = factor * np.asarray(getattr(plane, name))
+            np.testing.assert_allclose(getattr(other, name), scaled, rtol=1e-6, err_msg=name)
+        assert other.area == pytest.approx(factor**2 * plane.area, rel=1e-6)
+        np.testing.assert_allclose(other.normal, plane.normal, atol=1e-9)
+        scaled = np.outer(units, units) * plane.covariance
+        np.testing.assert_allclose(other.covariance, scaled, rtol=1e-4, atol=1e-4 * scaled.max())
+        shares = other.probability, other.confidence
+        assert shares == pytest.approx((plane.probability, plane.confidence), abs=1e-4)
+
+
+def test_no_axis_of_the_image_is_another_one(seen):
+    """The same regions of the transposed image have the transposed planes, errors and odds."""
+    image, result = seen
+    camera = image.camera
+    turned = replace(
+        camera,
+        width=camera.height,
+        height=camera.width,
+        fx=camera.fy,
+        fy=camera.fx,
+        cx=camera.cy,
+        cy=camera.cx,
+    )
+    depth = np.where(image.valid, image.points[..., 2], 0)
+    across = RangeImage.from_depth(depth.T.copy(), turned)
+    pairs = np.array([[1, 2], [2, 3]], np.uint16)
+    found = []
+    for view, labels in (image, result.labels), (across, result.labels.T.copy()):
+        planes = fit_planes(labels, view, result.sensor)
+        odds = plane_probabilities(Fits.of(labels, view, result.sensor), pairs, 0.5)
+        found.append((planes, odds[1:]))
+    (planes, odds), (others, same) = found
+    np.testing.assert_allclose(same, odds, rtol=1e-6)
+    full = [*SWAPPED, 3]
+    for plane, other in zip(planes, others, strict=True):
+        np.testing.assert_allclose(other.normal[SWAPPED], plane.normal, atol=1e-7)
+        np.testing.assert_allclose(other.centroid[SWAPPED], plane.centroid, atol=1e-7)
+        root = np.sqrt(np.diag(plane.covariance))
+        near = (other.covariance[np.ix_(full, full)] - plane.covariance) / np.outer(root, root)
+        assert np.abs(near).max() < 1e-5
+        np.testing.assert_allclose(other.area, plane.area, rtol=1e-6)
+        np.testing.assert_allclose(other.extents, plane.extents, rtol=1e-6)
+
+
+def test_the_map_turns_with_its_frame():
+    """Poses in another fixed frame: the same planes, errors and solution, moved there."""
+    scene = kinect_room(701, 18, walk)
+    sequence, random = SequenceSegmenter(Config()), np.random.default_rng(1)
+    turn = Rotation.from_rotvec([0.7, -0.4, 1.1]).as_matrix()
+    moved = Transform(turn, np.array([3, -2, 0.5]))
+    noise = PoseNoise(0.005, np.radians(0.3))
+    maps = [(PlaneMap(Config()), Adjustment(noise), g) for g in (Transform.identity(), moved)]
+    for k in range(0, 18, 3):
+        frame = simulate(scene, Kinect(701), frame=k, seed=701)
+        image = RangeImage.from_depth(frame.depth, frame.camera)
+        true = Transform(scene.poses[k].rotation, scene.poses[k].position)
+        stamp = 10**9 * (1 + k) // 30
+        found = sequence.segment(image, stamp, up=true.rotation[2])
+        told = true.by(random.normal(0, [noise.turn] * 3 + [noise.shift] * 3))
+        for plane_map, adjustment, frame_of_map in maps:
+            pose = frame_of_map.after(told)
+            plane_map.add(found.labels, found.planes, image, pose, stamp)
+            adjustment.add(plane_map.sighting)
+    (planes, solution), (others, other) = (
+        (each.planes, adjustment.solve(each.planes, each.successors))
+        for each, adjustment, _ in maps
+    )
+    jacobian = np.eye(4)
+    jacobian[:3, :3], jacobian[3, :3] = turn, -moved.shift @ turn
+    assert len(planes) > 5
+    for before, after in (planes, others), (solution.planes, other.planes):
+        for plane, twin in zip(before, after, strict=True):
+            normal = turn @ plane.normal
+            np.testing.assert_allclose(twin.normal, normal, atol=1e-9)
+            assert twin.distance == pytest.approx(plane.distance - normal @ moved.shift, abs=1e-9)
+            covariance = jacobian @ plane.covariance @ jacobian.T
+            near = 1e-6 * covariance.max()
+            np.testing.assert_allclose(twin.covariance, covariance, atol=near)
+            assert (twin.id, twin.observations) == (plane.id, plane.observations)
+            assert twin.area == pytest.approx(plane.area)
+    for pose, twin in zip(solution.poses, other.poses, strict=True):
+        np.testing.assert_allclose(twin.shift, moved.after(pose).shift, atol=1e-9)
